@@ -1,0 +1,20 @@
+"""What goes wrong in a user's hands, as exceptions that a command prints without a traceback.
+
+Every message says what was found, what was expected and what to do about it.
+"""
+
+
+class TidefieldError(Exception):
+    """Base of every error that a user can mend; commands print it and exit with status 2."""
+
+
+class SceneError(TidefieldError):
+    """A scene on disk is missing, incomplete or inconsistent."""
+
+
+class RunError(TidefieldError):
+    """A run folder or a checkpoint cannot be used as asked."""
+
+
+class DeviceError(TidefieldError):
+    """The requested device is not on this machine."""

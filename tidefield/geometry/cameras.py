@@ -1,0 +1,111 @@
+"""Pinhole cameras, many at once.
+
+Conventions (OpenCV): +x right, +y down, +z forward; pixel centres at +0.5, so an image of width W spans
+u in [0, W]. `T_world_camera` maps camera coordinates into the world. Lens distortion has been removed before
+a `Cameras` exists (see `geometry.lenses`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V pinhole cameras.
+
+    Attributes:
+        T_world_camera: camera-to-world rotation and position, world units.
+        focal_px: (fx, fy).
+        principal_px: (cx, cy), pixel centres at +0.5.
+        size_px: (width, height).
+        near_far: nearest and farthest z-depth (along +z) at which this camera may meet the scene, world units.
+        gain: colour gain of the photograph, per channel, relative to the scene's common exposure; 1 where unknown.
+            A photograph divided by its gain is at the common exposure (method.md, section 12).
+    """
+
+    T_world_camera: Float[Tensor, "V 3 4"]
+    focal_px: Float[Tensor, "V 2"]
+    principal_px: Float[Tensor, "V 2"]
+    size_px: Int[Tensor, "V 2"]
+    near_far: Float[Tensor, "V 2"]
+    gain: Float[Tensor, "V 3"]
+
+    def __len__(self) -> int:
+        return self.T_world_camera.shape[0]
+
+    def __getitem__(self, index: int | slice | list[int] | Tensor) -> Cameras:
+        """A sub-batch; an integer gives a batch of one."""
+        if isinstance(index, int):
+            index = [index]
+        return Cameras(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def to(self, device: torch.device | str) -> Cameras:
+        return Cameras(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    @property
+    def width(self) -> int:
+        """Width of a single camera, in pixels."""
+        return int(self.size_px[0, 0])
+
+    @property
+    def height(self) -> int:
+        """Height of a single camera, in pixels."""
+        return int(self.size_px[0, 1])
+
+    @property
+    def position_world(self) -> Float[Tensor, "V 3"]:
+        return self.T_world_camera[:, :, 3]
+
+    @property
+    def forward_world(self) -> Float[Tensor, "V 3"]:
+        """Unit viewing directions (+z of each camera)."""
+        return self.T_world_camera[:, :, 2]
+
+    def project(self, points_world: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
+        """Pixels and z-depths of points in every camera.
+
+        Points at or behind a camera have z <= 0 and meaningless pixels: test z before using them.
+        """
+        return project(self, points_world.expand(len(self), -1, -1))
+
+    def directions_world(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
+        """Ray directions through pixels, scaled so that one unit of ray is one unit of z-depth."""
+        xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
+        xyz = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+        return xyz @ self.T_world_camera[:, :, :3].transpose(1, 2)
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same views on a grid of width x height pixels."""
+        size = self.size_px.new_tensor([width, height]).expand_as(self.size_px)
+        ratio = size / self.size_px
+        return replace(self, focal_px=self.focal_px * ratio, principal_px=self.principal_px * ratio, size_px=size)
+
+
+def project(
+    cameras: Cameras, points_world: Float[Tensor, "V P 3"]
+) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
+    """Project each camera's own P points: pixels and z-depths.
+
+    The projection matrix P_i of the paper (3 x 4) is K_i [R_i | t_i] with [R_i | t_i] the inverse of
+    `T_world_camera`.
+    """
+    rotation = cameras.T_world_camera[:, :, :3]
+    xyz = (points_world - cameras.position_world[:, None]) @ rotation
+    z = xyz[..., 2]
+    # Keeps the division finite for points in the camera's plane; they are invalid by z <= 0 or out of the image.
+    z_safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    uv = xyz[..., :2] / z_safe[..., None] * cameras.focal_px[:, None] + cameras.principal_px[:, None]
+    return uv, z
+
+
+def pixel_grid(width: int, height: int, device: torch.device | str | None = None) -> Float[Tensor, "P 2"]:
+    """Centres of all pixels of an image, row by row: (0.5, 0.5), (1.5, 0.5), ..."""
+    v, u = torch.meshgrid(
+        torch.arange(height, device=device) + 0.5, torch.arange(width, device=device) + 0.5, indexing="ij"
+    )
+    return torch.stack([u, v], dim=-1).reshape(-1, 2)
