@@ -1,12 +1,253 @@
-"""Photographs in one memory-mapped store (to be written)."""
-from __future__ import annotations
-from dataclasses import dataclass
+"""Photographs: undistorted and resized once, then kept as raw bytes in one memory-mapped file.
 
+The file lies in the user's cache folder under a hash of everything that its pixels depend on, so a scene that is opened
+again at the same width is not decoded again.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import logging
+import os
+import secrets
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
 from jaxtyping import UInt8
+from PIL import Image
 from torch import Tensor
+
+from tidefield.errors import SceneError
+from tidefield.geometry.lenses import Lens, rectify
+
+Progress = Callable[[int, int], None]
+"""Called with how many photographs are ready, and of how many."""
+
+# Part of every key: raise it when the same photograph would give other pixels.
+_PIXELS_VERSION = 1
+_DAYS_KEPT_UNUSED = 60
+_MODES_WITH_ALPHA = ("RGBA", "LA", "PA")
+_MODES = ("1", "L", "P", "RGB", "CMYK", "YCbCr", *_MODES_WITH_ALPHA)
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Photographs:
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int) -> UInt8[Tensor, "H W 3"]: ...
+    """The pixels of a scene, photograph by photograph; sizes may differ.
+
+    Attributes:
+        colours: 8-bit sRGB pictures.
+        alphas: their opacity, None for opaque photographs. Colours are already composited on the background.
+    """
+
+    colours: tuple[UInt8[Tensor, "_ _ 3"], ...]
+    alphas: tuple[UInt8[Tensor, "_ _"] | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        assert len(self.alphas) in (0, len(self.colours)), "one alpha (or None) per photograph"
+
+    def __len__(self) -> int:
+        return len(self.colours)
+
+    def __getitem__(self, index: int) -> UInt8[Tensor, "H W 3"]:
+        return self.colours[index]
+
+    def alpha(self, index: int) -> UInt8[Tensor, "H W"] | None:
+        return self.alphas[index] if self.alphas else None
+
+
+@dataclass(frozen=True)
+class PhotographFile:
+    """A photograph on disk and what is wanted of it.
+
+    Attributes:
+        path: the file.
+        lens: the camera that took it, for exactly the file's pixels.
+        width: of the result; height likewise.
+        has_alpha: whether the file has an opacity channel.
+    """
+
+    path: Path
+    lens: Lens
+    width: int
+    height: int
+    has_alpha: bool
+
+    @property
+    def channels(self) -> int:
+        return 4 if self.has_alpha else 3
+
+    @property
+    def bytes(self) -> int:
+        return self.width * self.height * self.channels
+
+
+def read_header(path: Path) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, without decoding; EXIF orientation is not applied.
+
+    Raises:
+        SceneError: when the file is no picture that we read.
+    """
+    with _naming(path), Image.open(path) as picture:
+        if picture.mode not in _MODES:
+            raise SceneError(f"{path} has pixels of the kind {picture.mode}: expected 8 bits per colour; convert it")
+        return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
+
+
+def open_photographs(
+    files: Sequence[PhotographFile], background_rgb: tuple[float, float, float], progress: Progress | None = None
+) -> Photographs:
+    """All photographs, undistorted and resized: from the cache, or decoded into it.
+
+    Args:
+        files: the photographs.
+        background_rgb: what photographs with alpha are composited on, in [0, 1].
+        progress: told of every photograph that is decoded.
+
+    Raises:
+        SceneError: for a photograph that cannot be decoded whole, or a full disk.
+    """
+    store = _cache_folder() / f"{_key(files, background_rgb)}.photographs"
+    expected = sum(file.bytes for file in files)
+    try:
+        if store.is_file() and store.stat().st_size == expected:
+            os.utime(store)
+        else:
+            _forget_unused(store.parent)
+            _write(store, _decoded(files, background_rgb, progress), expected)
+        # Copy-on-write: nothing that a caller does to a view reaches the file.
+        return _views(np.memmap(store, dtype=np.uint8, mode="c"), files)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
+            raise
+        _log.warning(
+            "the cache folder %s cannot be written (%s): photographs are held in memory and will be decoded again next "
+            "time; set XDG_CACHE_HOME to a folder of yours",
+            store.parent,
+            error.strerror,
+        )
+    return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
+
+
+def _cache_folder() -> Path:
+    """$XDG_CACHE_HOME/tidefield, or what the platform has in its place."""
+    if "XDG_CACHE_HOME" in os.environ:
+        return Path(os.environ["XDG_CACHE_HOME"]) / "tidefield"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "tidefield" / "cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "tidefield"
+    return Path.home() / ".cache" / "tidefield"
+
+
+def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
+    parts = []
+    for file in files:
+        status = file.path.stat()
+        about = {**asdict(file), "path": str(file.path.resolve())}
+        parts.append([about, status.st_size, status.st_mtime_ns])
+    text = json.dumps([_PIXELS_VERSION, background_rgb, parts], sort_keys=True)
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+def _forget_unused(folder: Path) -> None:
+    """Remove stores, and leftovers of killed programs, that nobody has opened for a long time."""
+    limit = time.time() - _DAYS_KEPT_UNUSED * 86400
+    for store in [*folder.glob("*.photographs"), *folder.glob("*.partial")]:
+        # Another program may be quicker, or (on Windows) hold it open: then it stays until the next time.
+        with suppress(FileNotFoundError, PermissionError):
+            if store.stat().st_mtime < limit:
+                store.unlink()
+
+
+def _write(store: Path, pictures: Iterator[np.ndarray], expected: int) -> None:
+    """Write beside the store and put it in place only when it is complete."""
+    partial = store.with_name(f"{store.stem}-{secrets.token_hex(4)}.partial")
+    try:
+        store.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            for picture in pictures:
+                file.write(picture.data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, store)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise SceneError(
+            f"the disk of {store.parent} is full: {expected / 1e6:.0f} MB are needed there for the photographs; free "
+            "some space, choose a smaller --width, or set XDG_CACHE_HOME to a folder on another disk"
+        ) from error
+    finally:
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has been put in place
+            partial.unlink()
+
+
+def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
+    colours, alphas, start = [], [], 0
+    for file in files:
+        pixels = file.width * file.height
+        planes = torch.from_numpy(store[start : start + file.bytes])
+        colours.append(planes[: 3 * pixels].view(file.height, file.width, 3))
+        alphas.append(planes[3 * pixels :].view(file.height, file.width) if file.has_alpha else None)
+        start += file.bytes
+    return Photographs(tuple(colours), tuple(alphas))
+
+
+def _decoded(
+    files: Sequence[PhotographFile], background_rgb: tuple[float, float, float], progress: Progress | None
+) -> Iterator[UInt8[np.ndarray, " bytes"]]:
+    """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha if there is any."""
+    largest = max(file.lens.width * file.lens.height for file in files)
+    # A photograph in the works takes some 12 bytes per pixel; together they stay around a gigabyte.
+    workers = max(1, min(os.cpu_count() or 1, 8, 1_000_000_000 // (12 * largest)))
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[np.ndarray]] = deque()
+        try:
+            for done, file in enumerate([*files, *[None] * workers], start=1 - workers):
+                if file is not None:
+                    waiting.append(pool.submit(_decode, file, background_rgb))
+                if done > 0:
+                    yield waiting.popleft().result()
+                    if progress:
+                        progress(done, len(files))
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
+    with _naming(file.path), Image.open(file.path) as picture:
+        pixels = np.asarray(picture.convert("RGBA" if file.has_alpha else "RGB"))
+    if not file.has_alpha:
+        return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
+    # Composited before it is resampled: the colour of a transparent pixel means nothing.
+    alpha = pixels[..., 3:].astype(np.float32) / 255
+    flat = pixels[..., :3] * alpha + 255 * np.array(background_rgb, np.float32) * (1 - alpha)
+    pixels = np.concatenate([np.round(flat).astype(np.uint8), pixels[..., 3:]], axis=-1)
+    pixels = rectify(pixels, file.lens, file.width, file.height)
+    return np.concatenate([pixels[..., :3].reshape(-1), pixels[..., 3].reshape(-1)])
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a photograph is read into one SceneError that names it."""
+    try:
+        yield
+    # Pillow has SyntaxError for broken PNGs and a plain Exception of its own for decompression bombs.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise SceneError(
+            f"{path} cannot be read as a photograph ({error}): expected a whole JPEG or PNG; copy it again from the "
+            "camera, or take it away and go on with --allow-missing"
+        ) from error

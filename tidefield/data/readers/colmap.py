@@ -1,0 +1,223 @@
+"""COLMAP models, binary and text: cameras, images and points3D (https://colmap.github.io/format.html).
+
+The files are read here and not by pycolmap, because a model may come from anywhere: pycolmap 4.2 takes a truncated
+cameras.bin for a good one, with whatever its memory held as the calibration, and does not come back from a truncated
+frames.bin. The poses of images in rigs are complete in the images file, so rigs and frames are not needed.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from tidefield.data.readers.posed import Observations, PosedPhotographs, bounded_bytes, inside, keep_present
+from tidefield.errors import SceneError
+from tidefield.geometry.lenses import Lens, lens_from_colmap
+
+# Model number in cameras.bin -> name and number of parameters, of those that can be read; names of the others.
+_MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
+_OTHER_MODELS = {
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    14: "SIMPLE_FISHEYE",
+    15: "FISHEYE",
+    16: "EUCM",
+    17: "EQUIRECTANGULAR",
+}
+_NO_POINT = -1
+_OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+_MEGABYTES = 20_000
+
+
+@dataclass(frozen=True)
+class _Image:
+    """One record of the images file: world-to-camera quaternion (w, x, y, z) and translation, and what it saw."""
+
+    name: str
+    camera: int
+    quaternion: Float64[np.ndarray, " 4"]
+    translation: Float64[np.ndarray, " 3"]
+    uv_px: Float64[np.ndarray, "O 2"]
+    point: Int[np.ndarray, " O"]
+
+
+def find_colmap(root: Path) -> Path | None:
+    """The folder of a scene's COLMAP model: sparse/0 or sparse, or None."""
+    return next((root / name for name in ("sparse/0", "sparse") if _suffix(root / name)), None)
+
+
+def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotographs:
+    """A COLMAP model and its photographs in `root/images`.
+
+    Raises:
+        SceneError: for a damaged file, an unsupported camera model, or missing photographs.
+    """
+    suffix = _suffix(model)
+    assert suffix is not None, "find_colmap found no model here"
+    cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
+    try:
+        binary = suffix == ".bin"
+        lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
+        images = list((_binary_images if binary else _text_images)(images_file))
+        point_ids, xyz_world = (_binary_points if binary else _text_points)(points_file)
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
+        raise SceneError(
+            f"the COLMAP model in {model} is damaged ({error}): expected whole files cameras, images and points3D "
+            f"({suffix}); copy or export the model again"
+        ) from error
+    unknown = next((image for image in images if image.camera not in lenses), None)
+    if unknown:
+        raise SceneError(
+            f"{images_file} says that {unknown.name} was taken by camera {unknown.camera}, which {cameras_file.name} "
+            "does not have; export the model again"
+        )
+    paths = [inside(root / "images", image.name, images_file) for image in images]
+    present = keep_present(paths, images_file, allow_missing)
+    images = [images[i] for i in present]
+    return PosedPhotographs(
+        names=tuple(image.name for image in images),
+        paths=tuple(paths[i] for i in present),
+        lenses=tuple(lenses[image.camera] for image in images),
+        T_world_camera=_poses(images),
+        points=_observations(images, point_ids, xyz_world),
+    )
+
+
+def _suffix(model: Path) -> str | None:
+    """Which of COLMAP's two formats is in a folder; the binary one, where both are, as COLMAP has it."""
+    return next((suffix for suffix in (".bin", ".txt") if (model / f"cameras{suffix}").is_file()), None)
+
+
+def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
+    quaternion = np.array([image.quaternion for image in images]).reshape(-1, 4)
+    translation = np.array([image.translation for image in images]).reshape(-1, 3)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a quaternion of zeros becomes NaN, which is refused later
+        w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
+    R_world_camera = np.array(  # the transpose of the quaternion's R_camera_world
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    return np.concatenate([R_world_camera, -R_world_camera @ translation[:, :, None]], axis=2)
+
+
+def _observations(
+    images: list[_Image], point_ids: Int[np.ndarray, " P"], xyz_world: Float64[np.ndarray, "P 3"]
+) -> Observations | None:
+    if len(point_ids) == 0 or not images:
+        return None
+    order = np.argsort(point_ids)
+    seen = np.concatenate([image.point for image in images])
+    uv_px = np.concatenate([image.uv_px for image in images])
+    photograph = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
+    place = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
+    known = (point_ids[place] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[place]).all(axis=1)
+    return Observations(xyz_world, place[known], photograph[known], uv_px[known])
+
+
+class _Reader:
+    """Little-endian numbers out of a file, one after the other; struct.error where the file ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.bytes, self.at = path, bounded_bytes(path, _MEGABYTES), 0
+
+    def take(self, layout: str) -> tuple:
+        values = struct.unpack_from("<" + layout, self.bytes, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def count(self, smallest: int) -> int:
+        """A number of records of at least `smallest` bytes each, which must fit into what is left of the file."""
+        (count,) = self.take("Q")
+        if count * smallest > len(self.bytes) - self.at:
+            raise ValueError(f"{self.path.name} ends before the {count} records that it announces")
+        return count
+
+    def end(self) -> None:
+        if self.at != len(self.bytes):
+            raise ValueError(f"{self.path.name} goes on for {len(self.bytes) - self.at} bytes after its last record")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    reader = _Reader(path)
+    for _ in range(reader.count(24)):
+        camera, model, width, height = reader.take("IiQQ")
+        if model not in _MODELS and model not in _OTHER_MODELS:
+            raise ValueError(f"{path.name} has a camera of the model number {model}, which COLMAP does not have")
+        name, parameters = _MODELS.get(model) or (_OTHER_MODELS[model], 0)
+        yield camera, lens_from_colmap(name, width, height, reader.take(f"{parameters}d"))
+    reader.end()
+
+
+def _binary_images(path: Path) -> Iterator[_Image]:
+    reader = _Reader(path)
+    for _ in range(reader.count(73)):
+        _, *pose, camera = reader.take("I7dI")
+        end = reader.bytes.index(b"\0", reader.at)
+        name = reader.bytes[reader.at : end].decode()
+        reader.at = end + 1
+        count = reader.count(_OBSERVATION.itemsize)
+        seen = np.frombuffer(reader.bytes, _OBSERVATION, count, reader.at)
+        seen = seen[seen["point"] != _NO_POINT]
+        reader.at += count * _OBSERVATION.itemsize
+        yield _Image(name, camera, np.array(pose[:4]), np.array(pose[4:]), seen["uv"], seen["point"])
+    reader.end()
+
+
+def _binary_points(path: Path) -> tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"]]:
+    reader = _Reader(path)
+    ids, xyz = [], []
+    for _ in range(reader.count(51)):
+        point, *position = reader.take("Q3d")
+        reader.take("3Bd")  # colour and error
+        track = reader.count(8)
+        reader.at += 8 * track  # the images file says the same
+        ids.append(point)
+        xyz.append(position)
+    reader.end()
+    return np.array(ids, dtype=np.int64), np.array(xyz, dtype=np.float64).reshape(-1, 3)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    for line in bounded_bytes(path, _MEGABYTES).decode().splitlines():
+        if not line.startswith("#"):
+            yield line.strip()
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for line in filter(None, _lines(path)):
+        camera, model, width, height, *parameters = line.split()
+        yield int(camera), lens_from_colmap(model, int(width), int(height), [float(p) for p in parameters])
+
+
+def _text_images(path: Path) -> Iterator[_Image]:
+    lines = _lines(path)
+    for line in lines:
+        if not line:
+            continue
+        # Two lines per image; the second is empty where nothing was seen. A name may have spaces.
+        _, *pose, camera, name = line.split(maxsplit=9)
+        seen = np.array((next(lines, "")).split(), dtype=np.float64).reshape(-1, 3)
+        seen = seen[seen[:, 2] != _NO_POINT]
+        values = np.array(pose, dtype=np.float64)
+        yield _Image(name, int(camera), values[:4], values[4:], seen[:, :2], seen[:, 2].astype(np.int64))
+
+
+def _text_points(path: Path) -> tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"]]:
+    records = [line.split(maxsplit=4)[:4] for line in _lines(path) if line]
+    ids = np.array([int(record[0]) for record in records], dtype=np.int64)
+    return ids, np.array([record[1:] for record in records], dtype=np.float64).reshape(-1, 3)

@@ -1,0 +1,234 @@
+"""Lenses: pinhole cameras with the distortion of Brown's model, and its removal from photographs.
+
+Pixel coordinates have pixel centres at +0.5, as COLMAP's have, so a photograph of width W spans u in [0, W]. OpenCV's
+have them at 0: half a pixel is taken off the principal point wherever OpenCV is called, and nowhere else.
+
+With x, y on the plane z = 1 of the camera and r^2 = x^2 + y^2 (Brown 1971, as in OpenCV and COLMAP):
+
+    radial = 1 + k1 r^2 + k2 r^4 + k3 r^6
+    x_d = x radial + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y_d = y radial + 2 p2 x y + p1 (r^2 + 2 y^2)
+    u = fx x_d + cx,   v = fy y_d + cy
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tidefield.errors import SceneError
+
+# COLMAP's camera models that are pinhole cameras with this distortion, and the meaning of their parameters.
+_COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+
+Points = Float[np.ndarray, "P 2"]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's interior orientation for photographs of width x height pixels (see the module's equations)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def __post_init__(self) -> None:
+        finite = np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all()
+        if not finite or min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+            raise SceneError(
+                f"a camera has the unusable calibration {self}: expected finite numbers, a positive size and positive "
+                "focal lengths; calibrate the photographs again"
+            )
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float]:
+        """(k1, k2, p1, p2, k3): OpenCV's order."""
+        return (self.k1, self.k2, self.p1, self.p2, self.k3)
+
+    @property
+    def is_distorted(self) -> bool:
+        return any(self.distortion)
+
+    def distort(self, xy: Points) -> Points:
+        """Where the lens puts points of the plane z = 1, on that plane."""
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        x_d = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        y_d = y * radial + 2 * self.p2 * x * y + self.p1 * (r2 + 2 * y * y)
+        return np.stack([x_d, y_d], axis=-1)
+
+    def undistort(self, xy_distorted: Points) -> Points:
+        """The inverse of `distort`, by Newton's method; NaN where the lens puts no point."""
+        if not self.is_distorted:
+            return xy_distorted.copy()
+        xy = xy_distorted.astype(np.float64)
+        with np.errstate(all="ignore"):  # points that have no solution run away; they are marked below
+            for _ in range(50):
+                residual = self.distort(xy) - xy_distorted
+                (a, b), (c, d) = self._jacobian(xy)
+                step = np.stack([d * residual[:, 0] - b * residual[:, 1], a * residual[:, 1] - c * residual[:, 0]], -1)
+                step /= (a * d - b * c)[:, None]
+                xy -= step
+                if not (np.abs(step) > 1e-13).any():
+                    break
+            found = (np.abs(self.distort(xy) - xy_distorted).max(-1) < 1e-9) & self._is_unfolded(xy)
+        return np.where(found[:, None], xy, np.nan)
+
+    def project(self, points_camera: Float[np.ndarray, "P 3"]) -> Points:
+        """Pixels of points in front of the camera."""
+        xy = self.distort(points_camera[:, :2] / points_camera[:, 2:])
+        return xy * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def unproject(self, uv_px: Points) -> Points:
+        """Points of the plane z = 1 that appear at these pixels; NaN where the lens puts no point."""
+        return self.undistort((uv_px - (self.cx, self.cy)) / (self.fx, self.fy))
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens for photographs of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    @lru_cache(maxsize=256)  # noqa: B019 - a frozen value: the cache holds no more than a few hundred small objects
+    def pinhole(self) -> Lens:
+        """The distortion-free camera, of the same size and place, that sees as much as it can of what this lens sees.
+
+        Its whole image lies inside the photograph (there are no blank pixels), and its image plane is the inner
+        rectangle of the undistorted photograph, so fx and fy may differ slightly where those of the lens do not.
+        A lens without distortion is returned as it is.
+        """
+        if not self.is_distorted:
+            return self
+        x0, x1, y0, y1 = self._inner_rectangle()
+        fx, fy = self.width / (x1 - x0), self.height / (y1 - y0)
+        return Lens(self.width, self.height, fx, fy, -x0 * fx, -y0 * fy)
+
+    def _jacobian(self, xy: Points) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))
+        mixed = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
+        dx = radial + x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
+        dy = radial + y * y * slope + 2 * self.p2 * x + 6 * self.p1 * y
+        return (dx, mixed), (mixed, dy)
+
+    def _is_unfolded(self, xy: Points) -> np.ndarray:
+        """Whether the way from the axis to each point meets no fold: beyond a fold, two points share a pixel."""
+        along = np.linspace(0.0, 1.0, 17)[1:, None, None]
+        (a, b), (c, d) = self._jacobian((along * xy).reshape(-1, 2))
+        # Both eigenvalues of the (symmetric) Jacobian are positive until the first fold.
+        unfolded = (a * d - b * c > 0) & (a + d > 0)
+        return np.logical_and.reduce(unfolded.reshape(len(along), -1), axis=0)
+
+    def _inner_rectangle(self) -> tuple[float, float, float, float]:
+        """Left, right, top, bottom on the plane z = 1 of a rectangle that the photograph shows whole."""
+        u, v = np.linspace(0, self.width, 201), np.linspace(0, self.height, 201)
+        sides = {
+            "left": np.stack([0 * v, v], -1),
+            "right": np.stack([0 * v + self.width, v], -1),
+            "top": np.stack([u, 0 * u], -1),
+            "bottom": np.stack([u, 0 * u + self.height], -1),
+        }
+        xy = {name: self.unproject(side) for name, side in sides.items()}
+        # A side that the model never reaches (it folds over before) begins far out and is drawn in below.
+        x0 = np.nanmax(xy["left"][:, 0], initial=-4.0 * self.width / self.fx)
+        x1 = np.nanmin(xy["right"][:, 0], initial=4.0 * self.width / self.fx)
+        y0 = np.nanmax(xy["top"][:, 1], initial=-4.0 * self.height / self.fy)
+        y1 = np.nanmin(xy["bottom"][:, 1], initial=4.0 * self.height / self.fy)
+        if not (x0 < 0 < x1 and y0 < 0 < y1):
+            raise SceneError(f"the principal point of {self} lies outside its photographs; calibrate them again")
+        rectangle = np.array([x0, x1, y0, y1])
+        # Usually 1. Less where corners fold over, or where they stick out of a photograph with a wavy border.
+        share = 1.0
+        while not self._shows(share * rectangle):
+            share *= 0.995
+        x0, x1, y0, y1 = (share * rectangle).tolist()
+        return x0, x1, y0, y1
+
+    def _shows(self, rectangle: np.ndarray) -> bool:
+        x0, x1, y0, y1 = rectangle
+        s = np.linspace(0, 1, 201)
+        x, y = x0 + s * (x1 - x0), y0 + s * (y1 - y0)
+        border = np.concatenate([np.stack([x, 0 * s + edge], -1) for edge in (y0, y1)])
+        border = np.concatenate([border, *(np.stack([0 * s + edge, y], -1) for edge in (x0, x1))])
+        uv = self.distort(border) * (self.fx, self.fy) + (self.cx, self.cy)
+        # A twentieth of a pixel: the sampling of the border, far inside what repeating the edge pixel hides.
+        inside = (uv > -0.05).all() and (uv < np.array([self.width, self.height]) + 0.05).all()
+        return bool(inside and self._is_unfolded(border).all())
+
+
+def lens_from_colmap(model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
+    """The lens of a COLMAP camera.
+
+    Raises:
+        SceneError: for fisheye and other models, and for a wrong number of parameters.
+    """
+    if model not in _COLMAP_MODELS:
+        raise SceneError(
+            f"a camera has COLMAP's model {model}: supported are {', '.join(_COLMAP_MODELS)}; run COLMAP's "
+            "image_undistorter and open its output, or reconstruct again with --ImageReader.camera_model OPENCV"
+        )
+    names = _COLMAP_MODELS[model]
+    if len(names) != len(parameters):
+        raise SceneError(f"a {model} camera has {len(parameters)} parameters, expected {len(names)}: {names}")
+    values = dict(zip(names, map(float, parameters), strict=True))
+    if "f" in values:
+        values["fx"] = values["fy"] = values.pop("f")
+    return Lens(width, height, **values)
+
+
+def rectify(
+    photograph: UInt8[np.ndarray, "H W C"], lens: Lens, width: int, height: int
+) -> UInt8[np.ndarray, "height width C"]:
+    """A photograph as its `lens.pinhole()` would have taken it, reduced to width x height pixels.
+
+    Distortion is removed at the photograph's own resolution with a sharp interpolator, then every pixel of the result
+    is the mean of the pixels it covers. Without distortion and without reduction the photograph comes back untouched.
+    """
+    assert photograph.shape[:2] == (lens.height, lens.width), "the lens belongs to a photograph of another size"
+    channels = photograph.shape[2]
+    if lens.is_distorted:
+        # Lanczos is the sharper; averaging over blocks of pixels hides the difference and cubic takes a quarter of it.
+        kernel = cv2.INTER_LANCZOS4 if width > lens.width / 2 else cv2.INTER_CUBIC
+        photograph = cv2.remap(photograph, *_remap_tables(lens), kernel, borderMode=cv2.BORDER_REPLICATE)
+    if (width, height) != (lens.width, lens.height):
+        photograph = cv2.resize(photograph, (width, height), interpolation=cv2.INTER_AREA)
+    return photograph.reshape(height, width, channels)
+
+
+@lru_cache(maxsize=2)  # one survey has one or two cameras; the tables of a 50-megapixel one take 400 MB
+def _remap_tables(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    return cv2.initUndistortRectifyMap(
+        _opencv_matrix(lens),
+        np.array(lens.distortion),
+        None,  # pyright: ignore[reportCallIssue, reportArgumentType] - None is OpenCV's "no rotation"
+        _opencv_matrix(lens.pinhole()),
+        (lens.width, lens.height),
+        cv2.CV_32FC1,
+    )
+
+
+def _opencv_matrix(lens: Lens) -> np.ndarray:
+    return np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
