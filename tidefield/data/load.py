@@ -13,8 +13,11 @@ from torch import Tensor
 
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
 from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
+from tidefield.data.readers.blender import read_blender
 from tidefield.data.readers.colmap import find_colmap, read_colmap
-from tidefield.data.readers.posed import PosedPhotographs
+from tidefield.data.readers.llff import read_llff
+from tidefield.data.readers.posed import PosedPhotographs, proper_rotations
+from tidefield.data.readers.transforms import read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
@@ -46,11 +49,12 @@ def load_scene(
     """
     if width is not None and width < _SMALLEST_WIDTH:
         raise SceneError(f"photographs {width} pixels wide were asked for: expected at least {_SMALLEST_WIDTH}")
-    posed = _sorted(_read(root, allow_missing))
+    posed = _read(root, allow_missing)
     if len(posed.names) < _FEWEST:
         raise SceneError(
             f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
         )
+    posed = _sorted(replace(posed, T_world_camera=proper_rotations(posed.T_world_camera, posed.names, root)))
     files = tuple(map(_photograph_file, posed.paths, posed.lenses, [width] * len(posed.paths)))
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
     posed = _moved(posed, origin)
@@ -80,7 +84,15 @@ def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Choose the layout by what is in the folder."""
     if not root.is_dir():
         raise SceneError(f"{root} is {'a file' if root.exists() else 'not there'}: {_LAYOUTS}")
-    if model := find_colmap(root):
+    if model := find_colmap(root, "sparse/0", "sparse"):
+        return read_colmap(root, model, allow_missing)
+    if (root / "transforms.json").is_file():
+        return read_transforms(root, allow_missing)
+    if (root / "transforms_train.json").is_file():
+        return read_blender(root, allow_missing)
+    if (root / "poses_bounds.npy").is_file():
+        return read_llff(root)
+    if model := find_colmap(root, "colmap/sparse/0"):
         return read_colmap(root, model, allow_missing)
     found = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
     more = f" and {len(found) - 8} more" if len(found) > 8 else ""
@@ -195,6 +207,7 @@ def _split(posed: PosedPhotographs) -> tuple[tuple[int, ...], tuple[int, ...]]:
     if posed.split is None:
         return every_eighth(len(posed.names))
     train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+    assert not set(train) & set(test), "readers give disjoint parts"
     return train, test
 
 

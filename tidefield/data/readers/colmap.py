@@ -53,9 +53,9 @@ class _Image:
     point: Int[np.ndarray, " O"]
 
 
-def find_colmap(root: Path) -> Path | None:
-    """The folder of a scene's COLMAP model: sparse/0 or sparse, or None."""
-    return next((root / name for name in ("sparse/0", "sparse") if _suffix(root / name)), None)
+def find_colmap(root: Path, *places: str) -> Path | None:
+    """The first of these folders of a scene that holds a COLMAP model, or None."""
+    return next((root / place for place in places if _suffix(root / place)), None)
 
 
 def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotographs:
