@@ -177,9 +177,8 @@ def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Spars
         return None
     uv_px = np.full((len(points.uv_px), 2), np.nan)
     off_px = np.full(len(points.uv_px), np.nan)
-    for i, (lens, pinhole) in enumerate(zip(posed.lenses, pinholes, strict=True)):
-        mine = np.flatnonzero(points.photograph_index == i)
-        pose = posed.T_world_camera[i]
+    observations = points.by_photograph(len(pinholes))
+    for lens, pinhole, pose, mine in zip(posed.lenses, pinholes, posed.T_world_camera, observations, strict=True):
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
         xy = lens.unproject(points.uv_px[mine])
         uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)

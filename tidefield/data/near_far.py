@@ -22,11 +22,9 @@ def near_far_from_points(
     """Ranges from the points that each camera saw; where these are few, from all points in its frustum; where even
     these are few, the widest range of any camera."""
     ranges = np.full((len(T_world_camera), 2), np.nan)
-    order = np.argsort(points.photograph_index, kind="stable")
-    starts = np.searchsorted(points.photograph_index[order], np.arange(len(ranges) + 1))
+    observations = points.by_photograph(len(ranges))
     for i, (pose, pinhole) in enumerate(zip(T_world_camera, pinholes, strict=True)):
-        seen = points.point_index[order[starts[i] : starts[i + 1]]]
-        depth = _depth(pose, points.xyz_world[seen])
+        depth = _depth(pose, points.xyz_world[points.point_index[observations[i]]])
         depth = depth[depth > 0]
         if len(depth) < _POINTS_ENOUGH:
             inside, all_depths = _frustum(pose, pinhole, points.xyz_world)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,16 +68,13 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     suffix = _suffix(model)
     assert suffix is not None, "find_colmap found no model here"
     cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
-    try:
-        binary = suffix == ".bin"
+    binary = suffix == ".bin"
+    with _naming(cameras_file):
         lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
+    with _naming(images_file):
         images = list((_binary_images if binary else _text_images)(images_file))
+    with _naming(points_file):
         point_ids, xyz_world = (_binary_points if binary else _text_points)(points_file)
-    except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise SceneError(
-            f"the COLMAP model in {model} is damaged ({error}): expected whole files cameras, images and points3D "
-            f"({suffix}); copy or export the model again"
-        ) from error
     unknown = next((image for image in images if image.camera not in lenses), None)
     if unknown:
         raise SceneError(
@@ -98,6 +96,17 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
 def _suffix(model: Path) -> str | None:
     """Which of COLMAP's two formats is in a folder; the binary one, where both are, as COLMAP has it."""
     return next((suffix for suffix in (".bin", ".txt") if (model / f"cameras{suffix}").is_file()), None)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a file is parsed into a SceneError that names it."""
+    try:
+        yield
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
+        raise SceneError(
+            f"{path} is damaged ({error}): expected a whole file of a COLMAP model; copy or export the model again"
+        ) from error
 
 
 def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
@@ -133,7 +142,7 @@ class _Reader:
     """Little-endian numbers out of a file, one after the other; struct.error where the file ends too early."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.bytes, self.at = path, bounded_bytes(path, _MEGABYTES), 0
+        self.bytes, self.at = bounded_bytes(path, _MEGABYTES), 0
 
     def take(self, layout: str) -> tuple:
         values = struct.unpack_from("<" + layout, self.bytes, self.at)
@@ -144,12 +153,12 @@ class _Reader:
         """A number of records of at least `smallest` bytes each, which must fit into what is left of the file."""
         (count,) = self.take("Q")
         if count * smallest > len(self.bytes) - self.at:
-            raise ValueError(f"{self.path.name} ends before the {count} records that it announces")
+            raise ValueError(f"it ends before the {count} records that it announces")
         return count
 
     def end(self) -> None:
         if self.at != len(self.bytes):
-            raise ValueError(f"{self.path.name} goes on for {len(self.bytes) - self.at} bytes after its last record")
+            raise ValueError(f"it goes on for {len(self.bytes) - self.at} bytes after its last record")
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -157,7 +166,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for _ in range(reader.count(24)):
         camera, model, width, height = reader.take("IiQQ")
         if model not in _MODELS and model not in _OTHER_MODELS:
-            raise ValueError(f"{path.name} has a camera of the model number {model}, which COLMAP does not have")
+            raise ValueError(f"it has a camera of the model number {model}, which COLMAP does not have")
         name, parameters = _MODELS.get(model) or (_OTHER_MODELS[model], 0)
         yield camera, lens_from_colmap(name, width, height, reader.take(f"{parameters}d"))
     reader.end()

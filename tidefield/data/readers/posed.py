@@ -32,6 +32,12 @@ class Observations:
     photograph_index: Int[np.ndarray, " O"]
     uv_px: Float64[np.ndarray, "O 2"]
 
+    def by_photograph(self, photographs: int) -> list[Int[np.ndarray, " _"]]:
+        """For each photograph, the indices of its observations."""
+        order = np.argsort(self.photograph_index, kind="stable")
+        starts = np.searchsorted(self.photograph_index[order], np.arange(1, photographs))
+        return np.split(order, starts)
+
 
 @dataclass(frozen=True)
 class PosedPhotographs:
@@ -83,7 +89,13 @@ def inside(root: Path, name: str, named_by: Path) -> Path:
     path = root / relative
     lexically = not relative.anchor and ".." not in relative.parts and "\0" not in name and relative.parts
     homes = [(root / first).resolve() for first in ("", *relative.parts[:-1][:1])] if lexically else []
-    if not any(path.resolve().is_relative_to(home) for home in homes):
+    try:
+        real = path.resolve() if homes else path
+        outside = not any(real.is_relative_to(home) for home in homes)
+        path.is_file()
+    except (OSError, RuntimeError):  # a name too long for the system; links in a circle
+        outside = True
+    if outside:
         raise SceneError(
             f"{named_by} names the file {name!r}, which is outside of the scene's folder {root}: expected paths "
             "relative to that folder; move the photographs into it and correct the paths"

@@ -1,0 +1,181 @@
+import errno
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tidefield.data import images
+from tidefield.data.images import PhotographFile, open_photographs, read_header
+from tidefield.errors import SceneError
+from tidefield.geometry.lenses import Lens
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "tidefield"
+
+
+def save(path: Path, width: int, height: int, channels: int = 3, seed: int = 0, **options: object) -> PhotographFile:
+    pixels = np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
+    Image.fromarray(pixels).save(path, **options)
+    lens = Lens(width, height, 50.0, 50.0, width / 2, height / 2)
+    return PhotographFile(path, lens, width, height, has_alpha=channels == 4)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[PhotographFile, ...]:
+    return tuple(save(tmp_path / f"{i}.png", 30 + i, 20 + 2 * i, seed=i) for i in range(5))
+
+
+def refuse_to_decode(*_: object) -> np.ndarray:
+    raise AssertionError("decoded again")
+
+
+def test_photographs_of_different_sizes_come_back_as_they_are(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+    photographs = open_photographs(files, WHITE)
+    assert len(photographs) == 5
+    for i, file in enumerate(files):
+        assert (photographs[i].numpy() == np.asarray(Image.open(file.path))).all()
+        assert photographs.alpha(i) is None
+    once, twice = photographs[1], photographs[1]
+    assert once.data_ptr() == twice.data_ptr()  # views, not copies
+    assert len(list(cache.iterdir())) == 1
+
+
+def test_a_scene_opened_again_is_not_decoded_again(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[int, int]] = []
+    first = open_photographs(files, WHITE, lambda done, count: told.append((done, count)))
+    assert told == [(i, 5) for i in range(1, 6)]
+    monkeypatch.setattr(images, "_decode", refuse_to_decode)
+    again = open_photographs(files, WHITE, lambda done, count: told.append((done, count)))
+    assert len(told) == 5
+    assert all(torch.equal(first[i], again[i]) for i in range(5))
+
+
+def test_what_determines_the_pixels_determines_the_store(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_photographs(files, WHITE)
+    smaller = tuple(replace(file, width=15, height=10) for file in files)
+    other_lens = tuple(replace(file, lens=replace(file.lens, k1=0.1)) for file in files)
+    for count, changed in enumerate([smaller, other_lens, files[::-1], files[:3]], start=2):
+        open_photographs(changed, WHITE)
+        assert len(list(cache.iterdir())) == count
+    open_photographs(files, (0.0, 0.0, 0.0))
+    assert len(list(cache.iterdir())) == 6
+    os.utime(files[0].path, ns=(1, 1))
+    monkeypatch.setattr(images, "_decode", refuse_to_decode)
+    with pytest.raises(AssertionError, match="decoded again"):
+        open_photographs(files, WHITE)
+
+
+def test_writing_into_a_view_does_not_reach_the_store(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+    photographs = open_photographs(files, WHITE)
+    before = photographs[0].clone()
+    photographs[0].zero_()
+    assert torch.equal(open_photographs(files, WHITE)[0], before)
+
+
+def test_a_store_that_was_cut_short_is_made_again(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+    before = open_photographs(files, WHITE)[4].clone()
+    (store,) = cache.iterdir()
+    os.truncate(store, store.stat().st_size - 1)
+    assert torch.equal(open_photographs(files, WHITE)[4], before)
+
+
+def test_transparent_photographs_are_laid_on_the_background(cache: Path, tmp_path: Path) -> None:
+    pixels = np.zeros((2, 3, 4), np.uint8)
+    pixels[0] = (200, 100, 0, 255)
+    pixels[1] = (200, 100, 0, 51)  # a fifth
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    lens = Lens(3, 2, 5.0, 5.0, 1.5, 1.0)
+    photographs = open_photographs([PhotographFile(tmp_path / "a.png", lens, 3, 2, has_alpha=True)], WHITE)
+    assert photographs[0][0, 0].tolist() == [200, 100, 0]
+    assert photographs[0][1, 0].tolist() == [244, 224, 204]
+    alpha = photographs.alpha(0)
+    assert alpha is not None
+    assert alpha[:, 0].tolist() == [255, 51]
+
+
+def test_exif_orientation_is_not_applied(cache: Path, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    file = save(tmp_path / "turned.jpg", 30, 20, exif=exif)
+    assert read_header(file.path) == (30, 20, False)
+    assert open_photographs([file], WHITE)[0].shape == (20, 30, 3)
+
+
+def test_grey_photographs_become_three_equal_channels(cache: Path, tmp_path: Path) -> None:
+    Image.fromarray(np.arange(600, dtype=np.uint8).reshape(20, 30)).save(tmp_path / "grey.png")
+    lens = Lens(30, 20, 50.0, 50.0, 15.0, 10.0)
+    picture = open_photographs([PhotographFile(tmp_path / "grey.png", lens, 30, 20, has_alpha=False)], WHITE)[0]
+    assert (picture == picture[..., :1]).all()
+
+
+def test_a_truncated_jpeg_is_named_and_leaves_no_store(cache: Path, tmp_path: Path) -> None:
+    whole = [save(tmp_path / f"{i}.jpg", 200, 150, seed=i) for i in range(3)]
+    content = whole[1].path.read_bytes()
+    whole[1].path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(SceneError, match=r"1\.jpg cannot be read as a photograph \(.*truncated"):
+        open_photographs(whole, WHITE)
+    assert list(cache.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n" + bytes(40)])
+def test_what_is_no_picture_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "no.png").write_bytes(content)
+    with pytest.raises(SceneError, match=r"no\.png cannot be read"):
+        read_header(tmp_path / "no.png")
+
+
+def test_sixteen_bits_per_colour_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((4, 5), np.uint16)).save(tmp_path / "deep.png")
+    with pytest.raises(SceneError, match=r"deep\.png has pixels of the kind I;16.*8 bits"):
+        read_header(tmp_path / "deep.png")
+
+
+def test_a_full_disk_is_one_error_and_leaves_nothing_behind(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(images.os, "fsync", full)
+    with pytest.raises(SceneError, match=r"disk of .* is full: 0 MB .*XDG_CACHE_HOME"):
+        open_photographs(files, WHITE)
+    assert list(cache.iterdir()) == []
+
+
+def test_without_a_writable_cache_photographs_are_held_in_memory(
+    cache: Path, files: tuple[PhotographFile, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = open_photographs(files, WHITE)
+    cache.rename(cache.with_name("elsewhere"))
+    cache.write_text("a file where the folder should be")
+    held = open_photographs(files, WHITE)
+    assert "cannot be written" in caplog.text
+    assert all(torch.equal(held[i], kept[i]) for i in range(5))
+
+
+def test_stores_that_nobody_opened_for_long_are_forgotten(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+    open_photographs(files, WHITE)
+    open_photographs(files[:2], WHITE)
+    old, young = sorted(cache.iterdir(), key=lambda store: -store.stat().st_size)
+    (cache / "killed.partial").write_bytes(b"half")
+    long_ago = time.time() - 100 * 86400
+    os.utime(old, (long_ago, long_ago))
+    os.utime(cache / "killed.partial", (long_ago, long_ago))
+    open_photographs(files[:3], WHITE)
+    assert young.exists()
+    assert not old.exists()
+    assert not (cache / "killed.partial").exists()

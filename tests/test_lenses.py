@@ -1,0 +1,135 @@
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from tidefield.errors import SceneError
+from tidefield.geometry.lenses import Lens, lens_from_colmap, rectify
+
+CAMERAS = {
+    "SIMPLE_PINHOLE": [210.0, 160.5, 119.0],
+    "PINHOLE": [210.0, 220.0, 160.5, 119.0],
+    "SIMPLE_RADIAL": [210.0, 160.5, 119.0, 0.07],
+    "RADIAL": [280.0, 160.0, 120.0, -0.32, 0.15],
+    "OPENCV": [210.0, 220.0, 163.0, 116.0, -0.2, 0.05, 0.003, -0.004],
+}
+DISTORTED = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+def lens(model: str) -> Lens:
+    return lens_from_colmap(model, 320, 240, CAMERAS[model])
+
+
+def colmap(model: str) -> pycolmap.Camera:
+    return pycolmap.Camera(model=model, width=320, height=240, params=CAMERAS[model])
+
+
+def dots(uv_px: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
+    """A picture of soft dots at given pixels."""
+    v, u = np.mgrid[:height, :width] + 0.5
+    light = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 2.5**2)) for x, y in uv_px)
+    return np.repeat(np.round(250 * np.clip(light, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def centroid(picture: np.ndarray, near_px: np.ndarray, reach: int) -> np.ndarray:
+    x, y = np.floor(near_px).astype(int)
+    window = picture[y - reach : y + reach + 1, x - reach : x + reach + 1, 0].astype(float)
+    v, u = np.mgrid[y - reach : y + reach + 1, x - reach : x + reach + 1] + 0.5
+    return np.array([(u * window).sum(), (v * window).sum()]) / window.sum()
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_points_project_where_colmap_projects_them(model: str) -> None:
+    random = np.random.default_rng(0)
+    xyz = np.concatenate([random.uniform(-0.6, 0.6, (500, 2)), random.uniform(0.9, 3, (500, 1))], axis=1)
+    np.testing.assert_allclose(lens(model).project(xyz), colmap(model).img_from_cam(xyz), atol=1e-9)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_pixels_come_back_from_their_rays_and_agree_with_colmap(model: str) -> None:
+    uv = np.random.default_rng(1).uniform((0, 0), (320, 240), (500, 2))
+    xy = lens(model).unproject(uv)
+    np.testing.assert_allclose(lens(model).project(np.c_[xy, np.ones(500)]), uv, atol=1e-7)
+    np.testing.assert_allclose(xy, colmap(model).cam_from_img(uv), atol=1e-7)
+
+
+def test_the_sixth_order_term_is_opencvs() -> None:
+    own = Lens(320, 240, 200.0, 200.0, 160.0, 120.0, k1=0.1, k2=-0.05, p1=0.002, p2=0.001, k3=0.03)
+    xyz = np.random.default_rng(2).uniform((-0.7, -0.7, 1), (0.7, 0.7, 1), (50, 3))
+    matrix = np.array([[200.0, 0, 160], [0, 200, 120], [0, 0, 1]])
+    theirs, _ = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix, np.array(own.distortion))
+    np.testing.assert_allclose(own.project(xyz), theirs[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"])
+def test_other_camera_models_are_refused_with_a_way_out(model: str) -> None:
+    with pytest.raises(SceneError, match=rf"{model}.*RADIAL.*image_undistorter"):
+        lens_from_colmap(model, 320, 240, [1.0] * 8)
+
+
+def test_unusable_calibrations_are_refused() -> None:
+    with pytest.raises(SceneError, match="3 parameters, expected 4"):
+        lens_from_colmap("PINHOLE", 320, 240, [1.0, 2.0, 3.0])
+    for bad in ([float("nan"), 1.0, 1.0], [0.0, 160.0, 120.0], [-5.0, 160.0, 120.0]):
+        with pytest.raises(SceneError, match="calibrat"):
+            lens_from_colmap("SIMPLE_PINHOLE", 320, 240, bad)
+
+
+def test_pixels_beyond_the_fold_of_a_lens_have_no_ray() -> None:
+    folded = Lens(800, 600, 400.0, 400.0, 400.0, 300.0, k1=-0.3)
+    # r - 0.3 r^3 is greatest at r = 1/sqrt(0.9), where it is 0.7027.
+    xy = folded.undistort(np.array([[0.70, 0.0], [0.71, 0.0], [0.5, 0.0]]))
+    assert np.isfinite(xy[[0, 2]]).all()
+    assert np.isnan(xy[1]).all()
+
+
+@pytest.mark.parametrize("distorted", [*map(lens, DISTORTED), Lens(800, 600, 400.0, 400.0, 400.0, 300.0, k1=-0.3)])
+def test_the_pinhole_sees_only_what_the_photograph_shows_and_reaches_its_border(distorted: Lens) -> None:
+    pinhole = distorted.pinhole()
+    u, v = np.meshgrid(np.linspace(0, pinhole.width, 161), np.linspace(0, pinhole.height, 121))
+    grid = np.stack([u, v], axis=-1).reshape(-1, 2)
+    uv = distorted.project(np.c_[pinhole.unproject(grid), np.ones(len(grid))])
+    size = np.array([distorted.width, distorted.height])
+    assert (uv > -0.1).all()
+    assert (uv < size + 0.1).all()
+    folds = distorted.k1 == -0.3  # there the fold comes before the border
+    assert folds or (uv.min(axis=0) < 0.1).all()
+    assert folds or (uv.max(axis=0) > size - 0.1).all()
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+@pytest.mark.parametrize("reduction", [1, 2])
+def test_dots_end_up_where_the_pinhole_projects_them(model: str, reduction: int) -> None:
+    distorted, pinhole = lens(model), lens(model).pinhole()
+    u, v = np.meshgrid(np.linspace(20, 300, 8), np.linspace(20, 220, 6))
+    rays = np.c_[pinhole.unproject(np.stack([u, v], axis=-1).reshape(-1, 2)), np.ones(48)]
+    result = rectify(dots(distorted.project(rays)), distorted, 320 // reduction, 240 // reduction)
+    expected = pinhole.resized(320 // reduction, 240 // reduction).project(rays)
+    found = np.array([centroid(result, dot, 10 // reduction) for dot in expected])
+    # Distortion makes the dots themselves a little lopsided.
+    assert np.abs(found - expected).max() < 0.15
+    assert np.abs((found - expected).mean(axis=0)).max() < 0.02  # half a pixel lost anywhere would show here
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_undistorted_photographs_have_no_blank_pixels(model: str) -> None:
+    white = np.full((240, 320, 3), 255, np.uint8)
+    assert (rectify(white, lens(model), 320, 240) == 255).all()
+    assert (rectify(white, lens(model), 100, 75) == 255).all()
+
+
+def test_a_photograph_without_distortion_passes_untouched() -> None:
+    photograph = np.random.default_rng(3).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    assert (rectify(photograph, lens("PINHOLE"), 320, 240) == photograph).all()
+    assert lens("PINHOLE").pinhole() == lens("PINHOLE")
+
+
+def test_reduction_is_the_mean_of_the_pixels_that_are_covered() -> None:
+    photograph = np.random.default_rng(4).integers(0, 256, (240, 320, 4), dtype=np.uint8)
+    means = photograph.reshape(60, 4, 80, 4, 4).astype(float).mean(axis=(1, 3))
+    assert np.abs(rectify(photograph, lens("PINHOLE"), 80, 60) - means).max() <= 0.5
+
+
+def test_a_resized_lens_projects_to_resized_pixels() -> None:
+    xyz = np.array([[0.2, -0.3, 1.0]])
+    np.testing.assert_allclose(lens("OPENCV").resized(160, 60).project(xyz), lens("OPENCV").project(xyz) * (0.5, 0.25))
