@@ -127,6 +127,15 @@ def test_black_and_saturated_pixels_are_ignored(value: int):
     assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
 
 
+def test_windows_with_glints_are_ignored_although_their_mean_is_not_clipped():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    for i in range(3, COUNT, 3):
+        photographs.colours[i][::2, : 3 * WIDTH // 4 : 2] = 255
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
+
+
 def test_photographs_that_share_nothing_lean_on_the_ones_before_and_after():
     truth = planted()
     photographs, cameras, points = survey(truth)
