@@ -1,0 +1,47 @@
+"""Products appear whole or not at all."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from tidefield.errors import RunError
+from tidefield.products.files import completed_file
+
+
+def test_a_file_appears_when_it_is_complete(tmp_path: Path):
+    path = tmp_path / "a" / "b" / "map.tif"
+    with completed_file(path) as partial:
+        assert partial.suffix == ".tif"
+        partial.write_bytes(b"whole")
+        assert not path.exists()
+    assert path.read_bytes() == b"whole"
+    assert os.listdir(path.parent) == ["map.tif"]
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path):
+    def fill() -> None:
+        with completed_file(tmp_path / "map.tif") as partial:
+            partial.write_bytes(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(RunError, match=r"map\.tif cannot be written \(No space left on device\)"):
+        fill()
+    assert os.listdir(tmp_path) == []
+
+
+def test_errors_that_no_user_can_mend_pass_through(tmp_path: Path):
+    def stumble() -> None:
+        with completed_file(tmp_path / "map.tif"):
+            raise OSError(errno.EIO, "broken disk")
+
+    with pytest.raises(OSError, match="broken disk"):
+        stumble()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_dangling_link_counts_as_something_that_is_there(tmp_path: Path):
+    (tmp_path / "map.tif").symlink_to(tmp_path / "gone")
+    with pytest.raises(RunError, match="is there already"), completed_file(tmp_path / "map.tif"):
+        pytest.fail("nothing may be written")

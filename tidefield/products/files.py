@@ -1,0 +1,49 @@
+"""Products appear under their final names only when they are complete."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tidefield.errors import RunError
+
+_USERS_TO_MEND = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+
+
+def refuse_existing(*paths: Path) -> None:
+    """Raises: RunError when there is something under one of the names already."""
+    for path in paths:
+        if os.path.lexists(path):
+            raise RunError(f"{path} is there already: expected a new name; choose one, or pass --overwrite")
+
+
+@contextmanager
+def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary name beside `path` to write to; it takes the final name when the block ends, and goes when it fails.
+
+    Raises:
+        RunError: `path` is there already and must not be overwritten, or its folder cannot be written to.
+    """
+    if not overwrite:
+        refuse_existing(path)
+    # The suffix stays, because writers choose their format by it.
+    partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        if error.errno not in _USERS_TO_MEND:
+            raise
+        reason = error.strerror or os.strerror(error.errno)
+        raise RunError(
+            f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
+            "another place"
+        ) from error
+    finally:
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has its final name
+            partial.unlink()
