@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from tidefield.data.exif import read_metadata
+from tidefield.data.exposure import estimate_gains
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
 from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
 from tidefield.data.readers.blender import read_blender
@@ -67,10 +69,11 @@ def load_scene(
     alphas = (photographs.alpha(i) for i in range(len(photographs)))
     see_through = any(alpha is not None and bool((alpha < 255).any()) for alpha in alphas)
     train, test = _split(posed)
+    gain = estimate_gains(photographs, cameras, points, train, read_metadata(posed.paths))
     return Scene(
         root=root,
         names=posed.names,
-        cameras=cameras,
+        cameras=replace(cameras, gain=gain),
         photographs=photographs,
         points=points,
         train=train,

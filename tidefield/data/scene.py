@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from tidefield.data.images import Photographs
+from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 
 
@@ -61,8 +61,6 @@ class Scene:
 
     def index(self, name: str) -> int:
         """Index of a photograph by its name, with or without its suffix."""
-        from tidefield.errors import SceneError
-
         for i, own in enumerate(self.names):
             if name in (own, Path(own).stem, Path(own).name):
                 return i
