@@ -26,7 +26,7 @@ def test_the_nearest_photographs_are_training_photographs_beside_the_camera():
     assert set(plane_sweep.nearest_photographs(scene, scene.cameras[4], 4)) == {2, 3, 5, 6}
 
 
-def test_the_variance_of_the_mean_is_the_textbook_one():
+def test_agreement_is_the_squared_standard_error_of_the_mean_colour():
     scene = wall.scene(wall.cameras(3, step=0.0), test=())
     for value, picture in zip((51, 102, 255), scene.photographs.colours, strict=True):
         picture.fill_(value)
@@ -36,7 +36,8 @@ def test_the_variance_of_the_mean_is_the_textbook_one():
     values = torch.tensor([0.2, 0.4, 1.0])
     torch.testing.assert_close(mean, values.mean().expand_as(mean))
     assert (count == 3).all()
-    torch.testing.assert_close(variance, (3 * values.var() / 3).expand_as(variance))
+    squares = 3 * (values - values.mean()).square().sum() + 3 * plane_sweep.USUAL_SPREAD**2
+    torch.testing.assert_close(variance, (squares / 9).expand_as(variance))
 
 
 def test_where_two_photographs_never_meet_the_middle_plane_is_used():

@@ -20,6 +20,7 @@ from tidefield.model.rendering import Render, Rendering
 DEPTHS = 64
 WINDOW_PX = 5
 NEIGHBOURS = 8
+USUAL_SPREAD = 0.1  # of colours between photographs, per channel; stands in for what too few photographs cannot show
 
 
 def make(scene: Scene, *, depths: int = DEPTHS, neighbours: int = NEIGHBOURS) -> Render:
@@ -87,8 +88,9 @@ def _agreement(
         squares[inside] += colour.square()
         count[inside] += 1
     mean = total / count.clamp(min=1)
-    # The photographs' unbiased variance over their number: a depth that fewer can check does not look better for it.
-    variance = (squares - count * mean.square()).clamp(min=0).sum(-1) / (count * (count - 1)).clamp(min=1)[:, 0]
+    # Squared standard error of the mean, not the bare variance: where few photographs can check a depth, they agree
+    # by chance, and on thin overlap the nearest planes would win for being seen by two.
+    variance = ((squares - count * mean.square()).sum(-1) + 3 * USUAL_SPREAD**2) / count[:, 0].clamp(min=1).square()
     return mean.reshape(*depth.shape, 3), count.reshape(depth.shape), variance.reshape(depth.shape)
 
 
