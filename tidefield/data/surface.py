@@ -38,11 +38,23 @@ def surface_depth(camera: Cameras, points: SparsePoints | None, cameras: Cameras
     """
     assert len(camera) == 1, f"one camera at a time, not {len(camera)}"
     if points is not None:
-        uv, inverse = _visible(camera, points, cameras)
+        uv, inverse = trusted_points(camera, points, cameras)
         if len(uv):
             return _interpolate(camera, uv, inverse)
     middle = 2 / (1 / camera.near_far[0]).sum()
     return middle.expand(camera.height, camera.width).clone()
+
+
+def trusted_points(camera: Cameras, points: SparsePoints, cameras: Cameras) -> tuple[NDArray, NDArray]:
+    """Pixels (P x 2) and inverse z-depths (P) of the points that shape a camera's surface, on and around its image.
+
+    Those that it probably sees, without those that stand apart from all their neighbours in the image.
+    """
+    uv, inverse = _visible(camera, points, cameras)
+    if len(uv):
+        keep = _agree_with_neighbours(uv, inverse - _on_plane(_robust_plane(uv, inverse), uv))
+        uv, inverse = uv[keep], inverse[keep]
+    return uv, inverse
 
 
 def surface_points(camera: Cameras, depth: Float[Tensor, "H W"]) -> Float[Tensor, "P 3"]:
@@ -104,8 +116,6 @@ def _interpolate(camera: Cameras, uv: NDArray, inverse: NDArray) -> Float[Tensor
     width, height = camera.width, camera.height
     plane = _robust_plane(uv, inverse)
     residual = inverse - _on_plane(plane, uv)
-    keep = _agree_with_neighbours(uv, residual)
-    uv, residual, inverse = uv[keep], residual[keep], inverse[keep]
     frame = _frame_pixels(width, height)
     nearest = np.asarray(KDTree(uv).query(frame, k=min(NEIGHBOURS, len(uv)))[1]).reshape(len(frame), -1)
     uv = np.concatenate([uv, frame])

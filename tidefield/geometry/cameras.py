@@ -66,6 +66,14 @@ class Cameras:
         """Unit viewing directions (+z of each camera)."""
         return self.T_world_camera[:, :, 2]
 
+    @property
+    def projection(self) -> Float[Tensor, "V 3 4"]:
+        """P_i of the paper, K_i [R_i | t_i]: world points to homogeneous pixels; the third component is z-depth."""
+        rotation = self.T_world_camera[:, :, :3].transpose(1, 2)
+        view = torch.cat([rotation, -rotation @ self.position_world[:, :, None]], dim=2)
+        depth = view[:, 2:]
+        return torch.cat([self.focal_px[..., None] * view[:, :2] + self.principal_px[..., None] * depth, depth], dim=1)
+
     def project(self, points_world: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
         """Pixels and z-depths of points in every camera.
 
@@ -85,21 +93,23 @@ class Cameras:
         ratio = size / self.size_px
         return replace(self, focal_px=self.focal_px * ratio, principal_px=self.principal_px * ratio, size_px=size)
 
+    def cropped(self, width: int, height: int) -> Cameras:
+        """The same pixels, cut or continued at the right and the bottom."""
+        return replace(self, size_px=self.size_px.new_tensor([width, height]).expand_as(self.size_px))
+
 
 def project(
     cameras: Cameras, points_world: Float[Tensor, "V P 3"]
 ) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
     """Project each camera's own P points: pixels and z-depths.
 
-    The projection matrix P_i of the paper (3 x 4) is K_i [R_i | t_i] with [R_i | t_i] the inverse of
-    `T_world_camera`.
+    Points at or behind a camera have z <= 0 and meaningless pixels: test z before using them.
     """
-    rotation = cameras.T_world_camera[:, :, :3]
-    xyz = (points_world - cameras.position_world[:, None]) @ rotation
-    z = xyz[..., 2]
+    matrix = cameras.projection
+    homogeneous = points_world @ matrix[:, :, :3].transpose(1, 2) + matrix[:, None, :, 3]
+    z = homogeneous[..., 2]
     # Keeps the division finite for points in the camera's plane; they are invalid by z <= 0 or out of the image.
-    z_safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
-    uv = xyz[..., :2] / z_safe[..., None] * cameras.focal_px[:, None] + cameras.principal_px[:, None]
+    uv = homogeneous[..., :2] / torch.where(z.abs() < 1e-9, 1e-9, z)[..., None]
     return uv, z
 
 

@@ -1,0 +1,170 @@
+"""Presets and what they are made of: plain values, no behaviour, no heavy imports.
+
+A run stores its `Config` as JSON beside its weights; `config_from_json` reads it back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from tidefield.errors import RunError
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """The feature network (Table 1)."""
+
+    widths: tuple[int, int, int, int] = (64, 64, 128, 256)
+    """Channels of the 7x7 convolution and of the three residual stages."""
+    blocks: tuple[int, int, int] = (3, 4, 6)
+    """Basic blocks of the residual stages; ResNet-34 has 3, 4, 6."""
+    instance_norm: bool = True
+    """Instance norms in place of ResNet's batch norms; without them features do not depend on how much is encoded."""
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One pass along the rays; each looks closer where the one before expects the surface."""
+
+    stride: int
+    """Pixels between rays: 4 means one ray for 4 x 4 pixels."""
+    samples: int
+    """M, samples along a ray."""
+    feature_stride: int
+    """Pixels between the texels of the feature maps that this stage reads: 4, 2 or 1."""
+    feature_channels: int
+    """C, channels of these maps."""
+    hidden: int
+    """Channels of the aggregated features and of the ray transformer."""
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """The per-scene field: a multi-resolution hash grid under scene contraction."""
+
+    levels: int = 12
+    features: int = 2
+    log2_entries: int = 17
+    coarsest: int = 16
+    finest: int = 2048
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The network of the paper's Figure 2."""
+
+    encoder: EncoderConfig
+    stages: tuple[StageConfig, ...]
+    views: int
+    """N, neighbouring views; 0 leaves the per-scene field alone, a NeRF."""
+    fold: bool
+    """Apply the aggregation's first layer to the feature maps, once per photograph instead of once per sample."""
+    heads: int = 4
+    """Attention heads of the ray transformer."""
+    harmonics_degree: int = 3
+    """J of eq. 8."""
+    reach: float = 2.0
+    """Half-width of a finer stage's interval, in standard deviations of the coarser one's weights."""
+    guided: bool = True
+    """Begin from what is known: look around the sparse points' surface first, and around each coarser stage's depth."""
+    field: FieldConfig | None = None
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How the network is trained."""
+
+    tile_px: int
+    """Side of the square tiles that rays are drawn in."""
+    tiles: int
+    """Tiles per step."""
+    crop_px: int | None
+    """Side of the crops of the neighbours that are encoded for a tile; None encodes whole photographs."""
+    learning_rate: float
+    field_learning_rate: float = 1e-2
+    warm_up: int = 50
+    """Steps over which the learning rate rises."""
+    depth_weight: float = 0.0
+    """Weight of the sparse points' depths in the loss (method.md, section 13)."""
+    neighbours: Literal["seen", "direction"] = "seen"
+    """How neighbours are ranked: by what the target sees, or by viewing direction alone, as the paper does."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All that a run needs to be repeated, besides its scene and its seed."""
+
+    preset: str
+    network: NetworkConfig
+    train: TrainConfig
+
+
+PAPER = Config(
+    preset="paper",
+    network=NetworkConfig(
+        encoder=EncoderConfig(),
+        stages=(StageConfig(stride=1, samples=64, feature_stride=4, feature_channels=64, hidden=64),),
+        views=8,
+        fold=False,
+        guided=False,
+    ),
+    train=TrainConfig(tile_px=8, tiles=8, crop_px=None, learning_rate=5e-4, neighbours="direction"),
+)
+SWIFT = Config(
+    preset="swift",
+    network=NetworkConfig(
+        encoder=EncoderConfig(widths=(16, 16, 32, 64), blocks=(1, 1, 1), instance_norm=False),
+        stages=(
+            StageConfig(stride=4, samples=24, feature_stride=4, feature_channels=32, hidden=32),
+            StageConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
+        ),
+        views=5,
+        fold=True,
+    ),
+    train=TrainConfig(tile_px=32, tiles=4, crop_px=96, learning_rate=3e-3),
+)
+PRESETS = {"paper": PAPER, "swift": SWIFT}
+
+
+def config_to_json(config: Config) -> dict[str, Any]:
+    return dataclasses.asdict(config)
+
+
+def config_from_json(data: Any) -> Config:
+    """The Config of a JSON object.
+
+    Raises:
+        RunError: when a field is missing, unknown or of another type.
+    """
+    return _build(Config, data, "config")
+
+
+def _build(kind: Any, data: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        if not isinstance(data, dict) or set(data) != set(hints):
+            wrong = set(data) ^ set(hints) if isinstance(data, dict) else type(data).__name__
+            raise RunError(f"{where} does not fit this version ({wrong}): expected {sorted(hints)}; train it again")
+        return kind(**{name: _build(hint, data[name], f"{where}.{name}") for name, hint in hints.items()})  # type: ignore[operator]
+    if origin is tuple:
+        kinds = arguments[:1] * len(data) if isinstance(data, list) and arguments[-1] is ... else arguments
+        if not isinstance(data, list) or len(data) != len(kinds):
+            raise RunError(f"{where} is {data!r}: expected a list of {len(kinds)}; train it again")
+        return tuple(_build(k, value, f"{where}[{i}]") for i, (k, value) in enumerate(zip(kinds, data, strict=True)))
+    if origin in (typing.Union, types.UnionType):
+        inner = next(k for k in arguments if k is not type(None))
+        return None if data is None else _build(inner, data, where)
+    if origin is Literal:
+        if data not in arguments:
+            raise RunError(f"{where} is {data!r}: expected one of {arguments}")
+        return data
+    if kind is float and isinstance(data, int) and not isinstance(data, bool):
+        return float(data)
+    if type(data) is not kind:
+        raise RunError(f"{where} is {data!r}: expected {kind.__name__}")
+    return data

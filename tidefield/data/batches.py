@@ -1,0 +1,160 @@
+"""Training batches: tiles of training photographs, and their neighbours.
+
+Alphabet: T tiles of S x S pixels, R = S^2 rays, N neighbours, K crops or photographs to encode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tidefield.config import TrainConfig
+from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
+from tidefield.data.prior import read_prior, surface_prior
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Tiles to learn from. All colours are at the common exposure.
+
+    Attributes:
+        targets: the tiles' photographs.
+        corner_px: the tiles' upper left pixel corners.
+        colours: the truth.
+        inside: whether a pixel lies in its photograph; small photographs may be smaller than a tile.
+        neighbours: photographs serving as the tiles' neighbouring views.
+        which: for each neighbour, the image of `images` to read.
+        images: what to encode, in groups of one size: crops of, or whole, photographs.
+        image_corner_px: where in their photographs the images' upper left corners lie.
+    """
+
+    targets: Int[Tensor, " T"]
+    corner_px: Float[Tensor, "T 2"]
+    colours: Float[Tensor, "T R 3"]
+    inside: Bool[Tensor, "T R"]
+    neighbours: Int[Tensor, "T N"]
+    which: Int[Tensor, "T N"]
+    images: tuple[Float[Tensor, "_ 3 _ _"], ...]
+    image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
+
+
+class Surfaces:
+    """The prior of every camera of a scene (`surface_prior`), made when first asked for."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._priors: dict[int, Tensor] = {}
+
+    def __getitem__(self, index: int) -> Float[Tensor, "3 h w"]:
+        if index not in self._priors:
+            cameras = self.scene.cameras
+            self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras)
+        return self._priors[index]
+
+
+def even(scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)) -> Float[Tensor, "h w 3"]:
+    """A part of a photograph at the common exposure: divided by its gain (method.md, section 12)."""
+    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])
+
+
+def tile_surface(
+    camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "T 2"], side_px: int
+) -> Float[Tensor, "T 5 3"]:
+    """Surface points that a tile shows: its middle and four points towards its corners."""
+    spots = corner_px.new_tensor([[0.5, 0.5], [0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]])
+    uv = corner_px[:, None] + spots * side_px
+    uv = torch.minimum(uv.clamp(min=0), camera.size_px[0].to(uv))
+    expected, near, far = read_prior(prior[None], uv.reshape(1, -1, 2))
+    inverse = torch.where(expected.isnan(), (near + far) / 2, expected)
+    return (camera.position_world[:, None] + camera.directions_world(uv.reshape(1, -1, 2)) / inverse[..., None]).reshape(
+        -1, 5, 3
+    )
+
+
+def choose_neighbours(
+    camera: Cameras,
+    surface_world: Float[Tensor, "T 5 3"],
+    scene: Scene,
+    count: int,
+    strategy: str,
+    excluded: int | None = None,
+) -> Int[Tensor, "T N"]:
+    """Training photographs that serve as neighbouring views of one camera's tiles, best first."""
+    train = torch.tensor(scene.train)
+    candidates = scene.cameras[train]
+    if strategy == "direction":
+        rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
+    else:
+        rank = rank_by_view(camera, surface_world, candidates)
+    out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
+    return train[nearest(rank, out, count)]
+
+
+def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int, generator: torch.Generator) -> Batch:
+    """Random tiles of random training photographs."""
+    side = config.tile_px
+    train = torch.tensor(scene.train)
+    per_photograph = config.tiles if config.crop_px is None else 1
+    picks = torch.randint(len(train), (config.tiles // per_photograph,), generator=generator)
+    targets = train[picks].repeat_interleave(per_photograph)
+    size = scene.cameras.size_px[targets]
+    room = (size - side + 1).clamp(min=1)
+    corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
+    surfaces_world, neighbours = [], []
+    for target, at in zip(targets.tolist(), corner, strict=True):
+        camera = scene.cameras[target]
+        surface = tile_surface(camera, surfaces[target], at[None], side)
+        surfaces_world.append(surface[0, 0])
+        neighbours.append(choose_neighbours(camera, surface, scene, views, config.neighbours, target)[0])
+    chosen = torch.stack(neighbours)
+    colours, inside = zip(*(_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)))
+    if config.crop_px is None:
+        which, images, corners = _whole(scene, chosen)
+    else:
+        which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
+    return Batch(targets, corner, torch.stack(colours), torch.stack(inside), chosen, which, images, corners)
+
+
+def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
+    """Colours of a tile's pixels, and which of them the photograph has."""
+    u, v = corner.tolist()
+    pixels = even(scene, index, slice(v, v + side), slice(u, u + side))
+    height, width = pixels.shape[:2]
+    colours, inside = torch.zeros(side, side, 3), torch.zeros(side, side, dtype=torch.bool)
+    colours[:height, :width], inside[:height, :width] = pixels, True
+    return colours.reshape(-1, 3), inside.reshape(-1)
+
+
+def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Every neighbour once, in groups of one size."""
+    photographs, which = neighbours.unique(return_inverse=True)
+    sizes, group = scene.cameras.size_px[photographs].unique(dim=0, return_inverse=True)
+    order = group.argsort(stable=True)
+    images = tuple(
+        torch.stack([even(scene, int(i)).permute(2, 0, 1) for i in photographs[group == g]]) for g in range(len(sizes))
+    )
+    return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images)
+
+
+def _crops(
+    scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"], side: int
+) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """A crop of each tile's every neighbour around where the tile's middle is seen."""
+    flat = neighbours.reshape(-1)
+    cameras = scene.cameras[flat]
+    points = middle_world.repeat_interleave(neighbours.shape[1], 0)
+    homogeneous = (cameras.projection @ torch.cat([points, torch.ones(len(points), 1)], 1)[..., None])[..., 0]
+    uv = homogeneous[:, :2] / homogeneous[:, 2:].clamp(min=1e-6)
+    width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
+    extent = torch.tensor([width, height])
+    corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())
+    crops = [
+        even(scene, i, slice(v, v + height), slice(u, u + width)).permute(2, 0, 1)
+        for i, (u, v) in zip(flat.tolist(), corner.long().tolist(), strict=True)
+    ]
+    return torch.arange(len(flat)).reshape(neighbours.shape), (torch.stack(crops),), (corner,)

@@ -1,0 +1,74 @@
+"""Where along a camera's rays to look first: what the sparse points tell before any learning (method.md, section 13)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from tidefield.data.scene import SparsePoints
+from tidefield.data.surface import surface_depth, trusted_points
+from tidefield.geometry.cameras import Cameras
+
+STRIDE = 4
+"""Pixels between the prior's cells."""
+AROUND = 12
+"""Sparse points whose depths span a cell's interval."""
+MARGIN = 0.1
+"""Share of the image's depth range by which the interval goes beyond these points ..."""
+LONELY_MARGIN = 0.5
+"""... and where the nearest of them is a tenth of the image's width away."""
+PARALLAX_MARGIN = 0.01
+"""Share of the depth by which it goes beyond them in any case."""
+
+
+def surface_prior(camera: Cameras, points: SparsePoints | None, cameras: Cameras) -> Float[Tensor, "3 h w"]:
+    """Expected, nearest and farthest inverse z-depth of one camera's pixels, on cells of `STRIDE` pixels.
+
+    Expected is the surface through the sparse points; the interval spans the points around, with a margin that grows
+    where they are few. Without points nothing is expected (NaN) and the interval is the camera's near to far.
+    """
+    width, height = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
+    near, far = 1 / camera.near_far[0]
+    if points is None:
+        return torch.stack([torch.full_like(near, torch.nan), near, far])[:, None, None].expand(3, height, width)
+    # The cells of a grid of ceil(W / 4) columns are 4 pixels wide only if the camera is widened to match.
+    cells = camera.cropped(width * STRIDE, height * STRIDE).resized(width, height)
+    expected = 1 / surface_depth(cells, points, cameras)
+    uv, inverse = trusted_points(cells, points, cameras)
+    if len(uv) < AROUND:
+        return torch.stack([expected, near.expand_as(expected), far.expand_as(expected)])
+    lowest, highest, distance = _span(uv, inverse, width, height)
+    spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
+    lonely = np.minimum(distance / (0.1 * width), 1.0)
+    margin = spread * (MARGIN + (LONELY_MARGIN - MARGIN) * lonely) + PARALLAX_MARGIN * np.median(inverse)
+    lowest, highest = (torch.from_numpy(x).to(expected) for x in (lowest - margin, highest + margin))
+    highest = torch.maximum(highest, expected * (1 + PARALLAX_MARGIN)).clamp(max=near.item())
+    lowest = torch.minimum(lowest, expected * (1 - PARALLAX_MARGIN)).clamp(min=far.item())
+    return torch.stack([expected.clamp(far.item(), near.item()), highest, lowest])
+
+
+def read_prior(
+    priors: Float[Tensor, "T 3 h w"], uv_px: Float[Tensor, "T R 2"]
+) -> tuple[Float[Tensor, "T R"], Float[Tensor, "T R"], Float[Tensor, "T R"]]:
+    """Expected, nearest and farthest inverse depth at pixels, interpolated; beyond the image its border continues."""
+    height, width = priors.shape[-2:]
+    grid = uv_px / (STRIDE * uv_px.new_tensor([width, height])) * 2 - 1
+    values = F.grid_sample(priors, grid[:, :, None], padding_mode="border", align_corners=False)[..., 0]
+    expected, near, far = values.unbind(1)
+    return expected, near, far
+
+
+def _span(
+    uv: np.ndarray, inverse: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least and greatest inverse depth of the points around each cell, and the distance to the nearest, in cells."""
+    from scipy.spatial import KDTree
+
+    v, u = np.mgrid[:height, :width] + 0.5
+    distance, index = KDTree(uv).query(np.stack([u, v], -1).reshape(-1, 2), k=AROUND)
+    around = inverse[index]
+    shape = (height, width)
+    return around.min(1).reshape(shape), around.max(1).reshape(shape), distance[:, 0].reshape(shape)

@@ -1,0 +1,112 @@
+"""What the neighbouring views say of a sample: pooling with direction weights (paper, eq. 6 and Figure 2).
+
+Alphabet: T tiles, N views, P samples of a tile, C channels, H hidden channels. Views come before samples, so that a
+mean over views is a sum of N contiguous slabs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a source says of P samples per tile.
+
+    Attributes:
+        density: F_sigma, the feature that the ray transformer turns into density.
+        per_view: F_N,i, the feature of each view; None where there are no views.
+        view_weight: w_n,i in (0, 1), how far each view is to be believed; 0 where it is invalid.
+        mean_colour: the views' colours averaged with the direction weights; middle grey where there are none.
+        valid: whether anything is known of the sample.
+    """
+
+    density: Float[Tensor, "T P H"]
+    per_view: Float[Tensor, "T N P H"]
+    view_weight: Float[Tensor, "T N P"]
+    mean_colour: Float[Tensor, "T P 3"]
+    valid: Bool[Tensor, "T P"]
+
+
+def direction_weights(
+    cosine: Float[Tensor, "T N P"], valid: Bool[Tensor, "T N P"], sharpness: Float[Tensor, ""]
+) -> Float[Tensor, "T N P"]:
+    """Eq. 6: w~_i = max(0, exp(s (d.d_i - 1)) - min_j exp(s (d.d_j - 1))), normalised over the views.
+
+    Invalid views take no part in the minimum nor in the sum and get 0. Where every w~ is 0 (one view, or all at the
+    same angle) the valid views share equally (method.md, section 4).
+
+    Args:
+        cosine: d.d_i between the unit directions from the target's and from each view's camera to the sample.
+        valid: whether the view sees the sample.
+        sharpness: s, learnable.
+    """
+    closeness = torch.exp(sharpness * (cosine - 1))
+    least = closeness.masked_fill(~valid, math.inf).amin(1, keepdim=True)
+    raw = (closeness - least).clamp(min=0).masked_fill(~valid, 0.0)
+    total = raw.sum(1, keepdim=True)
+    shared = valid / valid.sum(1, keepdim=True).clamp(min=1)
+    # Below 1e-6 the differences are rounding of equal angles, not a preference.
+    tied = total < 1e-6
+    return torch.where(tied, shared, raw / total.masked_fill(tied, 1.0))
+
+
+def weighted_moments(
+    values: Float[Tensor, "T N P C"], weight: Float[Tensor, "T N P"]
+) -> tuple[Float[Tensor, "T P C"], Float[Tensor, "T P C"]]:
+    """Mean and variance over the views; the weights sum to 1 or, where no view is valid, to 0."""
+    w = weight[..., None]
+    mean = (w * values).sum(1)
+    return mean, (w * (values - mean[:, None]).square()).sum(1)
+
+
+class Aggregate(nn.Module):
+    """[F_i, mu, v] -> F_N,i and w_n,i -> pooled again by w_n -> F_sigma (Figure 2; method.md, section 5).
+
+    Args:
+        channels: C of the gathered features.
+        hidden: H.
+        folded: the part of the first layer that acts on F_i has been applied to the feature maps already (it commutes
+            with bilinear interpolation), so channels == hidden and F_i enters as it is.
+    """
+
+    def __init__(self, channels: int, hidden: int, folded: bool) -> None:
+        super().__init__()
+        assert not folded or channels == hidden, "a folded first layer hands on its outputs"
+        # exp keeps s positive; 20 separates views 20 degrees apart by a factor of 3.
+        self.log_sharpness = nn.Parameter(torch.tensor(math.log(20.0)))
+        self.own = nn.Identity() if folded else nn.Linear(channels, hidden)
+        self.shared = nn.Linear(2 * channels, hidden)
+        self.second = nn.Linear(hidden, hidden)
+        self.trust = nn.Linear(hidden, 1)
+        self.density = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
+
+    def forward(
+        self,
+        features: Float[Tensor, "T N P C"],
+        colours: Float[Tensor, "T N P 3"],
+        cosine: Float[Tensor, "T N P"],
+        valid: Bool[Tensor, "T N P"],
+    ) -> Evidence:
+        weight = direction_weights(cosine, valid, self.log_sharpness.exp())
+        mean, variance = weighted_moments(features, weight)
+        # A linear layer of [F_i, mu, v] is a sum of linear layers; the shared part is computed once for all views.
+        shared = self.shared(torch.cat([mean, variance], dim=-1))
+        per_view = F.relu(self.second(F.relu(self.own(features) + shared[:, None])))
+        trust = torch.sigmoid(self.trust(per_view)[..., 0]) * valid
+        seen = valid.any(1)
+        # Where no view is valid the sum is 0, and so are the pooled features.
+        pooled = weighted_moments(per_view, trust / trust.sum(1, keepdim=True).clamp(min=1e-6))
+        return Evidence(
+            density=self.density(torch.cat(pooled, dim=-1)),
+            per_view=per_view,
+            view_weight=trust,
+            mean_colour=(weight[..., None] * colours).sum(1) + 0.5 * ~seen[..., None],
+            valid=seen,
+        )

@@ -1,0 +1,161 @@
+"""The network of the paper's Figure 2: neighbouring views in, colours and depths of rays out.
+
+Alphabet: T tiles, R rays of a tile, M samples of a ray, P = R M, N views, C channels, H hidden channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tidefield.config import NetworkConfig
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.colour import ColourBlend
+from tidefield.model.compositing import composite
+from tidefield.model.encoder import Encoder
+from tidefield.model.field import Field
+from tidefield.model.gather import FeatureMaps, maps_from_images
+from tidefield.model.intervals import Intervals, refined, sample, spread_of
+from tidefield.model.stage import Stage, place_samples
+from tidefield.model.views import Views
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """T square tiles of target views.
+
+    Attributes:
+        cameras: the target camera of each tile.
+        corner_px: each tile's upper left pixel corner.
+        side_px: width and height of the tiles, pixels; they may reach beyond the image.
+    """
+
+    cameras: Cameras
+    corner_px: Float[Tensor, "T 2"]
+    side_px: int
+
+    def rays_px(self, stride: int, margin: int) -> Float[Tensor, "T R 2"]:
+        """Pixels of a tile's rays: centres of stride x stride squares, with `margin` more around the tile."""
+        count = -(-self.side_px // stride)
+        line = (torch.arange(-margin, count + margin, device=self.corner_px.device) + 0.5) * stride
+        v, u = torch.meshgrid(line, line, indexing="ij")
+        return self.corner_px[:, None] + torch.stack([u, v], dim=-1).reshape(1, -1, 2)
+
+
+@dataclass(frozen=True)
+class TileRendering:
+    """Rendered tiles, at the common exposure.
+
+    Attributes:
+        colour: without what lies behind the scene; add (1 - opacity) times the background.
+        depth: expected z-depth.
+        opacity: sum of the weights.
+        expected: per stage, the mean inverse depth of its rays, margin included.
+        glimpses: per stage but the last, colours of its rays (margin included) as far as it can tell: the neighbours'
+            mean colours under its weights.
+    """
+
+    colour: Float[Tensor, "T R 3"]
+    depth: Float[Tensor, "T R"]
+    opacity: Float[Tensor, "T R"]
+    expected: tuple[Float[Tensor, "T _"], ...]
+    glimpses: tuple[Float[Tensor, "T _ 3"], ...]
+
+
+class Network(nn.Module):
+    """Features of the neighbours -> samples -> evidence -> ray transformer -> density and colour -> rendering."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        if config.views:
+            wanted = {s.feature_stride: s.feature_channels for s in config.stages}
+            self.encoder = Encoder(config.encoder, tuple(sorted(wanted.items(), reverse=True)))
+            self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
+        self.field = Field(config.field) if config.field else None
+        field_channels = self.field.channels if self.field else 0
+        self.stages = nn.ModuleList(Stage(config, stage, field_channels) for stage in config.stages)
+        self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree)
+
+    def forward(
+        self,
+        tiles: Tiles,
+        views: Views | None,
+        start: Intervals,
+        opaque: bool,
+        generator: torch.Generator | None = None,
+    ) -> TileRendering:
+        """Render tiles.
+
+        Args:
+            tiles: what to render.
+            views: the tiles' neighbours; None with the per-scene field alone.
+            start: intervals of the first stage's rays (`first_rays_px`).
+            opaque: light that passes all samples is stopped by the last; False lets it through to the background.
+            generator: jitters samples, for training.
+        """
+        intervals, expected, glimpses = start, [], []
+        unit = self.field.unit if self.field and not views else None
+        for k, stage in enumerate(self.stages):
+            uv = tiles.rays_px(stage.stride, self.margin(k))
+            samples = place_samples(tiles.cameras, uv, intervals, sample(intervals, stage.samples, generator))
+            field = self.field(samples.points_world) if self.field else None
+            gathered = views.read(stage.feature_stride, samples.points_world, samples.directions) if views else None
+            evidence = stage.evidence(gathered, field)
+            w = stage.weights(evidence, samples, intervals, opaque, unit)
+            mean, spread = spread_of(w, samples.place)
+            expected.append(intervals.near + (intervals.far - intervals.near) * mean)
+            if k + 1 < len(self.stages):
+                glimpses.append(composite(w, evidence.mean_colour.unflatten(1, w.shape[1:])))
+                ratio = stage.stride // self.stages[k + 1].stride
+                reach, margin = self.config.reach, self.margin(k + 1)
+                intervals = refined(intervals, mean.detach(), spread.detach(), ratio, reach, margin)
+        colours = self.colour(evidence, gathered, samples.directions)
+        return TileRendering(
+            colour=composite(w, colours.unflatten(1, w.shape[1:])),
+            depth=1 / expected[-1],
+            opacity=w.sum(-1),
+            expected=tuple(expected),
+            glimpses=tuple(glimpses),
+        )
+
+    def margin(self, stage: int) -> int:
+        """Rays around a tile that a stage adds, for the next one to interpolate between."""
+        return int(stage + 1 < len(self.stages))
+
+    def first_rays_px(self, tiles: Tiles) -> Float[Tensor, "T R 2"]:
+        """Pixels at which `forward` wants its start intervals."""
+        return tiles.rays_px(self.config.stages[0].stride, self.margin(0))
+
+    def encode(
+        self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None
+    ) -> dict[int, FeatureMaps]:
+        """Features of photographs of one size, or of crops, with the photographs themselves as first channels.
+
+        Args:
+            photographs: colours at the common exposure.
+            corner_px: where in their photographs the crops' upper left corners lie; None for whole photographs.
+        """
+        corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
+        features = self.encoder(photographs)
+        maps = {}
+        for stride, feature in zip(self.encoder.strides, features, strict=True):
+            colours = self._colours(photographs, stride)
+            maps[stride] = maps_from_images(torch.cat([colours, feature.float()], dim=1), corner, stride)
+        return maps
+
+    def _colours(self, photographs: Float[Tensor, "K 3 H W"], stride: int) -> Float[Tensor, "K 3 h w"]:
+        """The photographs on the texels of a map: averaged if coarse, else sharpened against the bilinear reading.
+
+        The sharpening filter is learned, begins as none, and sums to one.
+        """
+        if stride > 1:
+            odd = stride + 1 - stride % 2
+            return F.avg_pool2d(photographs, odd, stride, odd // 2, count_include_pad=False)
+        planes = F.pad(photographs.flatten(0, 1)[:, None], (2, 2, 2, 2), mode="replicate")
+        detail = F.conv2d(planes, self.sharpen - self.sharpen.mean())
+        return photographs + detail.reshape(photographs.shape)

@@ -1,0 +1,133 @@
+"""One pass along the rays: samples, what is known of them, and the weights with which they make the picture.
+
+Alphabet: T tiles, R rays of a tile, M samples of a ray, P = R M, H hidden channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tidefield.config import NetworkConfig, StageConfig
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.aggregate import Aggregate, Evidence
+from tidefield.model.compositing import weights
+from tidefield.model.intervals import Intervals
+from tidefield.model.ray_transformer import RayTransformer
+from tidefield.model.views import Gathered
+
+
+@dataclass(frozen=True)
+class Samples:
+    """M samples on each of R rays.
+
+    Attributes:
+        place: 0 at the near end of the ray's interval, 1 at the far end.
+        inverse_depth: inverse z-depth.
+        points_world: X, all rays' samples one after the other.
+        directions: d, unit, from the target's camera.
+        delta: distance along the ray to the next sample; from the last one, to the interval's far end.
+    """
+
+    place: Float[Tensor, "T R M"]
+    inverse_depth: Float[Tensor, "T R M"]
+    points_world: Float[Tensor, "T P 3"]
+    directions: Float[Tensor, "T P 3"]
+    delta: Float[Tensor, "T R M"]
+
+
+def place_samples(
+    cameras: Cameras, uv_px: Float[Tensor, "T R 2"], intervals: Intervals, place: Float[Tensor, "T R M"]
+) -> Samples:
+    """Samples on the rays through pixels, at given places of the rays' intervals."""
+    inverse_depth = intervals.inverse_depth(place)
+    depth = 1 / inverse_depth
+    ray = cameras.directions_world(uv_px)
+    length = ray.norm(dim=-1, keepdim=True)
+    points = cameras.position_world[:, None, None] + ray[:, :, None] * depth[..., None]
+    ends = torch.cat([depth, (1 / intervals.far)[..., None]], dim=-1) * length
+    unit = (ray / length)[:, :, None].expand_as(points)
+    return Samples(place, inverse_depth, points.flatten(1, 2), unit.flatten(1, 2), ends.diff(dim=-1).clamp(min=0))
+
+
+class Stage(nn.Module):
+    """Evidence, ray transformer and density of one pass."""
+
+    def __init__(self, network: NetworkConfig, config: StageConfig, field_channels: int) -> None:
+        super().__init__()
+        self.samples = config.samples
+        self.stride, self.feature_stride = config.stride, config.feature_stride
+        hidden = config.hidden
+        self.hidden = hidden
+        if network.views:
+            self.aggregate = Aggregate(config.feature_channels, hidden, network.fold)
+            self.transformer = RayTransformer(hidden, network.heads)
+        if field_channels:
+            self.from_field = nn.Sequential(nn.Linear(field_channels, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
+        self.density = nn.Linear(hidden, 1)
+        self.guided = network.guided
+        if network.guided:
+            self.guide = nn.Linear(3, hidden)
+            # At the start: density where the surface is expected, within about a sample; the network corrects it.
+            self.guide_height = nn.Parameter(torch.tensor(2.0))
+            self.guide_steepness = nn.Parameter(torch.tensor(1.0))
+            nn.init.zeros_(self.density.weight)
+            nn.init.zeros_(self.density.bias)
+
+    def evidence(self, gathered: Gathered | None, field: Float[Tensor, "T P F"] | None) -> Evidence:
+        """What the neighbours and the per-scene field say of the samples; their density features add up."""
+        if gathered is None:
+            assert field is not None, "a network without views needs a field"
+            tiles, count = field.shape[:2]
+            empty = field.new_zeros(tiles, 0, count, self.hidden)
+            known = torch.ones(tiles, count, dtype=torch.bool, device=field.device)
+            grey = field.new_full((tiles, count, 3), 0.5)
+            return Evidence(self.from_field(field), empty, empty[..., 0], grey, known)
+        evidence = self.aggregate(gathered.features, gathered.colours, gathered.cosine, gathered.valid)
+        if field is None:
+            return evidence
+        return replace(
+            evidence, density=evidence.density + self.from_field(field), valid=torch.ones_like(evidence.valid)
+        )
+
+    def weights(
+        self, evidence: Evidence, samples: Samples, intervals: Intervals, opaque: bool, unit: Float[Tensor, ""] | None
+    ) -> Float[Tensor, "T R M"]:
+        """How much each sample contributes to its ray.
+
+        Density is predicted per unit of length. With views the unit is the mean spacing of the ray's samples, which the
+        features resolve, whatever the scene's scale; a field, which must say the same from everywhere, brings its own.
+        """
+        shape = samples.place.shape
+        x = evidence.density.unflatten(1, shape[1:])
+        valid = evidence.valid.unflatten(1, shape[1:])
+        bias: Tensor | float = 0.0
+        if self.guided:
+            x, bias = self._guide(x, samples, intervals)
+        if hasattr(self, "transformer"):
+            rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
+            x = self.transformer(*rays).unflatten(0, shape[:2])
+        length = samples.delta.mean(-1, keepdim=True) if unit is None else unit
+        sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
+        delta = samples.delta
+        if opaque:
+            delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)
+        return weights(sigma, delta)
+
+    def _guide(
+        self, x: Float[Tensor, "T R M H"], samples: Samples, intervals: Intervals
+    ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
+        """Tell the samples where the surface is expected: as a feature, and as a bias of their density."""
+        expected = intervals.place(intervals.expected)
+        known = expected.isfinite()[..., None]
+        # In samples, so that it means the same for any number of them and any interval.
+        offset = (samples.place - expected[..., None]) * samples.place.shape[-1]
+        offset = torch.where(known, offset, 0.0)
+        features = torch.stack([offset / 4, torch.exp(-(offset / 2) ** 2), torch.exp(-(offset / 8) ** 2)], dim=-1)
+        # Beyond the floor it would shut off, for good, samples that the views may yet find to be the surface.
+        bias = (self.guide_height - self.guide_steepness * offset.square()).clamp(min=-4)
+        return x + self.guide(features) * known[..., None], torch.where(known, bias, 0.0)

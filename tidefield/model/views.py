@@ -1,0 +1,76 @@
+"""The neighbouring views of a batch of tiles, read at samples: projection and gathering (method.md, section 3).
+
+Alphabet: T tiles, N views, K maps, P samples of a tile, C channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.gather import FeatureMaps, gather
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What N views show at P samples.
+
+    Attributes:
+        colours: C_i, at the common exposure.
+        features: F_i.
+        directions: d_i, unit, from each view's camera to the sample.
+        cosine: d.d_i with the target's direction.
+        valid: whether the sample is in front of the camera and inside the encoded part of the photograph.
+    """
+
+    colours: Float[Tensor, "T N P 3"]
+    features: Float[Tensor, "T N P C"]
+    directions: Float[Tensor, "T N P 3"]
+    cosine: Float[Tensor, "T N P"]
+    valid: Bool[Tensor, "T N P"]
+
+
+@dataclass(frozen=True)
+class Views:
+    """N neighbouring photographs for each of T tiles, encoded: {(I_i, P_i, F_i)} of the paper.
+
+    Attributes:
+        cameras: of the T N views, tile by tile.
+        which: the map of each view.
+        maps: by feature stride; the first three channels are the photograph itself at the common exposure.
+    """
+
+    cameras: Cameras
+    which: Int[Tensor, "T N"]
+    maps: dict[int, FeatureMaps]
+
+    def read(
+        self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"]
+    ) -> Gathered:
+        """Project samples into every view and read the maps of one stride there.
+
+        Args:
+            directions: d, unit, from the target's camera to the samples.
+        """
+        tiles, count = self.which.shape
+        matrix = self.cameras.projection.unflatten(0, (tiles, count))
+        homogeneous = points_world[:, None] @ matrix[..., :3].transpose(2, 3) + matrix[:, :, None, :, 3]
+        z = homogeneous[..., 2:]
+        front = z > 1e-6
+        uv = homogeneous[..., :2] / torch.where(front, z, 1.0)
+        size = self.cameras.size_px.reshape(tiles, count, 1, 2)
+        inside = front[..., 0] & (uv >= 0).all(-1) & (uv <= size).all(-1)
+        values, on_map = gather(self.maps[stride], self.which, uv)
+        offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
+        theirs = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+        return Gathered(
+            colours=values[..., :3],
+            features=values[..., 3:],
+            directions=theirs,
+            cosine=(theirs * directions[:, None]).sum(-1),
+            valid=inside & on_map,
+        )
