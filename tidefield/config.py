@@ -67,8 +67,8 @@ class NetworkConfig:
     """Attention heads of the ray transformer."""
     harmonics_degree: int = 3
     """J of eq. 8."""
-    reach: float = 2.0
-    """Half-width of a finer stage's interval, in standard deviations of the coarser one's weights."""
+    doubt: float = 0.05
+    """Share of a finer stage's samples that are spread evenly instead of where the coarser stage saw the surface."""
     guided: bool = True
     """Begin from what is known: look around the sparse points' surface first, and around each coarser stage's depth."""
     field: FieldConfig | None = None

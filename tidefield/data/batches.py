@@ -71,9 +71,9 @@ def tile_surface(
     uv = torch.minimum(uv.clamp(min=0), camera.size_px[0].to(uv))
     expected, near, far = read_prior(prior[None], uv.reshape(1, -1, 2))
     inverse = torch.where(expected.isnan(), (near + far) / 2, expected)
-    return (camera.position_world[:, None] + camera.directions_world(uv.reshape(1, -1, 2)) / inverse[..., None]).reshape(
-        -1, 5, 3
-    )
+    return (
+        camera.position_world[:, None] + camera.directions_world(uv.reshape(1, -1, 2)) / inverse[..., None]
+    ).reshape(-1, 5, 3)
 
 
 def choose_neighbours(

@@ -16,9 +16,7 @@ ANGLE_SCALE_RAD = 0.35
 """Angle at which a view that sees the whole tile is worth as much as one straight on that sees 1 / e of it."""
 
 
-def rank_by_view(
-    targets: Cameras, surface_world: Float[Tensor, "T S 3"], candidates: Cameras
-) -> Float[Tensor, "T V"]:
+def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "T S 3"], candidates: Cameras) -> Float[Tensor, "T V"]:
     """How well each candidate shows what a target sees: share of the surface points in its frame times closeness.
 
     Closeness falls with the mean angle subtended at the points between the target's and the candidate's rays, so it
@@ -40,9 +38,7 @@ def rank_by_direction(targets: Cameras, candidates: Cameras) -> Float[Tensor, "T
     return (targets.forward_world @ candidates.forward_world.T + 1) / 2
 
 
-def nearest(
-    rank: Float[Tensor, "T V"], excluded: Bool[Tensor, "T V"], count: int
-) -> Int[Tensor, "T N"]:
+def nearest(rank: Float[Tensor, "T V"], excluded: Bool[Tensor, "T V"], count: int) -> Int[Tensor, "T N"]:
     """The `count` best-ranked candidates of each tile, best first; fewer where there are not as many.
 
     Args:

@@ -61,9 +61,7 @@ def read_prior(
     return expected, near, far
 
 
-def _span(
-    uv: np.ndarray, inverse: np.ndarray, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _span(uv: np.ndarray, inverse: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least and greatest inverse depth of the points around each cell, and the distance to the nearest, in cells."""
     from scipy.spatial import KDTree
 

@@ -24,6 +24,7 @@ class Evidence:
         per_view: F_N,i, the feature of each view; None where there are no views.
         view_weight: w_n,i in (0, 1), how far each view is to be believed; 0 where it is invalid.
         mean_colour: the views' colours averaged with the direction weights; middle grey where there are none.
+        disagreement: how differently the views see the sample: a weighted sum of the variances of their features.
         valid: whether anything is known of the sample.
     """
 
@@ -31,6 +32,7 @@ class Evidence:
     per_view: Float[Tensor, "T N P H"]
     view_weight: Float[Tensor, "T N P"]
     mean_colour: Float[Tensor, "T P 3"]
+    disagreement: Float[Tensor, "T P"]
     valid: Bool[Tensor, "T P"]
 
 
@@ -85,6 +87,7 @@ class Aggregate(nn.Module):
         self.shared = nn.Linear(2 * channels, hidden)
         self.second = nn.Linear(hidden, hidden)
         self.trust = nn.Linear(hidden, 1)
+        self.metric = nn.Parameter(torch.full((channels,), -math.log(channels)))
         self.density = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
 
     def forward(
@@ -108,5 +111,6 @@ class Aggregate(nn.Module):
             per_view=per_view,
             view_weight=trust,
             mean_colour=(weight[..., None] * colours).sum(1) + 0.5 * ~seen[..., None],
+            disagreement=variance @ self.metric.exp(),
             valid=seen,
         )

@@ -30,8 +30,7 @@ class Encoder(nn.Module):
         self.strides = tuple(stride for stride, _ in outputs)
         self.stem = _ConvNorm(3, w0, 7, 2, norm)
         self.stages = nn.ModuleList(
-            _stage(i, o, n, norm)
-            for i, o, n in zip((w0, w1, w2), (w1, w2, w3), config.blocks, strict=True)
+            _stage(i, o, n, norm) for i, o, n in zip((w0, w1, w2), (w1, w2, w3), config.blocks, strict=True)
         )
         # Skips at strides 8 and 4 (layers 3 and 2 of Table 1), then, for finer outputs, 2 (layer 1) and 1 (the input).
         channels, skips = (w3, w2, w1, w0, min(w0, 8)), (w2, w1, w0, 3)

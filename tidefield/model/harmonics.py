@@ -42,9 +42,7 @@ def basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K
     return torch.stack(columns, dim=-1)
 
 
-def expand(
-    coefficients: Float[Tensor, "*B 3 K"], basis_values: Float[Tensor, "*B K"]
-) -> Float[Tensor, "*B 3"]:
+def expand(coefficients: Float[Tensor, "*B 3 K"], basis_values: Float[Tensor, "*B K"]) -> Float[Tensor, "*B 3"]:
     """Colour of eq. 8: sum_jm c_j^m Y_j^m, per channel."""
     return (coefficients * basis_values[..., None, :]).sum(-1)
 

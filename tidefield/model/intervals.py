@@ -40,60 +40,59 @@ class Intervals:
         return self.near[..., None] + (self.far - self.near)[..., None] * place
 
 
-def sample(intervals: Intervals, count: int, generator: torch.Generator | None) -> Float[Tensor, "T R M"]:
-    """Places of `count` samples per ray, one in each of as many equal parts.
+def sample(density: Float[Tensor, "T R B"], count: int, generator: torch.Generator | None) -> Float[Tensor, "T R M"]:
+    """Places of `count` samples per ray, one in each of as many parts of equal probability.
 
     Args:
+        density: not negative and not normalised, over B equal bins from near to far.
         generator: jitters the samples within their parts, for training; None puts them in the middle.
     """
-    tiles, rays = intervals.near.shape
-    device = intervals.near.device
+    tiles, rays, bins = density.shape
+    device = density.device
     if generator is None:
         jitter = torch.full((1, 1, count), 0.5, device=device)
     else:
         jitter = torch.rand(tiles, rays, count, generator=generator, device=device)
-    return ((torch.arange(count, device=device) + jitter) / count).expand(tiles, rays, count)
-
-
-def spread_of(
-    weights: Float[Tensor, "T R M"], place: Float[Tensor, "T R M"]
-) -> tuple[Float[Tensor, "T R"], Float[Tensor, "T R"]]:
-    """Mean place of a ray's weights and their standard deviation, which is at least that within one sample's part."""
-    total = weights.sum(-1).clamp(min=1e-6)
-    mean = (weights * place).sum(-1) / total
-    variance = (weights * (place - mean[..., None]).square()).sum(-1) / total
-    within = 1 / (12 * place.shape[-1] ** 2)
-    return mean, (variance + within).sqrt()
+    wanted = ((torch.arange(count, device=device) + jitter) / count).expand(tiles, rays, count).contiguous()
+    if bins == 1:
+        return wanted
+    below = F.pad(density.cumsum(-1), (1, 0))
+    below = below / below[..., -1:]
+    bin_ = (torch.searchsorted(below, wanted, right=True) - 1).clamp(0, bins - 1)
+    low, high = below.gather(-1, bin_), below.gather(-1, bin_ + 1)
+    return (bin_ + (wanted - low) / (high - low).clamp(min=1e-9)) / bins
 
 
 def refined(
-    intervals: Intervals,
-    mean: Float[Tensor, "T R"],
-    spread: Float[Tensor, "T R"],
-    ratio: int,
-    reach: float,
-    margin: int,
-) -> Intervals:
-    """Intervals of the next stage's rays, `ratio` times as dense: the coarse rays' mean +- reach x spread.
+    intervals: Intervals, density: Float[Tensor, "T R B"], ratio: int, margin: int
+) -> tuple[Intervals, Float[Tensor, "T r B"]]:
+    """Intervals of the next stage's rays, `ratio` times as dense, and where in them to look.
 
-    The outermost coarse rays are a margin that finer rays lean on; of the finer rays `margin` on each side stay. At
-    each coarse ray the interval is widened to hold its eight neighbours' means, so that both sides of an edge are
-    looked at; then ends and expectation are interpolated.
+    Coarse rays' densities are interpolated like their intervals, so that a ray beside an edge looks at both of its
+    sides. The outermost coarse rays are a margin for this; of the finer rays `margin` on each side stay.
     """
-    tiles, rays = mean.shape
+    tiles, rays, _ = density.shape
     side = round(rays**0.5)
-    inverse = (intervals.near + (intervals.far - intervals.near) * mean).reshape(tiles, 1, side, side)
-    half = (reach * spread * (intervals.near - intervals.far)).reshape(tiles, 1, side, side)
-    highest = F.max_pool2d(inverse, 3, 1, 1)
-    lowest = -F.max_pool2d(-inverse, 3, 1, 1)
-    ends = torch.cat([torch.maximum(inverse + half, highest), torch.minimum(inverse - half, lowest), inverse], dim=1)
+    known = torch.stack([intervals.near, intervals.far, intervals.expected], dim=-1)
+    grid = torch.cat([known, density], dim=-1).transpose(1, 2).reshape(tiles, -1, side, side)
     if ratio > 1:
-        ends = F.interpolate(ends, scale_factor=ratio, mode="bilinear", align_corners=False)
+        grid = F.interpolate(grid, scale_factor=ratio, mode="bilinear", align_corners=False)
     cut = ratio - margin
-    side = ends.shape[-1] - cut
-    inner = ends[:, :, cut:side, cut:side].flatten(2)
-    near, far, expected = inner.unbind(1)
-    # An inverse depth of 0 is at infinity; beyond it lies behind the camera.
-    tiniest = 1e-6 * near.abs().clamp(min=1e-12)
-    far = far.clamp(min=0) + tiniest
-    return Intervals(near=torch.maximum(near, far * (1 + 1e-4)), far=far, expected=expected)
+    inner = grid[:, :, cut : grid.shape[2] - cut, cut : grid.shape[3] - cut].flatten(2).transpose(1, 2)
+    near, far, expected = inner[..., :3].unbind(-1)
+    return Intervals(near, far, expected), inner[..., 3:]
+
+
+def histogram(
+    weights: Float[Tensor, "T R M"], place: Float[Tensor, "T R M"], bins: int, floor: float
+) -> Float[Tensor, "T R B"]:
+    """Weights at places as a density over equal bins; `floor` of the whole is spread evenly, lest anything be ruled out.
+
+    Every weight is shared by the two bins whose middles it lies between.
+    """
+    spot = (place * bins - 0.5).clamp(0, bins - 1)
+    low = spot.floor().clamp(max=bins - 2)
+    part = spot - low
+    result = torch.zeros(*weights.shape[:2], bins, device=weights.device, dtype=weights.dtype)
+    result.scatter_add_(2, low.long(), weights * (1 - part)).scatter_add_(2, low.long() + 1, weights * part)
+    return (1 - floor) * result + floor / bins

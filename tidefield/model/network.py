@@ -19,7 +19,7 @@ from tidefield.model.compositing import composite
 from tidefield.model.encoder import Encoder
 from tidefield.model.field import Field
 from tidefield.model.gather import FeatureMaps, maps_from_images
-from tidefield.model.intervals import Intervals, refined, sample, spread_of
+from tidefield.model.intervals import Intervals, histogram, refined, sample
 from tidefield.model.stage import Stage, place_samples
 from tidefield.model.views import Views
 
@@ -75,6 +75,9 @@ class Network(nn.Module):
         if config.views:
             wanted = {s.feature_stride: s.feature_channels for s in config.stages}
             self.encoder = Encoder(config.encoder, tuple(sorted(wanted.items(), reverse=True)))
+            self.descriptors = nn.ModuleDict(
+                {str(s): nn.Conv2d(3, c, 5, padding=2, padding_mode="replicate", bias=False) for s, c in wanted.items()}
+            )
             self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
         self.field = Field(config.field) if config.field else None
         field_channels = self.field.channels if self.field else 0
@@ -99,21 +102,21 @@ class Network(nn.Module):
             generator: jitters samples, for training.
         """
         intervals, expected, glimpses = start, [], []
+        density = torch.ones_like(start.near)[..., None]
         unit = self.field.unit if self.field and not views else None
         for k, stage in enumerate(self.stages):
             uv = tiles.rays_px(stage.stride, self.margin(k))
-            samples = place_samples(tiles.cameras, uv, intervals, sample(intervals, stage.samples, generator))
+            samples = place_samples(tiles.cameras, uv, intervals, sample(density, stage.samples, generator))
             field = self.field(samples.points_world) if self.field else None
             gathered = views.read(stage.feature_stride, samples.points_world, samples.directions) if views else None
             evidence = stage.evidence(gathered, field)
             w = stage.weights(evidence, samples, intervals, opaque, unit)
-            mean, spread = spread_of(w, samples.place)
-            expected.append(intervals.near + (intervals.far - intervals.near) * mean)
+            expected.append((w * samples.inverse_depth).sum(-1) / w.sum(-1).clamp(min=1e-6))
             if k + 1 < len(self.stages):
                 glimpses.append(composite(w, evidence.mean_colour.unflatten(1, w.shape[1:])))
                 ratio = stage.stride // self.stages[k + 1].stride
-                reach, margin = self.config.reach, self.margin(k + 1)
-                intervals = refined(intervals, mean.detach(), spread.detach(), ratio, reach, margin)
+                density = histogram(w.detach(), samples.place, stage.samples, self.config.doubt)
+                intervals, density = refined(intervals, density, ratio, self.margin(k + 1))
         colours = self.colour(evidence, gathered, samples.directions)
         return TileRendering(
             colour=composite(w, colours.unflatten(1, w.shape[1:])),
@@ -145,7 +148,8 @@ class Network(nn.Module):
         maps = {}
         for stride, feature in zip(self.encoder.strides, features, strict=True):
             colours = self._colours(photographs, stride)
-            maps[stride] = maps_from_images(torch.cat([colours, feature.float()], dim=1), corner, stride)
+            feature = feature.float() + self.descriptors[str(stride)](colours)
+            maps[stride] = maps_from_images(torch.cat([colours, feature], dim=1), corner, stride)
         return maps
 
     def _colours(self, photographs: Float[Tensor, "K 3 H W"], stride: int) -> Float[Tensor, "K 3 h w"]:

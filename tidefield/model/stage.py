@@ -20,6 +20,9 @@ from tidefield.model.intervals import Intervals
 from tidefield.model.ray_transformer import RayTransformer
 from tidefield.model.views import Gathered
 
+NOISE = 1e-4
+"""Variance of a colour below which views agree: 2.5 of 255 levels."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -73,6 +76,7 @@ class Stage(nn.Module):
         if network.guided:
             self.guide = nn.Linear(3, hidden)
             # At the start: density where the surface is expected, within about a sample; the network corrects it.
+            self.match = nn.Parameter(torch.tensor(1.0))
             self.guide_height = nn.Parameter(torch.tensor(2.0))
             self.guide_steepness = nn.Parameter(torch.tensor(1.0))
             nn.init.zeros_(self.density.weight)
@@ -86,7 +90,7 @@ class Stage(nn.Module):
             empty = field.new_zeros(tiles, 0, count, self.hidden)
             known = torch.ones(tiles, count, dtype=torch.bool, device=field.device)
             grey = field.new_full((tiles, count, 3), 0.5)
-            return Evidence(self.from_field(field), empty, empty[..., 0], grey, known)
+            return Evidence(self.from_field(field), empty, empty[..., 0], grey, grey[..., 0] * 0, known)
         evidence = self.aggregate(gathered.features, gathered.colours, gathered.cosine, gathered.valid)
         if field is None:
             return evidence
@@ -108,6 +112,8 @@ class Stage(nn.Module):
         bias: Tensor | float = 0.0
         if self.guided:
             x, bias = self._guide(x, samples, intervals)
+            difference = torch.log(evidence.disagreement.unflatten(1, shape[1:]) + NOISE).masked_fill(~valid, 9.0)
+            bias = bias - self.match * (difference - difference.amin(-1, keepdim=True))
         if hasattr(self, "transformer"):
             rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
             x = self.transformer(*rays).unflatten(0, shape[:2])
@@ -127,7 +133,7 @@ class Stage(nn.Module):
         # In samples, so that it means the same for any number of them and any interval.
         offset = (samples.place - expected[..., None]) * samples.place.shape[-1]
         offset = torch.where(known, offset, 0.0)
-        features = torch.stack([offset / 4, torch.exp(-(offset / 2) ** 2), torch.exp(-(offset / 8) ** 2)], dim=-1)
+        features = torch.stack([offset / 4, torch.exp(-((offset / 2) ** 2)), torch.exp(-((offset / 8) ** 2))], dim=-1)
         # Beyond the floor it would shut off, for good, samples that the views may yet find to be the surface.
         bias = (self.guide_height - self.guide_steepness * offset.square()).clamp(min=-4)
         return x + self.guide(features) * known[..., None], torch.where(known, bias, 0.0)

@@ -48,9 +48,7 @@ class Views:
     which: Int[Tensor, "T N"]
     maps: dict[int, FeatureMaps]
 
-    def read(
-        self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"]
-    ) -> Gathered:
+    def read(self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"]) -> Gathered:
         """Project samples into every view and read the maps of one stride there.
 
         Args:
