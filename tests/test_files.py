@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.products.files import completed_file
+from tidefield.files import completed_file
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path):

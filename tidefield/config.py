@@ -88,8 +88,6 @@ class TrainConfig:
     field_learning_rate: float = 1e-2
     warm_up: int = 50
     """Steps over which the learning rate rises."""
-    depth_weight: float = 0.0
-    """Weight of the sparse points' depths in the loss (method.md, section 13)."""
     neighbours: Literal["seen", "direction"] = "seen"
     """How neighbours are ranked: by what the target sees, or by viewing direction alone, as the paper does."""
 

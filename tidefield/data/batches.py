@@ -5,7 +5,7 @@ Alphabet: T tiles of S x S pixels, R = S^2 rays, N neighbours, K crops or photog
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,12 @@ class Batch:
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
+
+    def to(self, device: torch.device) -> Batch:
+        def moved(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
+            return tuple(v.to(device) for v in value) if isinstance(value, tuple) else value.to(device)
+
+        return Batch(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
 
 
 class Surfaces:
@@ -112,12 +118,15 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
         surfaces_world.append(surface[0, 0])
         neighbours.append(choose_neighbours(camera, surface, scene, views, config.neighbours, target)[0])
     chosen = torch.stack(neighbours)
-    colours, inside = zip(*(_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)))
-    if config.crop_px is None:
+    tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
+    colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
+    if not views:
+        which, images, corners = chosen, (), ()
+    elif config.crop_px is None:
         which, images, corners = _whole(scene, chosen)
     else:
         which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
-    return Batch(targets, corner, torch.stack(colours), torch.stack(inside), chosen, which, images, corners)
+    return Batch(targets, corner, colours, inside, chosen, which, images, corners)
 
 
 def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:

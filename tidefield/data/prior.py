@@ -1,4 +1,4 @@
-"""Where along a camera's rays to look first: what the sparse points tell before any learning (method.md, section 13)."""
+"""Where along a camera's rays to look first: what the sparse points tell (method.md, section 13)."""
 
 from __future__ import annotations
 

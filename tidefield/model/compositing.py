@@ -14,7 +14,8 @@ from torch import Tensor
 def weights(sigma: Float[Tensor, "*R M"], delta: Float[Tensor, "*R M"]) -> Float[Tensor, "*R M"]:
     """w_i = T_i (1 - exp(-sigma_i delta_i)), T_i = exp(-sum_{j<i} sigma_j delta_j), eqs. 3 and 4.
 
-    The last delta may be infinite (what lies behind the last sample): the weights then sum to 1 if its sigma is positive.
+    The last delta may be infinite (what lies behind the last sample): the weights then sum to 1 where its sigma is
+    positive.
     """
     # An infinite interval stops all light and what reaches it is known; through exp(-sigma inf) gradients were NaN.
     endless = delta.isinf()

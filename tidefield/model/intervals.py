@@ -52,7 +52,7 @@ def sample(density: Float[Tensor, "T R B"], count: int, generator: torch.Generat
     if generator is None:
         jitter = torch.full((1, 1, count), 0.5, device=device)
     else:
-        jitter = torch.rand(tiles, rays, count, generator=generator, device=device)
+        jitter = torch.rand(tiles, rays, count, generator=generator).to(device)
     wanted = ((torch.arange(count, device=device) + jitter) / count).expand(tiles, rays, count).contiguous()
     if bins == 1:
         return wanted
@@ -86,7 +86,7 @@ def refined(
 def histogram(
     weights: Float[Tensor, "T R M"], place: Float[Tensor, "T R M"], bins: int, floor: float
 ) -> Float[Tensor, "T R B"]:
-    """Weights at places as a density over equal bins; `floor` of the whole is spread evenly, lest anything be ruled out.
+    """Weights at places as a density over equal bins; `floor` of the whole is spread evenly, so nothing is ruled out.
 
     Every weight is shared by the two bins whose middles it lies between.
     """

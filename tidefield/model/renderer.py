@@ -61,10 +61,8 @@ class Renderer:
         colour = picture([p.colour.cpu() for p in parts])
         opacity = picture([p.opacity.cpu() for p in parts])
         depth = picture([p.depth.cpu() for p in parts])[..., 0]
-        if scene.background_rgb is None:
-            behind = self.fallback * camera.gain[0]
-        else:
-            behind = torch.tensor(scene.background_rgb)
+        white = scene.background_rgb
+        behind = self.fallback * camera.gain[0] if white is None else torch.tensor(white)
         colour = colour * camera.gain[0] + (1 - opacity) * behind
         return Rendering(colour=colour.clamp(0, 1), depth=depth, opacity=opacity[..., 0].clamp(0, 1))
 

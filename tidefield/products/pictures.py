@@ -11,8 +11,8 @@ from PIL import Image, PngImagePlugin
 from torch import Tensor
 
 from tidefield.errors import RunError
+from tidefield.files import completed_file, refuse_existing
 from tidefield.model.rendering import Rendering
-from tidefield.products.files import completed_file, refuse_existing
 
 SEEN_OPACITY = 0.5
 """Where the scene stopped less light than this, a depth means nothing."""

@@ -13,8 +13,8 @@ from av.video.reformatter import Colorspace
 from jaxtyping import UInt8
 
 from tidefield.errors import RunError
+from tidefield.files import completed_file
 from tidefield.model.rendering import Rendering
-from tidefield.products.files import completed_file
 from tidefield.products.pictures import to_8bit
 
 QUALITY = {"crf": "18", "preset": "medium"}

@@ -1,4 +1,4 @@
-"""Products appear under their final names only when they are complete."""
+"""Files appear under their final names only when they are complete."""
 
 from __future__ import annotations
 
