@@ -1,5 +1,27 @@
-"""Shapes are checked in every test: jaxtyping's annotations, enforced by beartype."""
+"""How all tests run: shapes checked (jaxtyping's annotations, enforced by beartype), one thread, slow tests on request."""
 
+import pytest
 from jaxtyping import install_import_hook
 
 install_import_hook("tidefield", "beartype.beartype")
+
+import torch  # noqa: E402 (the hook comes before anything that might import tidefield)
+
+torch.set_num_threads(1)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="run the tests that take more than a minute, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip, and say so, what was not asked for and what this machine cannot run."""
+    skips = {}
+    if not config.getoption("--slow"):
+        skips["slow"] = pytest.mark.skip(reason="takes more than a minute; run with --slow")
+    if not torch.cuda.is_available():
+        skips["gpu"] = pytest.mark.skip(reason="needs a CUDA device, and there is none")
+    for item in items:
+        for marker, skip in skips.items():
+            if item.get_closest_marker(marker) is not None:
+                item.add_marker(skip)

@@ -1,7 +1,16 @@
+"""Both ways of reading pictures at pixels: photographs for the baselines, feature maps for the network."""
+
+from itertools import pairwise
+
+import pytest
 import textured_wall as wall
 import torch
+from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.baselines.gather import fill_unseen, read_photograph
+from tidefield.model.gather import gather, maps_from_images, weighted_rows
+from tidefield.model.renderer import joined
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -33,3 +42,109 @@ def test_filling_keeps_what_was_seen_and_continues_it():
 def test_nothing_seen_is_grey():
     filled = fill_unseen(torch.rand(4, 5, 3), torch.zeros(4, 5, dtype=torch.bool))
     assert (filled == 0.5).all()
+
+
+def images(count: int = 3, height: int = 7, width: int = 9, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(count, 4, height, width, generator=generator, dtype=torch.float64)
+
+
+def corners(count: int = 3) -> Tensor:
+    return torch.tensor([[0.0, 0.0], [12.0, 5.0], [3.0, 8.0], [1.0, 0.0]])[:count]
+
+
+def spots(images: Tensor, corner: Tensor, stride: int, count: int = 200, seed: int = 1) -> Tensor:
+    """Pixels on and around each map, K P 2."""
+    extent = torch.tensor(images.shape[:1:-1]) * stride
+    drawn = torch.rand(len(images), count, 2, generator=torch.Generator().manual_seed(seed))
+    return corner[:, None] + (drawn * 1.4 - 0.2) * extent
+
+
+def naive(image: Tensor, corner: Tensor, stride: int, uv: Tensor) -> Tensor:
+    """`grid_sample` on one map whose first texel is centred at the corner's first pixel, P C."""
+    size = torch.tensor(image.shape[:0:-1])
+    place = (uv - corner - 0.5) / stride
+    grid = ((place + 0.5) / size * 2 - 1).to(image)
+    return F.grid_sample(image[None], grid[None, None], padding_mode="border", align_corners=False)[0, :, 0].T
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+@pytest.mark.parametrize("size", [(7, 9), (1, 9), (7, 1), (1, 1)])
+def test_feature_maps_are_read_as_grid_sample_reads_them(stride: int, size: tuple[int, int]):
+    pictures, corner = images(3, *size), corners()
+    uv = spots(pictures, corner, stride)
+    values, inside = gather(maps_from_images(pictures, corner, stride), torch.tensor([[0, 1, 2]]), uv[None])
+    extent = torch.tensor(size[::-1]) * stride
+    first = corner + 0.5 - stride / 2
+    expected_inside = ((uv >= first[:, None]) & (uv <= (first + extent)[:, None])).all(-1)
+    assert torch.equal(inside[0], expected_inside)
+    assert inside.any()
+    assert not inside.all()
+    for k in range(3):
+        expected = naive(pictures[k], corner[k], stride, uv[k])
+        torch.testing.assert_close(values[0, k][inside[0, k]], expected[inside[0, k]], atol=1e-5, rtol=1e-5)
+
+
+def test_at_stride_one_pixel_centres_give_the_pixels():
+    pictures = images(1)
+    uv = torch.tensor([[0.5, 0.5], [8.5, 6.5], [3.5, 2.5]])
+    values, inside = gather(maps_from_images(pictures, corners(1), 1), torch.tensor([[0]]), uv[None, None])
+    assert inside.all()
+    torch.testing.assert_close(values[0, 0], pictures[0][:, [0, 6, 2], [0, 8, 3]].T)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_maps_of_several_sizes_are_read_as_one_set(stride: int):
+    groups = [images(2, 7, 9, seed=1), images(1, 4, 3, seed=2), images(1, 1, 5, seed=3)]
+    corner = corners(4)
+    parts = [maps_from_images(g, c, stride) for g, c in zip(groups, corner.split([2, 1, 1]), strict=True)]
+    maps = joined(parts)
+    every = [image for g in groups for image in g]
+    which = torch.tensor([[3, 0], [1, 2], [2, 2]])
+    uv = torch.stack([spots(every[k][None], corner[k][None], stride)[0] for k in which.reshape(-1)])
+    values, inside = gather(maps, which, uv.unflatten(0, which.shape))
+    for t, n in [(t, n) for t in range(3) for n in range(2)]:
+        k = int(which[t, n])
+        expected = naive(every[k], corner[k], stride, uv[2 * t + n])
+        seen = inside[t, n]
+        assert seen.any()
+        torch.testing.assert_close(values[t, n][seen], expected[seen], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(7, 9), (1, 9), (7, 1)])
+def test_gradients_of_reading_are_those_of_grid_sample(size: tuple[int, int]):
+    ours, theirs = images(2, *size).requires_grad_(), images(2, *size).requires_grad_()
+    corner, stride = corners(2), 2
+    uv = spots(ours, corner, stride)
+    weight = torch.randn(2, 200, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    values, inside = gather(maps_from_images(ours, corner, stride), torch.tensor([[0, 1]]), uv[None])
+    weight = weight * inside[0, ..., None]
+    (values[0] * weight).sum().backward()
+    sum((naive(theirs[k], corner[k], stride, uv[k]) * weight[k]).sum() for k in range(2)).backward()  # type: ignore[union-attr]
+    assert ours.grad is not None
+    assert theirs.grad is not None
+    torch.testing.assert_close(ours.grad, theirs.grad, atol=1e-4, rtol=1e-4)
+
+
+def test_reading_is_continuous_from_texel_to_texel():
+    pictures = images(1)
+    line = torch.stack([torch.linspace(0, 9, 3001), torch.full((3001,), 3.3)], -1)
+    values, inside = gather(maps_from_images(pictures, corners(1), 1), torch.tensor([[0]]), line[None, None])
+    assert inside.all()
+    assert max((b - a).abs().max() for a, b in pairwise(values[0, 0])) < 0.02
+
+
+def test_meaningless_pixels_are_off_the_map_and_give_finite_values():
+    uv = torch.tensor([[torch.nan, 3.0], [torch.inf, 3.0], [-torch.inf, -torch.inf], [1e30, -1e30], [-1e9, 2.0]])
+    values, inside = gather(maps_from_images(images(1), corners(1), 2), torch.tensor([[0]]), uv[None, None])
+    assert not inside.any()
+    assert values.isfinite().all()
+
+
+def test_weighted_rows_are_sums_with_the_right_gradient():
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    index = torch.tensor([[0, 5, 5], [2, 1, 0]])
+    share = torch.rand(2, 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(weighted_rows(rows, index, share), (rows[index] * share[..., None]).sum(1))
+    assert torch.autograd.gradcheck(lambda r: weighted_rows(r, index, share), rows.requires_grad_())

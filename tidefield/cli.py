@@ -6,6 +6,7 @@ Only what is needed to answer --help is imported here; torch and the rest are im
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,6 +202,9 @@ def demo(
 
 def _begin(talk: Talk) -> object:
     """Set up messages; returns the console that commands print to."""
+    # Before torch is imported: threads that wait spinning for work take the cores from those that have some, and on a
+    # busy machine a step takes ten times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from rich.console import Console
     from rich.logging import RichHandler
 

@@ -111,7 +111,9 @@ class Network(nn.Module):
             gathered = views.read(stage.feature_stride, samples.points_world, samples.directions) if views else None
             evidence = stage.evidence(gathered, field)
             w = stage.weights(evidence, samples, intervals, opaque, unit)
-            expected.append((w * samples.inverse_depth).sum(-1) / w.sum(-1).clamp(min=1e-6))
+            # A ray that nothing stops is said to end in the middle of its samples.
+            w_known = w + 1e-6 / w.shape[-1]
+            expected.append((w_known * samples.inverse_depth).sum(-1) / w_known.sum(-1))
             if k + 1 < len(self.stages):
                 glimpses.append(composite(w, evidence.mean_colour.unflatten(1, w.shape[1:])))
                 ratio = stage.stride // self.stages[k + 1].stride

@@ -1,0 +1,54 @@
+# Every target sets up what it needs in a virtual environment of its own, once.
+PYTHON ?= python3
+VENV ?= .venv
+OUT ?= tidefield-demo
+ARGS ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt
+REQUIRED := pyproject.toml constraints.txt $(VENV)/.made
+
+.PHONY: demo test bench lint clean help
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo     the whole job on the built-in scene, into $(OUT)/ (OUT=FOLDER for another)"
+	@echo "make test     the tests (ARGS=... for pytest)"
+	@echo "make bench    the benchmarks (ARGS=... for them)"
+	@echo "make lint     ruff and pyright"
+	@echo "make clean    remove the virtual environment, which the next target makes again"
+	@echo "PYTHON=python3.12 chooses another Python than python3, before the environment is made."
+
+demo: $(VENV)/.installed
+	$(BIN)/tidefield demo $(OUT) $(ARGS)
+
+# Sharing these small tensor operations between threads costs more than it gains, many times more on busy cores.
+test: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+
+bench: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks $(ARGS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+clean:
+	rm -rf $(VENV)
+
+$(VENV)/.made:
+	@command -v $(PYTHON) > /dev/null || \
+		{ echo "There is no $(PYTHON) here: expected Python 3.11 or newer; install it or name it, as in PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.version_info >= (3, 11) or sys.exit("$(PYTHON) is Python " + v + ": expected 3.11 or newer; name one, as in: make $(MAKECMDGOALS) PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+# Editable, so that only new requirements make it install again.
+$(VENV)/.installed: $(REQUIRED)
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/.installed-dev: $(REQUIRED)
+	$(PIP) -e '.[dev]'
+	touch $(VENV)/.installed $@
