@@ -1,4 +1,4 @@
-"""How all tests run: shapes checked (jaxtyping's annotations, enforced by beartype), one thread, slow tests on request."""
+"""How all tests run: shapes checked (jaxtyping, enforced by beartype), on one thread, the slow ones on request."""
 
 import pytest
 from jaxtyping import install_import_hook

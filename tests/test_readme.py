@@ -24,8 +24,8 @@ def blocks(language: str) -> list[str]:
 
 def command_lines(program: str) -> list[str]:
     """Of the code blocks, indented lines and inline code."""
-    code = "\n".join([*blocks("sh"), *re.findall(r"^    (.*)$", README, flags=re.MULTILINE), *re.findall(r"`([^`]+)`", README)])
-    lines = [line.split("  #")[0].strip() for line in code.splitlines()]
+    indented, inline = re.findall(r"^    (.*)$", README, flags=re.MULTILINE), re.findall(r"`([^`\n]+)`", README)
+    lines = [line.split("  #")[0].strip() for line in [*"\n".join(blocks("sh")).splitlines(), *indented, *inline]]
     return sorted({line for line in lines if line.startswith(program + " ")})
 
 
@@ -61,7 +61,7 @@ def test_the_python_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_the_tree_names_every_file_and_no_other() -> None:
-    (tree,) = [block for block in blocks("") if block.startswith("tidefield/\n")]
+    (tree,) = [block for block in blocks("text") if block.startswith("tidefield/\n")]
     folders, named = [], set()
     for line in tree.splitlines():
         depth, (name, *purpose) = (len(line) - len(line.lstrip())) // 4, line.split()
