@@ -30,9 +30,7 @@ def scene() -> tuple[Evidence, Gathered, Tensor]:
     direction = unit(generator, T, P)
     theirs = F.normalize(direction[:, None] + 0.3 * unit(generator, T, N, P), dim=-1)
     cosine = (theirs * direction[:, None]).sum(-1)
-    evidence = Evidence(
-        draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), draw(T, P), valid.any(1)
-    )
+    evidence = Evidence(draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), draw(T, P), valid.any(1))
     return evidence, Gathered(draw(T, N, P, 3), draw(T, N, P, 4), theirs, cosine, valid), direction
 
 
@@ -84,7 +82,9 @@ def test_shares_are_a_softmax_so_two_views_keep_their_ratio_when_a_third_is_hidd
     after = shares(own, evidence, replace(gathered, valid=fewer), direction)[:, :, 0]
     torch.testing.assert_close(after[:, 0] / after[:, 2], before[:, 0] / before[:, 2])
     assert (after[:, 1] == 0).all()
-    torch.testing.assert_close(after.sum(1), before.sum(1), msg="the target's share depends on how many views there are")
+    torch.testing.assert_close(
+        after.sum(1), before.sum(1), msg="the target's share depends on how many views there are"
+    )
 
 
 def test_two_views_in_the_same_place_that_say_the_same_have_the_same_share():

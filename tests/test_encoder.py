@@ -128,6 +128,8 @@ def test_finer_outputs_hold_finer_detail():
     stripes = picture(64, 64).clone()
     stripes[..., ::2], stripes[..., 1::2] = 0.2, 0.8
     with torch.inference_mode():
-        rough = [m[..., 24 // s : 40 // s, 24 // s : 40 // s].diff(dim=-1).abs().mean() for m, (s, _) in
-                 zip(encoder(stripes), ALL, strict=True)]
+        rough = [
+            m[..., 24 // s : 40 // s, 24 // s : 40 // s].diff(dim=-1).abs().mean()
+            for m, (s, _) in zip(encoder(stripes), ALL, strict=True)
+        ]
     assert all(coarse < 0.1 * fine for coarse, fine in pairwise(rough[1:]))

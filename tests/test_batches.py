@@ -1,0 +1,165 @@
+from dataclasses import fields, replace
+
+import pytest
+import textured_wall as wall
+import torch
+from torch import Tensor
+
+from tidefield.config import PAPER, SWIFT, TrainConfig
+from tidefield.data.batches import Batch, Surfaces, choose_neighbours, draw_batch, even, tile_surface
+from tidefield.data.images import Photographs
+from tidefield.data.scene import Scene
+
+CROPS = replace(SWIFT.train, tile_px=8, tiles=6, crop_px=20)
+WHOLE = replace(PAPER.train, tile_px=8, tiles=6)
+TEST = (1, 4)
+
+
+def scene() -> Scene:
+    return wall.scene(wall.with_gains(wall.cameras(7)), TEST)
+
+
+def mixed_scene() -> Scene:
+    """Photographs of two sizes, taking turns, one narrower than a tile."""
+    own = wall.cameras(6)
+    size = torch.tensor([[48, 36], [40, 6]]).repeat(3, 1)
+    own = replace(own, size_px=size, principal_px=size / 2)
+    return replace(wall.scene(own), photographs=Photographs(tuple(wall.photograph(own[i]) for i in range(6))))
+
+
+def batch(own: Scene, config: TrainConfig, seed: int = 0, views: int = 3) -> Batch:
+    return draw_batch(own, Surfaces(own), config, views, torch.Generator().manual_seed(seed))
+
+
+def seeds(own: Scene, config: TrainConfig, count: int = 8) -> list[Batch]:
+    return [batch(own, config, seed) for seed in range(count)]
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE, replace(CROPS, neighbours="direction")])
+def test_a_target_is_never_its_own_neighbour_and_test_photographs_take_no_part(config: TrainConfig):
+    for drawn in seeds(scene(), config):
+        assert not (drawn.neighbours == drawn.targets[:, None]).any()
+        assert not torch.isin(torch.cat([drawn.targets, drawn.neighbours.flatten()]), torch.tensor(TEST)).any()
+        assert all(len(set(row.tolist())) == 3 for row in drawn.neighbours)
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE])
+def test_the_same_seed_draws_the_same_batch_and_another_seed_another(config: TrainConfig):
+    first, again, other = batch(scene(), config), batch(scene(), config), batch(scene(), config, seed=1)
+    for f in fields(Batch):
+        torch.testing.assert_close(getattr(first, f.name), getattr(again, f.name), rtol=0, atol=0)
+    assert not torch.equal(first.corner_px, other.corner_px)
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE])
+def test_tiles_hold_the_pixels_they_claim_at_the_common_exposure(config: TrainConfig):
+    own = scene()
+    for drawn in seeds(own, config, 3):
+        assert drawn.inside.all()
+        for t, (target, (u, v)) in enumerate(zip(drawn.targets.tolist(), drawn.corner_px.long().tolist(), strict=True)):
+            pixels = own.photographs[target][v : v + 8, u : u + 8].float() / 255 / own.cameras.gain[target]
+            torch.testing.assert_close(drawn.colours[t].reshape(8, 8, 3), pixels)
+
+
+def images(drawn: Batch) -> list[tuple[Tensor, Tensor]]:
+    """Every image with its corner, in the order that `which` counts in."""
+    pairs = zip(drawn.images, drawn.image_corner_px, strict=True)
+    return [pair for group, corner in pairs for pair in zip(group, corner, strict=True)]
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_images_hold_the_neighbours_pixels_they_claim(config: TrainConfig, mixed: bool):
+    own = mixed_scene() if mixed else scene()
+    for drawn in seeds(own, config, 4):
+        every = images(drawn)
+        for neighbour, which in zip(drawn.neighbours.flatten().tolist(), drawn.which.flatten().tolist(), strict=True):
+            image, corner = every[which]
+            u, v = corner.long().tolist()
+            assert corner.tolist() == [u, v], "a crop between pixels"
+            height, width = image.shape[1:]
+            part = even(own, neighbour)[v : v + height, u : u + width]
+            torch.testing.assert_close(image, part.permute(2, 0, 1))
+
+
+def test_whole_photographs_are_encoded_once_each():
+    for drawn in seeds(mixed_scene(), WHOLE, 4):
+        assert sum(len(group) for group in drawn.images) == len(drawn.neighbours.unique())
+        assert not any(corner.any() for corner in drawn.image_corner_px)
+
+
+def test_crops_show_what_the_tile_shows():
+    own = scene()
+    for drawn in seeds(own, CROPS, 4):
+        camera = own.cameras[drawn.targets]
+        middle = camera.directions_world(drawn.corner_px[:, None] + 4)[:, 0] * wall.DEPTH + camera.position_world
+        for t in range(6):
+            for n in range(3):
+                uv, _ = own.cameras[int(drawn.neighbours[t, n])].project(middle[t : t + 1])
+                image, corner = images(drawn)[drawn.which[t, n]]
+                assert image.shape[1:] == (20, 20)
+                wanted = (uv[0, 0] - 10).clamp(min=0).minimum(torch.tensor([28.0, 16.0]))
+                assert (corner - wanted).abs().max() <= 0.51
+
+
+def test_tiles_are_drawn_from_everywhere():
+    drawn = seeds(scene(), CROPS, 40)
+    corners = torch.cat([d.corner_px for d in drawn])
+    assert corners.amin(0).tolist() == [0, 0]
+    assert corners.amax(0).tolist() == [40, 28]
+    assert torch.cat([d.targets for d in drawn]).unique().tolist() == [0, 2, 3, 5, 6]
+
+
+def test_a_photograph_smaller_than_a_tile_says_which_pixels_it_has():
+    drawn = [b for b in seeds(mixed_scene(), CROPS) if (b.targets % 2 == 1).any()]
+    assert drawn
+    for b in drawn:
+        for t in (b.targets % 2 == 1).nonzero()[:, 0].tolist():
+            inside = b.inside[t].reshape(8, 8)
+            assert inside[:6].all()
+            assert not inside[6:].any()
+            assert not b.colours[t].reshape(8, 8, 3)[6:].any()
+
+
+def test_whole_photographs_serve_all_tiles_of_one_target():
+    for drawn in seeds(scene(), WHOLE):
+        assert len(drawn.targets.unique()) == 1
+        assert len(drawn.targets) == 6
+
+
+def test_evened_photographs_are_at_the_common_exposure():
+    own = scene()
+    level = wall.scene(wall.cameras(7), TEST)
+    unclipped = (own.photographs[2] < 255).all(-1) & (level.photographs[2] < 255).all(-1)
+    difference = (even(own, 2) - even(level, 2)).abs()[unclipped]
+    assert difference.max() < 0.5 / 255 * (1 + 1 / own.cameras.gain[2].min()) + 1e-6
+    torch.testing.assert_close(even(own, 2, slice(3, 9), slice(5, 6)), even(own, 2)[3:9, 5:6])
+
+
+def test_a_tiles_surface_lies_on_the_wall_behind_it():
+    own = scene()
+    camera, corner = own.cameras[2], torch.tensor([[0.0, 0.0], [40.0, 28.0], [46.0, 34.0]])
+    points = tile_surface(camera, Surfaces(own)[2], corner, 8)
+    torch.testing.assert_close(points[..., 2], torch.full((3, 5), wall.DEPTH), rtol=1e-3, atol=0)
+    uv, _ = camera.project(points.reshape(-1, 3))
+    uv = uv.reshape(3, 5, 2)
+    torch.testing.assert_close(uv[:2, 0], corner[:2] + 4, atol=1e-3, rtol=0)
+    assert ((uv >= -1e-3) & (uv <= torch.tensor([48.0, 36.0]) + 1e-3)).all()
+
+
+def test_without_points_the_surface_is_between_near_and_far():
+    own = replace(scene(), points=None)
+    points = tile_surface(own.cameras[0], Surfaces(own)[0], torch.zeros(1, 2), 8)
+    torch.testing.assert_close(points[..., 2], torch.full((1, 5), 2 / (1 / 3 + 1 / 10)))
+
+
+@pytest.mark.parametrize("strategy", ["seen", "direction"])
+def test_a_view_to_render_has_the_training_photographs_around_it(strategy: str):
+    own = scene()
+    surface = tile_surface(own.cameras[1], Surfaces(own)[1], torch.zeros(1, 2), 32)
+    chosen = choose_neighbours(own.cameras[1], surface, own, 100, strategy)
+    assert sorted(chosen[0].tolist()) == list(own.train)
+    fewer = choose_neighbours(own.cameras[2], surface, own, 100, strategy, excluded=2)
+    assert sorted(fewer[0].tolist()) == [0, 3, 5, 6]
+    if strategy == "seen":
+        assert set(chosen[0, :2].tolist()) == {0, 2}

@@ -1,0 +1,125 @@
+import math
+from dataclasses import fields
+
+import pytest
+import torch
+from torch import Tensor
+
+from tidefield.geometry.cameras import Cameras, pixel_grid, project
+
+
+def turned(angles: tuple[float, float, float]) -> Tensor:
+    """A rotation: about x, then y, then z."""
+    result = torch.eye(3, dtype=torch.float64)
+    for axis, angle in enumerate(angles):
+        c, s = math.cos(angle), math.sin(angle)
+        turn = torch.eye(3, dtype=torch.float64)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+        result = turn @ result
+    return result
+
+
+def cameras() -> Cameras:
+    rotation = torch.stack([turned((0.2 * k, -0.3, 0.5 + k)) for k in range(3)])
+    position = torch.tensor([[1.0, 2.0, 3.0], [-4.0, 0.5, 9.0], [0.0, 0.0, -2.0]], dtype=torch.float64)
+    return Cameras(
+        T_world_camera=torch.cat([rotation, position[..., None]], -1),
+        focal_px=torch.tensor([[50.0, 60.0], [80.0, 70.0], [40.0, 40.0]], dtype=torch.float64),
+        principal_px=torch.tensor([[31.0, 25.5], [40.0, 30.0], [16.0, 12.0]], dtype=torch.float64),
+        size_px=torch.tensor([[64, 48], [80, 60], [32, 24]]),
+        near_far=torch.tensor([[1.0, 9.0]] * 3, dtype=torch.float64),
+        gain=torch.ones(3, 3, dtype=torch.float64),
+    )
+
+
+def world_points(count: int = 6) -> Tensor:
+    return 5 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def test_projection_is_the_pinhole_point_by_point():
+    own, points = cameras(), world_points()
+    uv, z = own.project(points)
+    for v in range(3):
+        for p in range(len(points)):
+            x = own.T_world_camera[v, :, :3].T @ (points[p] - own.T_world_camera[v, :, 3])
+            assert z[v, p].item() == pytest.approx(x[2].item())
+            expected = own.focal_px[v] * x[:2] / x[2] + own.principal_px[v]
+            torch.testing.assert_close(uv[v, p], expected)
+
+
+def test_the_projection_matrix_is_what_project_uses():
+    own, points = cameras(), world_points()
+    homogeneous = own.projection @ torch.cat([points, torch.ones(len(points), 1, dtype=torch.float64)], 1).T
+    uv, z = own.project(points)
+    torch.testing.assert_close(homogeneous[:, 2], z)
+    torch.testing.assert_close((homogeneous[:, :2] / homogeneous[:, 2:]).transpose(1, 2), uv)
+
+
+def test_going_along_a_pixels_direction_for_a_depth_and_projecting_comes_back():
+    own = cameras()
+    generator = torch.Generator().manual_seed(1)
+    uv = 40 * torch.rand(3, 8, 2, generator=generator, dtype=torch.float64)
+    depth = 1 + 5 * torch.rand(3, 8, generator=generator, dtype=torch.float64)
+    points = own.position_world[:, None] + own.directions_world(uv) * depth[..., None]
+    pixels, z = project(own, points)
+    torch.testing.assert_close(pixels, uv)
+    torch.testing.assert_close(z, depth)
+
+
+def test_the_principal_point_looks_forward_with_x_right_and_y_down():
+    own = cameras()
+    torch.testing.assert_close(own.directions_world(own.principal_px[:, None])[:, 0], own.forward_world)
+    upright = Cameras(
+        T_world_camera=torch.eye(3, 4)[None],
+        focal_px=torch.tensor([[10.0, 10.0]]),
+        principal_px=torch.tensor([[8.0, 6.0]]),
+        size_px=torch.tensor([[16, 12]]),
+        near_far=torch.tensor([[1.0, 2.0]]),
+        gain=torch.ones(1, 3),
+    )
+    uv, z = upright.project(torch.tensor([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0], [0.0, 1.0, 2.0]]))
+    assert uv[0].tolist() == [[8, 6], [13, 6], [8, 11]]
+    assert z.tolist() == [[2, 2, 2]]
+
+
+def test_points_behind_and_in_the_cameras_plane_are_told_by_z():
+    own = cameras()[0]
+    behind = own.position_world - 2 * own.forward_world
+    uv, z = own.project(torch.cat([behind, own.position_world]))
+    assert z[0, 0].item() == pytest.approx(-2)
+    assert z[0, 1].item() == pytest.approx(0, abs=1e-12)
+    assert uv.isfinite().all()
+
+
+def test_a_resized_view_sees_the_same_at_scaled_pixels():
+    own, points = cameras(), world_points()
+    uv, z = own.project(points)
+    small = own.resized(16, 24)
+    assert (small.size_px == torch.tensor([16, 24])).all()
+    smaller, same = small.project(points)
+    torch.testing.assert_close(smaller, uv * (small.size_px / own.size_px)[:, None])
+    torch.testing.assert_close(same, z)
+
+
+def test_a_cropped_view_keeps_its_pixels():
+    own, points = cameras(), world_points()
+    cut = own.cropped(20, 70)
+    assert (cut.size_px == torch.tensor([20, 70])).all()
+    torch.testing.assert_close(cut.project(points), own.project(points))
+
+
+def test_indexing_gives_batches_in_the_order_asked_for():
+    own = cameras()
+    assert len(own) == 3
+    assert len(own[1]) == 1
+    assert (own[1].width, own[1].height) == (80, 60)
+    for index, expected in [([2, 0], [2, 0]), (slice(1, 3), [1, 2]), (torch.tensor([1, 1]), [1, 1])]:
+        picked = own[index]
+        for f in fields(Cameras):
+            assert torch.equal(getattr(picked, f.name), getattr(own, f.name)[expected])
+
+
+def test_the_pixel_grid_goes_row_by_row_through_pixel_centres():
+    expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
+    assert pixel_grid(3, 2).tolist() == expected

@@ -1,0 +1,283 @@
+"""The boxes together: a textured wall that untrained and randomly weighted networks look at."""
+
+from dataclasses import replace
+
+import pytest
+import textured_wall as wall
+import torch
+from torch import Tensor, nn
+
+from tidefield.config import PAPER, SWIFT, Config, EncoderConfig, FieldConfig, NetworkConfig, StageConfig
+from tidefield.data.prior import surface_prior
+from tidefield.data.scene import Scene
+from tidefield.model.intervals import Intervals
+from tidefield.model.network import Network, TileRendering, Tiles
+from tidefield.model.renderer import FeatureShelf, Renderer, start_intervals
+from tidefield.model.stage import place_samples
+from tidefield.model.views import Views
+
+CPU = torch.device("cpu")
+FIELD = FieldConfig(levels=4, log2_entries=10, coarsest=4, finest=64)
+SMALL_PAPER = replace(
+    PAPER.network,
+    encoder=EncoderConfig(widths=(8, 8, 12, 16), blocks=(1, 1, 1), instance_norm=True),
+    stages=(StageConfig(stride=1, samples=12, feature_stride=4, feature_channels=16, hidden=16),),
+    views=3,
+)
+NETWORKS = {
+    "swift": SWIFT.network,
+    "paper": SMALL_PAPER,
+    "swift and field": replace(SWIFT.network, field=FIELD),
+    "paper and field": replace(SMALL_PAPER, field=FIELD),
+    "field alone": replace(SMALL_PAPER, views=0, field=FIELD),
+    "swift's stages on a field alone": replace(SWIFT.network, views=0, field=FIELD),
+}
+TARGET = 3
+
+
+def network(config: NetworkConfig, seed: int = 0, stir: float = 0.0) -> Network:
+    """As it begins; `stir` moves every weight, so that parts that begin at zero take part."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        own = Network(config)
+        with torch.no_grad():
+            for parameter in own.parameters():
+                parameter.add_(stir * torch.randn(parameter.shape))
+    if own.field:
+        own.field.cover(torch.tensor([0.0, 0.0, wall.DEPTH]), 3.0)
+    return own
+
+
+def scene(count: int = 7, width: int = 64, height: int = 48) -> Scene:
+    return wall.scene(wall.cameras(count, width, height, step=0.25), (TARGET,))
+
+
+def looking(
+    own: Network, at: Scene, side: int = 16, corners: tuple[tuple[int, int], ...] = ((16, 8), (40, 24))
+) -> tuple[Tiles, Views | None, Intervals]:
+    """What `forward` is given for tiles of the scene's held-out photograph."""
+    tiles = Tiles(at.cameras[[TARGET] * len(corners)], torch.tensor(corners).float(), side)
+    prior = surface_prior(at.cameras[TARGET], at.points, at.cameras)
+    start = start_intervals(own, tiles, prior.expand(len(corners), -1, -1, -1))
+    if not own.config.views:
+        return tiles, None, start
+    neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
+    return tiles, FeatureShelf(own, at, CPU).views(neighbours), start
+
+
+def outputs(rendering: TileRendering) -> list[Tensor]:
+    return [rendering.colour, rendering.depth, rendering.opacity, *rendering.expected, *rendering.glimpses]
+
+
+def assert_finite_forward_and_backward(own: Network, result: TileRendering) -> None:
+    assert all(part.isfinite().all() for part in outputs(result))
+    sum(part.square().mean() for part in outputs(result)).backward()  # type: ignore[union-attr]
+    for name, parameter in own.named_parameters():
+        assert parameter.grad is not None, f"{name} takes no part"
+        assert parameter.grad.isfinite().all(), name
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("opaque", [True, False])
+def test_every_kind_of_network_is_finite_forward_and_backward(name: str, opaque: bool):
+    own = network(NETWORKS[name], stir=0.02)
+    tiles, views, start = looking(own, scene())
+    result = own(tiles, views, start, opaque, torch.Generator().manual_seed(0))
+    assert result.colour.shape == (2, 256, 3)
+    assert result.depth.shape == result.opacity.shape == (2, 256)
+    assert len(result.expected) == len(result.glimpses) + 1 == len(own.stages)
+    assert (result.opacity <= 1 + 1e-5).all()
+    assert ((result.depth > 3 - 1e-3) & (result.depth < 10 + 1e-2)).all()
+    assert_finite_forward_and_backward(own, result)
+
+
+@pytest.mark.parametrize("name", ["swift", "paper", "swift and field"])
+def test_rays_that_no_view_sees_are_finite_and_only_a_field_can_stop_them(name: str):
+    own, at = network(NETWORKS[name], stir=0.02), scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 100
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose), points=None)
+    tiles, views, start = looking(own, at)
+    result = own(tiles, views, start, True)
+    assert_finite_forward_and_backward(own, result)
+    if own.field:
+        torch.testing.assert_close(result.opacity, torch.ones(2, 256))
+    else:
+        assert not result.opacity.any()
+        assert not result.colour.any()
+
+
+@pytest.mark.parametrize("name", ["swift", "paper"])
+def test_where_views_see_an_opaque_scene_all_light_is_stopped(name: str):
+    own = network(NETWORKS[name], stir=0.02)
+    result = own(*looking(own, scene()), True)
+    torch.testing.assert_close(result.opacity, torch.ones(2, 256), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["swift", "paper", "swift and field"])
+def test_the_order_of_the_views_does_not_matter(name: str):
+    own = network(NETWORKS[name], stir=0.05).eval()
+    with torch.inference_mode():
+        tiles, views, start = looking(own, scene())
+        assert views is not None
+        count = own.config.views
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
+        rows = (torch.arange(2)[:, None] * count + order).reshape(-1)
+        shuffled = Views(views.cameras[rows], views.which[:, order], views.maps)
+        before, after = own(tiles, views, start, True), own(tiles, shuffled, start, True)
+    for one, other in zip(outputs(before), outputs(after), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
+
+
+def test_a_scene_a_thousand_times_as_large_has_the_same_colours():
+    own, at = network(SWIFT.network, stir=0.02).eval(), scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[:, :, 3] *= 1000
+    assert at.points is not None
+    larger = replace(
+        at,
+        cameras=replace(at.cameras, T_world_camera=pose, near_far=at.cameras.near_far * 1000),
+        points=replace(at.points, xyz_world=at.points.xyz_world * 1000),
+    )
+    with torch.inference_mode():
+        one, other = own(*looking(own, at), True), own(*looking(own, larger), True)
+    torch.testing.assert_close(one.colour, other.colour, atol=2e-3, rtol=0)
+    torch.testing.assert_close(one.depth * 1000, other.depth, atol=0, rtol=2e-3)
+
+
+def depth_errors(config: Config, at: Scene) -> Tensor:
+    """Relative depth errors of a view by an untrained network, where the neighbours see the wall well."""
+    own = network(config.network).eval()
+    rendering = Renderer(own, at, config, CPU)(at.cameras[TARGET])
+    truth = wall.true_depth(at.cameras[TARGET])
+    return ((rendering.depth - truth).abs() / truth)[4:-4, 8:-8]
+
+
+def test_untrained_views_that_agree_find_the_wall_without_any_sparse_points():
+    error = depth_errors(SWIFT, replace(scene(width=96, height=72), points=None))
+    assert error.median() < 0.05
+    assert error.mean() < 0.08
+
+
+def test_an_untrained_network_finds_the_wall_where_sparse_points_tell_of_it():
+    assert depth_errors(SWIFT, scene()).max() < 0.03
+
+
+def test_an_untrained_network_renders_the_wall_from_its_neighbours():
+    at = scene(width=96, height=72)
+    rendering = Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU)(at.cameras[TARGET])
+    truth = at.photographs[TARGET].float() / 255
+    error = (rendering.colour - truth)[4:-4, 8:-8].square().mean()
+    assert -10 * error.log10() > 25
+
+
+@pytest.mark.parametrize("name", ["swift", "field alone"])
+def test_tiles_do_not_show(name: str):
+    """Four small tiles are the large tile that they cover: margins are rendered, not guessed."""
+    own, at = network(NETWORKS[name], stir=0.02).eval(), scene()
+    with torch.inference_mode():
+        whole = own(*looking(own, at, 16, ((16, 8),)), True).colour.reshape(16, 16, 3)
+        parts = own(*looking(own, at, 8, ((16, 8), (24, 8), (16, 16), (24, 16))), True).colour.reshape(4, 8, 8, 3)
+    upper, lower = torch.cat([parts[0], parts[1]], 1), torch.cat([parts[2], parts[3]], 1)
+    torch.testing.assert_close(torch.cat([upper, lower]), whole, atol=1e-4, rtol=0)
+
+
+def test_a_field_alone_says_the_same_of_a_place_whatever_the_interval_it_is_met_in():
+    """Density per unit of length: twice as many samples through an even fog stop the same light."""
+    config = replace(SMALL_PAPER, views=0, field=FIELD)
+    fine = replace(config, stages=(replace(config.stages[0], samples=48),))
+    few, many = network(config), network(fine)
+    many.load_state_dict(few.state_dict())
+    for own in (few, many):
+        nn.init.zeros_(own.stages[0].density.weight)  # type: ignore[arg-type]
+        nn.init.constant_(own.stages[0].density.bias, -2.0)  # type: ignore[arg-type]
+    at = scene()
+    with torch.inference_mode():
+        one, other = few(*looking(few, at), False).opacity, many(*looking(many, at), False).opacity
+    assert 0.05 < one.mean() < 0.999
+    # The first sample lies in the middle of its part: the light before it is not counted.
+    torch.testing.assert_close(one, other, atol=0.05, rtol=0)
+
+
+def test_without_a_generator_rendering_repeats_and_with_one_it_varies_with_the_seed():
+    own = network(SWIFT.network).eval()
+    given = looking(own, scene())
+    with torch.inference_mode():
+        first, again = own(*given, True), own(*given, True)
+        one, other = (own(*given, True, torch.Generator().manual_seed(s)) for s in (1, 2))
+    assert torch.equal(first.colour, again.colour)
+    assert not torch.equal(one.colour, other.colour)
+
+
+def test_rays_go_through_the_centres_of_a_tiles_squares():
+    tiles = Tiles(scene().cameras[[0]], torch.tensor([[10.0, 20.0]]), 4)
+    assert tiles.rays_px(1, 0)[0, :5].tolist() == [[10.5, 20.5], [11.5, 20.5], [12.5, 20.5], [13.5, 20.5], [10.5, 21.5]]
+    assert tiles.rays_px(2, 0)[0].tolist() == [[11, 21], [13, 21], [11, 23], [13, 23]]
+    margin = tiles.rays_px(4, 1)[0]
+    assert margin.shape == (9, 2)
+    assert margin[[0, 4, 8]].tolist() == [[8, 18], [12, 22], [16, 26]]
+
+
+def test_samples_lie_on_their_pixels_rays_at_their_depths_and_their_lengths_add_up():
+    camera = scene().cameras[[0]]
+    uv = torch.tensor([[[3.5, 40.0], [60.0, 7.5]]])
+    intervals = Intervals(torch.tensor([[1 / 3, 1 / 4]]), torch.tensor([[1 / 9, 1 / 5]]), torch.full((1, 2), torch.nan))
+    place = torch.tensor([0.0, 0.3, 0.8]).expand(1, 2, 3)
+    samples = place_samples(camera, uv, intervals, place)
+    pixels, z = camera.project(samples.points_world[0])
+    torch.testing.assert_close(pixels[0], uv[0].repeat_interleave(3, 0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(z[0], 1 / samples.inverse_depth.flatten())
+    torch.testing.assert_close(samples.inverse_depth, intervals.inverse_depth(place))
+    offset = samples.points_world[0] - camera.position_world
+    torch.testing.assert_close(samples.directions[0], offset / offset.norm(dim=-1, keepdim=True))
+    reach = offset.norm(dim=-1).reshape(2, 3)
+    ratio = reach[:, 0] / torch.tensor([3.0, 4.0])
+    torch.testing.assert_close(samples.delta[0, :, :2], reach.diff(dim=-1))
+    torch.testing.assert_close(reach[:, 0] + samples.delta[0].sum(-1), torch.tensor([9.0, 5.0]) * ratio)
+
+
+def test_views_read_each_sample_where_it_projects():
+    own, at = network(SWIFT.network).eval(), scene()
+    with torch.inference_mode():
+        tiles, views, _ = looking(own, at)
+        assert views is not None
+        xy = torch.tensor([[0.1, -0.2], [0.7, 0.3], [-2.4, 0.0], [0.0, 40.0]])
+        points = torch.cat([xy, torch.full((4, 1), wall.DEPTH)], -1)
+        points = torch.cat([points, torch.tensor([[0.0, 0.0, -wall.DEPTH]])]).expand(2, 5, 3)
+        towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
+        gathered = views.read(1, points, towards)
+    for n, index in enumerate([2, 4, 1, 5, 0]):
+        camera = at.cameras[index]
+        uv, z = camera.project(points[0])
+        inside = (z > 0) & (uv >= 0).all(-1) & (uv <= camera.size_px[0]).all(-1)
+        assert torch.equal(gathered.valid[0, n], inside[0])
+        offset = nn.functional.normalize(points[0] - camera.position_world, dim=-1)
+        torch.testing.assert_close(gathered.directions[0, n], offset)
+        torch.testing.assert_close(gathered.cosine[0, n], (offset * towards[0]).sum(-1))
+        seen = inside[0]
+        # Half a level of rounding, and what a bilinear reading loses of a texture with waves a few pixels long.
+        assert (gathered.colours[0, n] - wall.texture(points[0, :, :2]))[seen].abs().max() < 0.05
+    assert gathered.valid[0, :, :2].all()
+    assert not gathered.valid[0, :, 3:].any()
+
+
+def test_a_crop_is_read_as_its_photograph_is():
+    own, at = network(SWIFT.network).eval(), scene()
+    photograph = at.photographs[0].permute(2, 0, 1)[None] / 255
+    with torch.inference_mode():
+        whole = own.encode(photograph)
+        crop = own.encode(photograph[:, :, 7:39, 12:60], torch.tensor([[12.0, 7.0]]))
+    assert (crop[1].origin_px == torch.tensor([12.5, 7.5])).all()
+    pixels = [m.rows[:, :3].reshape(m.size[0, 1], m.size[0, 0], 3) for m in (whole[1], crop[1])]
+    torch.testing.assert_close(pixels[1][4:-4, 4:-4], pixels[0][7:39, 12:60][4:-4, 4:-4])
+    torch.testing.assert_close(pixels[0], photograph[0].permute(1, 2, 0))
+
+
+def test_the_learned_sharpening_keeps_even_areas():
+    own = network(SWIFT.network, stir=0.3)
+    for level, tolerance in ((0.0, 1e-5), (0.7, 1e-5)):
+        maps = own.encode(torch.full((1, 3, 24, 24), level))
+        for stride in (1, 4):
+            torch.testing.assert_close(
+                maps[stride].rows[:, :3], torch.full_like(maps[stride].rows[:, :3], level), atol=tolerance, rtol=0
+            )
