@@ -121,6 +121,7 @@ def test_the_box_is_figure_2_sample_by_sample():
     features, colours, cosine, valid = inputs()
     evidence = own(features, colours, cosine, valid)
     weight = direction_weights(cosine, valid, own.log_sharpness.exp())
+    assert isinstance(own.own, torch.nn.Linear)
     first = torch.cat([own.own.weight, own.shared.weight], 1)
     for t, p in [(0, 0), (0, 1), (1, 4), (1, 5), (1, 6)]:
         seen = [i for i in range(N) if valid[t, i, p]]

@@ -27,12 +27,13 @@ def mixed_scene() -> Scene:
     return replace(wall.scene(own), photographs=Photographs(tuple(wall.photograph(own[i]) for i in range(6))))
 
 
-def batch(own: Scene, config: TrainConfig, seed: int = 0, views: int = 3) -> Batch:
-    return draw_batch(own, Surfaces(own), config, views, torch.Generator().manual_seed(seed))
+def batch(own: Scene, config: TrainConfig, seed: int = 0) -> Batch:
+    return draw_batch(own, Surfaces(own), config, 3, torch.Generator().manual_seed(seed))
 
 
 def seeds(own: Scene, config: TrainConfig, count: int = 8) -> list[Batch]:
-    return [batch(own, config, seed) for seed in range(count)]
+    surfaces = Surfaces(own)
+    return [draw_batch(own, surfaces, config, 3, torch.Generator().manual_seed(seed)) for seed in range(count)]
 
 
 @pytest.mark.parametrize("config", [CROPS, WHOLE, replace(CROPS, neighbours="direction")])
@@ -163,3 +164,11 @@ def test_a_view_to_render_has_the_training_photographs_around_it(strategy: str):
     assert sorted(fewer[0].tolist()) == [0, 3, 5, 6]
     if strategy == "seen":
         assert set(chosen[0, :2].tolist()) == {0, 2}
+
+
+def test_a_batch_for_a_network_without_views_has_nothing_to_encode():
+    own = scene()
+    drawn = draw_batch(own, Surfaces(own), CROPS, 0, torch.Generator().manual_seed(0))
+    assert drawn.neighbours.shape == (6, 0)
+    assert drawn.images == ()
+    assert drawn.colours.shape == (6, 64, 3)

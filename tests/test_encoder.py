@@ -39,7 +39,7 @@ def test_the_paper_preset_is_table_1_for_a_640_x_480_image():
 
 def test_the_paper_preset_has_resnet_34s_blocks_and_table_1s_kernels():
     encoder = paper()
-    assert [len(stage) for stage in encoder.stages] == [3, 4, 6]
+    assert [len(list(stage.children())) for stage in encoder.stages] == [3, 4, 6]
     three_by_three = [
         sum(isinstance(m, nn.Conv2d) and m.kernel_size == (3, 3) for m in s.modules()) for s in encoder.stages
     ]
