@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from tidefield.model.aggregate import Aggregate, direction_weights, weighted_moments
 
-T, N, P, C, H = 2, 4, 7, 5, 6
+T, N, P, C, H = 2, 4, 20, 5, 6
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:

@@ -263,6 +263,19 @@ def test_views_read_each_sample_where_it_projects():
     assert not gathered.valid[0, :, 3:].any()
 
 
+def test_what_lies_behind_a_view_is_not_seen_by_it_wherever_its_pixels_would_be():
+    own, at = network(SWIFT.network).eval(), scene()
+    spread = torch.rand(2, 500, 3, generator=torch.Generator().manual_seed(0))
+    behind = spread * torch.tensor([8.0, 8.0, -6.0]) - torch.tensor([4.0, 4.0, 0.1])
+    with torch.inference_mode():
+        _, views, _ = looking(own, at)
+        assert views is not None
+        gathered = [views.read(stride, behind, nn.functional.normalize(behind, dim=-1)) for stride in (1, 4)]
+    for each in gathered:
+        assert not each.valid.any()
+        assert each.features.isfinite().all()
+
+
 def test_a_crop_is_read_as_its_photograph_is():
     own, at = network(SWIFT.network).eval(), scene()
     photograph = at.photographs[0].permute(2, 0, 1)[None] / 255
