@@ -10,12 +10,15 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
 from tidefield.errors import TidefieldError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Preset = Literal["swift", "paper"]
 Method = Literal["plane-sweep", "sparse-depth"]
@@ -200,7 +203,7 @@ def demo(
     commands.demo(out, minutes=minutes, device=device, overwrite=overwrite, console=_begin(talk))
 
 
-def _begin(talk: Talk) -> object:
+def _begin(talk: Talk) -> Console:
     """Set up messages; returns the console that commands print to."""
     # Before torch is imported: threads that wait spinning for work take the cores from those that have some, and on a
     # busy machine a step takes ten times as long.

@@ -246,9 +246,7 @@ def _refuse_run(folder: Path, overwrite: bool) -> None:
     if (folder / RUN_FILE).exists():
         if overwrite:
             return
-        raise RunError(
-            f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite"
-        )
+        raise RunError(f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite")
     if any(folder.iterdir()):
         raise RunError(f"{folder} holds other files: expected a new or empty folder; choose a new name")
 

@@ -21,7 +21,7 @@ MARGIN = 0.1
 LONELY_MARGIN = 0.5
 """... and where the nearest of them is a tenth of the image's width away."""
 PARALLAX_MARGIN = 0.01
-"""Share of the depth by which it goes beyond them in any case."""
+"""Share of the depth by which it goes beyond the expected surface in any case."""
 
 
 def surface_prior(camera: Cameras, points: SparsePoints | None, cameras: Cameras) -> Float[Tensor, "3 h w"]:
@@ -39,15 +39,18 @@ def surface_prior(camera: Cameras, points: SparsePoints | None, cameras: Cameras
     expected = 1 / surface_depth(cells, points, cameras)
     uv, inverse = trusted_points(cells, points, cameras)
     if len(uv) < AROUND:
-        return torch.stack([expected, near.expand_as(expected), far.expand_as(expected)])
-    lowest, highest, distance = _span(uv, inverse, width, height)
-    spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
-    lonely = np.minimum(distance / (0.1 * width), 1.0)
-    margin = spread * (MARGIN + (LONELY_MARGIN - MARGIN) * lonely) + PARALLAX_MARGIN * np.median(inverse)
-    lowest, highest = (torch.from_numpy(x).to(expected) for x in (lowest - margin, highest + margin))
-    highest = torch.maximum(highest, expected * (1 + PARALLAX_MARGIN)).clamp(max=near.item())
-    lowest = torch.minimum(lowest, expected * (1 - PARALLAX_MARGIN)).clamp(min=far.item())
-    return torch.stack([expected.clamp(far.item(), near.item()), highest, lowest])
+        lowest, highest = far.expand_as(expected), near.expand_as(expected)
+    else:
+        lowest, highest, distance = _span(uv, inverse, width, height)
+        spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
+        lonely = np.minimum(distance / (0.1 * width), 1.0)
+        margin = spread * (MARGIN + (LONELY_MARGIN - MARGIN) * lonely)
+        lowest, highest = (torch.from_numpy(x).to(expected) for x in (lowest - margin, highest + margin))
+    # Never beyond the camera's own range, and never empty: a camera's range may be narrower than its points.
+    expected = expected.clamp(far * (1 + PARALLAX_MARGIN), near / (1 + PARALLAX_MARGIN))
+    highest = torch.maximum(highest, expected * (1 + PARALLAX_MARGIN)).clamp(max=near)
+    lowest = torch.minimum(lowest, expected / (1 + PARALLAX_MARGIN)).clamp(min=far)
+    return torch.stack([expected, highest, lowest])
 
 
 def read_prior(

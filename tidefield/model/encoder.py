@@ -91,6 +91,7 @@ class _Up(nn.Module):
         self.merge = _ConvNorm(skip + outputs, outputs, 3, 1, norm)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        # To the skip's own size, not by 2: an odd size was rounded up on the way down.
-        x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=False)
+        # By 2 exactly, then cut: an odd size was rounded up on the way down, and fitting it would shift features.
+        x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+        x = x[..., : skip.shape[-2], : skip.shape[-1]]
         return F.relu(self.merge(torch.cat([skip, F.relu(self.widen(x))], dim=1)))

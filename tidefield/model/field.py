@@ -34,6 +34,9 @@ class Field(nn.Module):
     The scene's centre and radius are set once by `cover` and stored with the weights.
     """
 
+    centre_world: Tensor
+    radius: Tensor
+
     def __init__(self, config: FieldConfig) -> None:
         super().__init__()
         self.entries = 2**config.log2_entries

@@ -6,6 +6,7 @@ Alphabet: T tiles, R rays of a tile, M samples of a ray, P = R M, N views, C cha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -14,14 +15,15 @@ from torch.nn import functional as F
 
 from tidefield.config import NetworkConfig
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.aggregate import Evidence
 from tidefield.model.colour import ColourBlend
 from tidefield.model.compositing import composite
 from tidefield.model.encoder import Encoder
 from tidefield.model.field import Field
 from tidefield.model.gather import FeatureMaps, maps_from_images
 from tidefield.model.intervals import Intervals, histogram, refined, sample
-from tidefield.model.stage import Stage, place_samples
-from tidefield.model.views import Views
+from tidefield.model.stage import Samples, Stage, place_samples
+from tidefield.model.views import Gathered, Views
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Tiles:
 
     def rays_px(self, stride: int, margin: int) -> Float[Tensor, "T R 2"]:
         """Pixels of a tile's rays: centres of stride x stride squares, with `margin` more around the tile."""
-        count = -(-self.side_px // stride)
+        assert self.side_px % stride == 0, f"tiles of {self.side_px} px cannot be covered by rays every {stride} px"
+        count = self.side_px // stride
         line = (torch.arange(-margin, count + margin, device=self.corner_px.device) + 0.5) * stride
         v, u = torch.meshgrid(line, line, indexing="ij")
         return self.corner_px[:, None] + torch.stack([u, v], dim=-1).reshape(1, -1, 2)
@@ -64,6 +67,17 @@ class TileRendering:
     opacity: Float[Tensor, "T R"]
     expected: tuple[Float[Tensor, "T _"], ...]
     glimpses: tuple[Float[Tensor, "T _ 3"], ...]
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one pass along the rays found; expected is the mean inverse depth."""
+
+    samples: Samples
+    gathered: Gathered | None
+    evidence: Evidence
+    weights: Float[Tensor, "T R M"]
+    expected: Float[Tensor, "T R"]
 
 
 class Network(nn.Module):
@@ -101,32 +115,49 @@ class Network(nn.Module):
             opaque: light that passes all samples is stopped by the last; False lets it through to the background.
             generator: jitters samples, for training.
         """
-        intervals, expected, glimpses = start, [], []
-        density = torch.ones_like(start.near)[..., None]
-        unit = self.field.unit if self.field and not views else None
-        for k, stage in enumerate(self.stages):
-            uv = tiles.rays_px(stage.stride, self.margin(k))
-            samples = place_samples(tiles.cameras, uv, intervals, sample(density, stage.samples, generator))
-            field = self.field(samples.points_world) if self.field else None
-            gathered = views.read(stage.feature_stride, samples.points_world, samples.directions) if views else None
-            evidence = stage.evidence(gathered, field)
-            w = stage.weights(evidence, samples, intervals, opaque, unit)
-            # A ray that nothing stops is said to end in the middle of its samples.
-            w_known = w + 1e-6 / w.shape[-1]
-            expected.append((w_known * samples.inverse_depth).sum(-1) / w_known.sum(-1))
-            if k + 1 < len(self.stages):
-                glimpses.append(composite(w, evidence.mean_colour.unflatten(1, w.shape[1:])))
-                ratio = stage.stride // self.stages[k + 1].stride
-                density = histogram(w.detach(), samples.place, stage.samples, self.config.doubt)
-                intervals, density = refined(intervals, density, ratio, self.margin(k + 1))
-        colours = self.colour(evidence, gathered, samples.directions)
+        intervals, density = start, torch.ones_like(start.near)[..., None]
+        expected, glimpses = [], []
+        last = len(self.config.stages) - 1
+        for k in range(last):
+            look = self._look(k, tiles, views, intervals, density, opaque, generator)
+            expected.append(look.expected)
+            glimpses.append(composite(look.weights, look.evidence.mean_colour.unflatten(1, look.weights.shape[1:])))
+            this, following = self.config.stages[k : k + 2]
+            density = histogram(look.weights.detach(), look.samples.place, this.samples, self.config.doubt)
+            intervals, density = refined(intervals, density, this.stride // following.stride, self.margin(k + 1))
+        look = self._look(last, tiles, views, intervals, density, opaque, generator)
+        colours = self.colour(look.evidence, look.gathered, look.samples.directions)
         return TileRendering(
-            colour=composite(w, colours.unflatten(1, w.shape[1:])),
-            depth=1 / expected[-1],
-            opacity=w.sum(-1),
-            expected=tuple(expected),
+            colour=composite(look.weights, colours.unflatten(1, look.weights.shape[1:])),
+            depth=1 / look.expected,
+            opacity=look.weights.sum(-1),
+            expected=(*expected, look.expected),
             glimpses=tuple(glimpses),
         )
+
+    def _look(
+        self,
+        k: int,
+        tiles: Tiles,
+        views: Views | None,
+        intervals: Intervals,
+        density: Float[Tensor, "T R B"],
+        opaque: bool,
+        generator: torch.Generator | None,
+    ) -> _Look:
+        """One pass along the rays: stage k."""
+        stage, config = cast(Stage, self.stages[k]), self.config.stages[k]
+        uv = tiles.rays_px(config.stride, self.margin(k))
+        samples = place_samples(tiles.cameras, uv, intervals, sample(density, config.samples, generator))
+        points, directions = samples.points_world, samples.directions
+        gathered = views.read(config.feature_stride, points, directions) if views else None
+        evidence = stage.evidence(gathered, self.field(points) if self.field else None)
+        unit = self.field.unit if self.field and not views else None
+        weights = stage.weights(evidence, samples, intervals, opaque, unit)
+        # A ray that nothing stops is said to end in the middle of its samples.
+        known = weights + 1e-6 / weights.shape[-1]
+        expected = (known * samples.inverse_depth).sum(-1) / known.sum(-1)
+        return _Look(samples, gathered, evidence, weights, expected)
 
     def margin(self, stage: int) -> int:
         """Rays around a tile that a stage adds, for the next one to interpolate between."""

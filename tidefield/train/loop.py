@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,7 +184,7 @@ def scene_ball(scene: Scene) -> tuple[torch.Tensor, float]:
 
 
 @contextmanager
-def _interruption() -> Iterator[object]:
+def _interruption() -> Iterator[Callable[[], bool]]:
     """Turns SIGINT and SIGTERM into a question that can be asked between steps; a second SIGINT interrupts at once."""
     asked = False
 
