@@ -173,7 +173,10 @@ def demo(out: Path, *, minutes: float, device: str, overwrite: bool, console: Co
     scene, run = out / "scene", out / "run"
     if not scene.exists():
         console.print("Making a survey of a tidal flat ...")
-        write_survey(make_survey("river_mouths", seed=7, views=40, width=320), scene)
+        half = out / "scene.partial"
+        shutil.rmtree(half, ignore_errors=True)
+        write_survey(make_survey("river_mouths", seed=7, views=40, width=320), half)
+        half.rename(scene)
     if not (run / CHECKPOINT_FILE).exists():
         train(
             scene,
