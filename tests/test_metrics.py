@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tidefield.model.rendering import to_8_bit
 from tidefield.train.lpips import BACKBONES
 from tidefield.train.metrics import (
     METRICS,
@@ -14,7 +15,6 @@ from tidefield.train.metrics import (
     psnr,
     score,
     ssim_map,
-    to_8_bit,
 )
 
 NO_LPIPS = dict.fromkeys(BACKBONES, "no weights here")

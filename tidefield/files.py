@@ -35,6 +35,9 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
+        with partial.open("rb+") as file:
+            # Without this a power cut may leave the final name with nothing behind it.
+            os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
         if error.errno not in _USERS_TO_MEND:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tidefield.geometry.cameras import Cameras
@@ -24,6 +25,11 @@ class Rendering:
     colour: Float[Tensor, "H W 3"]
     depth: Float[Tensor, "H W"]
     opacity: Float[Tensor, "H W"]
+
+
+def to_8_bit(colour: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+    """Colours in [0, 1], clipped and rounded to 0..255."""
+    return (colour.detach().float().clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 Render = Callable[[Cameras], Rendering]

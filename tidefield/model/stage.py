@@ -62,10 +62,7 @@ class Stage(nn.Module):
 
     def __init__(self, network: NetworkConfig, config: StageConfig, field_channels: int) -> None:
         super().__init__()
-        self.samples = config.samples
-        self.stride, self.feature_stride = config.stride, config.feature_stride
-        hidden = config.hidden
-        self.hidden = hidden
+        self.hidden = hidden = config.hidden
         if network.views:
             self.aggregate = Aggregate(config.feature_channels, hidden, network.fold)
             self.transformer = RayTransformer(hidden, network.heads)
@@ -75,7 +72,8 @@ class Stage(nn.Module):
         self.guided = network.guided
         if network.guided:
             self.guide = nn.Linear(3, hidden)
-            # At the start: density where the surface is expected, within about a sample; the network corrects it.
+            # At the start: density where the views agree and, within about a sample, the surface is expected; the
+            # network corrects it.
             self.match = nn.Parameter(torch.tensor(1.0))
             self.guide_height = nn.Parameter(torch.tensor(2.0))
             self.guide_steepness = nn.Parameter(torch.tensor(1.0))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tidefield.errors import RunError
 from tidefield.files import completed_file, refuse_existing
-from tidefield.model.rendering import Rendering
+from tidefield.model.rendering import Rendering, to_8_bit
 
 SEEN_OPACITY = 0.5
 """Where the scene stopped less light than this, a depth means nothing."""
@@ -21,7 +21,7 @@ SEEN_OPACITY = 0.5
 def to_8bit(colour: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Colours in [0, 1], rounded (and clipped) to 8 bits."""
     assert bool(colour.isfinite().all()), "a colour is not finite"
-    return (colour.detach().float().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return to_8_bit(colour).cpu().numpy()
 
 
 def depth_range(rendering: Rendering) -> tuple[float, float]:

@@ -6,11 +6,9 @@ Knows a method only as `render(camera) -> Rendering`, so every method is judged 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from statistics import fmean
@@ -26,9 +24,10 @@ from tidefield import __version__
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.model.rendering import Render, Rendering
+from tidefield.files import completed_file
+from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.train.lpips import Lpips, load_lpips
-from tidefield.train.metrics import METRICS, SUFFIXES, Image8, flip_map, score, to_8_bit
+from tidefield.train.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.train.pictures import Panel, Scale, colours, depth_panel, side_by_side
 
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
@@ -115,7 +114,8 @@ def evaluate(
         "version": __version__,
         "configuration": dict(configuration),
     }
-    _write_json(path, report)
+    with completed_file(path, overwrite=True) as partial:
+        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     console.print(_table(scene, report))
     for remark in _remarks(report, out):
         console.print(remark, soft_wrap=True, highlight=False, markup=False)
@@ -187,34 +187,8 @@ def _save_pictures(out: Path, file: Path, image: Image8, truth: Image8, renderin
     ]
     for folder, picture in (("renderings", Image.fromarray(image.numpy())), ("pictures", side_by_side(panels))):
         path = out / folder / file
-        with _writing(path):
-            picture.save(path)
-
-
-def _write_json(path: Path, report: Mapping[str, Any]) -> None:
-    """Write beside the file, then put it in its place: there is never half a report."""
-    text = json.dumps(report, indent=2, allow_nan=False) + "\n"
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with _writing(path), partial.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-            os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        raise RunError(
-            f"{path} cannot be written ({error.strerror or error}): expected a folder of yours with room on its disk; "
-            "free some space or choose another folder"
-        ) from error
+        with completed_file(path, overwrite=True) as partial:
+            picture.save(partial)
 
 
 def _table(scene: Scene, report: Mapping[str, Any]) -> Table:

@@ -89,11 +89,6 @@ def _score_image(
             scores.values.update({metric + suffix: value for suffix, value in zip(masks, values, strict=True)})
 
 
-def to_8_bit(colour: Float[Tensor, "H W 3"]) -> Image8:
-    """Colours in [0, 1], clipped and rounded."""
-    return (colour.clamp(0, 1) * 255).round().to(torch.uint8)
-
-
 def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> float:
     """Eqs. 11-12 over the masked pixels, dB, at most `PSNR_LIMIT_DB`."""
     error = image[mask].double() - truth[mask].double()
