@@ -12,7 +12,8 @@ from tidefield.data.prior import surface_prior
 from tidefield.data.scene import Scene
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, TileRendering, Tiles
-from tidefield.model.renderer import FeatureShelf, Renderer, start_intervals
+from tidefield.model.renderer import Renderer, start_intervals
+from tidefield.model.shelf import FeatureShelf
 from tidefield.model.stage import place_samples
 from tidefield.model.views import Views
 
@@ -62,7 +63,7 @@ def looking(
     if not own.config.views:
         return tiles, None, start
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
-    return tiles, FeatureShelf(own, at, CPU).views(neighbours), start
+    return tiles, FeatureShelf(own, at, CPU).views(neighbours, torch.zeros(len(corners), 3)), start
 
 
 def outputs(rendering: TileRendering) -> list[Tensor]:

@@ -22,7 +22,7 @@ class FeatureMaps:
     """K maps of features, of any sizes, one after the other.
 
     Attributes:
-        rows: the texels of all maps, each map row by row.
+        rows: the texels of all maps, each map row by row; single or half precision.
         first: index in `rows` of each map's first texel.
         size: (width, height) of each map, texels.
         origin_px: pixel of the photograph at which each map's first texel is centred.
@@ -77,7 +77,7 @@ def gather(
     indices = torch.stack([index, index + right, index + below, index + below + right], dim=-1)
     share = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], dim=-1)
     values = weighted_rows(maps.rows, indices.reshape(-1, 4), share.reshape(-1, 4).to(maps.rows.dtype))
-    return values.reshape(*uv_px.shape[:-1], -1), inside
+    return values.float().reshape(*uv_px.shape[:-1], -1), inside
 
 
 def weighted_rows(

@@ -13,13 +13,15 @@ from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.gather import FeatureMaps
 from tidefield.model.intervals import Intervals
-from tidefield.model.network import Network, TileRendering, Tiles
+from tidefield.model.network import Network, Tiles
 from tidefield.model.rendering import Rendering
-from tidefield.model.views import Views
+from tidefield.model.shelf import FeatureShelf, NoRoom
 
 TILE_PX = 32
 RAYS_AT_ONCE = 8192
 """Rays of the finest stage handled at once: enough to keep two cores or a GPU busy, few enough for the cache."""
+BLOCK_TILES = 16
+"""Tiles along the sides of the blocks that a view is made in, so that tiles that follow one another see the same."""
 
 
 class Renderer:
@@ -34,76 +36,78 @@ class Renderer:
 
     def __init__(self, network: Network, scene: Scene, config: Config, device: torch.device) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
-        self.shelf = FeatureShelf(network, scene, device)
+        self.shelf = FeatureShelf(network, scene, device) if network.config.views else None
         means = [even(scene, i).mean((0, 1)) for i in scene.train]
         self.fallback = torch.stack(means).mean(0)
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras) -> Rendering:
         """The view of one camera, at its own gain."""
-        scene, network = self.scene, self.network
+        scene = self.scene
         prior = surface_prior(camera, scene.points, scene.cameras)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
-        v, u = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-        corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
-        surface = tile_surface(camera, prior, corners, TILE_PX)
-        views, strategy = network.config.views, self.config.train.neighbours
-        neighbours = choose_neighbours(camera, surface, scene, views, strategy) if views else None
-        parts = []
-        for some in torch.arange(len(corners)).split(max(1, RAYS_AT_ONCE // TILE_PX**2)):
-            parts.append(self._tiles(camera, prior, corners[some], None if neighbours is None else neighbours[some]))
-
-        def picture(values: list[Tensor]) -> Tensor:
-            stacked = torch.cat(values).reshape(rows, columns, TILE_PX, TILE_PX, -1)
-            whole = stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, -1)
-            return whole[: camera.height, : camera.width]
-
-        colour = picture([p.colour.cpu() for p in parts])
-        opacity = picture([p.opacity.cpu() for p in parts])
-        depth = picture([p.depth.cpu() for p in parts])[..., 0]
+        picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 5)
+        for top in range(0, rows, BLOCK_TILES):
+            for left in range(0, columns, BLOCK_TILES):
+                size = (min(BLOCK_TILES, columns - left), min(BLOCK_TILES, rows - top))
+                block = self._block(camera, prior, (left, top), size)
+                height, width = block.shape[:2]
+                at = (top * TILE_PX, left * TILE_PX)
+                picture[at[0] : at[0] + height, at[1] : at[1] + width] = block
+        colour, opacity, depth = picture[: camera.height, : camera.width].split([3, 1, 1], dim=-1)
         white = scene.background_rgb
         behind = self.fallback * camera.gain[0] if white is None else torch.tensor(white)
-        colour = colour * camera.gain[0] + (1 - opacity) * behind
-        return Rendering(colour=colour.clamp(0, 1), depth=depth, opacity=opacity[..., 0].clamp(0, 1))
+        colour = (colour * camera.gain[0] + (1 - opacity) * behind).clamp(0, 1)
+        return Rendering(colour=colour, depth=depth[..., 0].clone(), opacity=opacity[..., 0].clamp(0, 1))
+
+    def _block(
+        self, camera: Cameras, prior: Float[Tensor, "3 h w"], corner: tuple[int, int], size: tuple[int, int]
+    ) -> Float[Tensor, "H W 5"]:
+        """Colour, opacity and depth of a block of tiles; corner and size in tiles."""
+        (left, top), (columns, rows) = corner, size
+        v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
+        corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
+        surface = tile_surface(camera, prior, corners, TILE_PX)
+        views, strategy = self.network.config.views, self.config.train.neighbours
+        neighbours = choose_neighbours(camera, surface, self.scene, views, strategy) if views else None
+        parts = []
+        for some in torch.arange(len(corners)).split(max(1, RAYS_AT_ONCE // TILE_PX**2)):
+            chosen = None if neighbours is None else neighbours[some]
+            parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
+        stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 5)
+        return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 5)
 
     def _tiles(
-        self, camera: Cameras, prior: Tensor, corners: Float[Tensor, "T 2"], neighbours: Int[Tensor, "T N"] | None
-    ) -> TileRendering:
+        self,
+        camera: Cameras,
+        prior: Float[Tensor, "3 h w"],
+        corners: Float[Tensor, "T 2"],
+        neighbours: Int[Tensor, "T N"] | None,
+        middle_world: Float[Tensor, "T 3"],
+    ) -> Float[Tensor, "T R 5"]:
+        views = None
+        if neighbours is not None:
+            assert self.shelf is not None
+            try:
+                views = self.shelf.views(neighbours, middle_world)
+            except NoRoom:
+                if len(corners) == 1:
+                    raise
+                halves = zip(corners.chunk(2), neighbours.chunk(2), middle_world.chunk(2), strict=True)
+                return torch.cat([self._tiles(camera, prior, *half) for half in halves])
         index = torch.zeros(len(corners), dtype=torch.long)
         tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
-        start = start_intervals(self.network, tiles, prior.expand(len(corners), -1, -1, -1).to(self.device))
-        views = None if neighbours is None else self.shelf.views(neighbours)
-        return self.network(tiles, views, start, self.scene.background_rgb is None)
+        start = start_intervals(self.network, tiles, prior[None].to(self.device))
+        found = self.network(tiles, views, start, self.scene.background_rgb is None)
+        return torch.cat([found.colour, found.opacity[..., None], found.depth[..., None]], dim=-1).cpu()
 
 
-def start_intervals(network: Network, tiles: Tiles, priors: Float[Tensor, "T 3 h w"]) -> Intervals:
-    """The first stage's intervals from the cameras' priors."""
-    expected, near, far = read_prior(priors, network.first_rays_px(tiles))
+def start_intervals(network: Network, tiles: Tiles, priors: Float[Tensor, "_ 3 h w"]) -> Intervals:
+    """The first stage's intervals from the priors of the tiles' cameras, or from the one prior of them all."""
+    uv = network.first_rays_px(tiles)
+    read = read_prior(priors, uv.reshape(len(priors), -1, 2))
+    expected, near, far = (x.reshape(uv.shape[:2]) for x in read)
     return Intervals(near=near, far=far, expected=expected)
-
-
-class FeatureShelf:
-    """The training photographs' features, encoded once each and kept."""
-
-    def __init__(self, network: Network, scene: Scene, device: torch.device) -> None:
-        self.network, self.scene, self.device = network, scene, device
-        self.cameras = scene.cameras.to(device)
-        self._maps: dict[int, FeatureMaps] | None = None
-        self._slot = torch.full((len(scene.names),), -1)
-
-    def views(self, neighbours: Int[Tensor, "T N"]) -> Views:
-        if self._maps is None:
-            self._maps = self._encode_all()
-        cameras = self.cameras[neighbours.reshape(-1).to(self.device)]
-        return Views(cameras, self._slot[neighbours].to(self.device), self._maps)
-
-    def _encode_all(self) -> dict[int, FeatureMaps]:
-        parts = []
-        for slot, index in enumerate(self.scene.train):
-            self._slot[index] = slot
-            photograph = even(self.scene, index).permute(2, 0, 1)[None].to(self.device)
-            parts.append(self.network.encode(photograph))
-        return {stride: joined([p[stride] for p in parts]) for stride in parts[0]}
 
 
 def joined(maps: list[FeatureMaps]) -> FeatureMaps:

@@ -1,0 +1,123 @@
+"""The training photographs' features, encoded block by block when first needed, and kept while there is room.
+
+Alphabet: T tiles, N views, S slots.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tidefield.data.batches import even
+from tidefield.data.scene import Scene
+from tidefield.model.gather import FeatureMaps
+from tidefield.model.network import Network
+from tidefield.model.views import Views
+
+BLOCK_PX = 1024
+"""Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
+OVERLAP_PX = 384
+"""What neighbouring blocks share at least, so that what a tile shows lies in one of them."""
+BUDGET_BYTES = 1_500_000_000
+"""Of features kept; what was not used for longest goes first."""
+
+
+class NoRoom(Exception):
+    """More blocks were asked for at once than the shelf holds."""
+
+
+class FeatureShelf:
+    """Features of one scene's photographs, in half precision.
+
+    Args:
+        network: whose encoder is used, on `device`.
+        scene: the photographs.
+        device: where features are computed and kept.
+        budget_bytes: of memory for features; a few blocks are kept even if they need more.
+    """
+
+    def __init__(self, network: Network, scene: Scene, device: torch.device, budget_bytes: int = BUDGET_BYTES) -> None:
+        self.network, self.scene, self.device = network, scene, device
+        self.cameras = scene.cameras.to(device)
+        size = scene.cameras.size_px[list(scene.train)].clamp(max=BLOCK_PX)
+        self._side = tuple(int(x) for x in size.amax(0))
+        blocks = int(_block_counts(scene.cameras.size_px[list(scene.train)]).prod(-1).sum())
+        maps = {stage.feature_stride: 3 + stage.feature_channels for stage in network.config.stages}
+        room = budget_bytes // sum(2 * self._texels(stride) * channels for stride, channels in maps.items())
+        self.slots = max(min(blocks, room), network.config.views)
+        self._maps = {stride: self._empty(stride, channels) for stride, channels in maps.items()}
+        self._held: OrderedDict[tuple[int, int, int], int] = OrderedDict()
+
+    def views(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> Views:
+        """The neighbours of tiles, encoded around what each tile shows.
+
+        Args:
+            neighbours: photographs.
+            middle_world: the surface in the middle of each tile.
+
+        Raises:
+            NoRoom: when these tiles need more blocks than there are slots.
+        """
+        keys = self._blocks(neighbours, middle_world)
+        wanted = dict.fromkeys(keys)
+        if len(wanted) > self.slots:
+            raise NoRoom
+        for key in wanted:
+            if key in self._held:
+                self._held.move_to_end(key)
+        for key in wanted:
+            if key not in self._held:
+                self._encode(key)
+        which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.shape)
+        return Views(self.cameras[neighbours.reshape(-1).to(self.device)], which, self._maps)
+
+    def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
+        """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""
+        photographs = neighbours.reshape(-1)
+        cameras = self.scene.cameras[photographs]
+        points = middle_world.repeat_interleave(neighbours.shape[1], 0)
+        homogeneous = (cameras.projection @ torch.cat([points, torch.ones(len(points), 1)], 1)[..., None])[..., 0]
+        uv = homogeneous[:, :2] / homogeneous[:, 2:].clamp(min=1e-6)
+        last = _block_counts(cameras.size_px) - 1
+        free = (cameras.size_px - BLOCK_PX).clamp(min=1)
+        index = torch.minimum(((uv - BLOCK_PX / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
+        return [(i, *at) for i, at in zip(photographs.tolist(), index.tolist(), strict=True)]
+
+    def _encode(self, key: tuple[int, int, int]) -> None:
+        photograph, column, row = key
+        slot = self._held.popitem(last=False)[1] if len(self._held) == self.slots else len(self._held)
+        size = self.scene.cameras.size_px[photograph]
+        last = (_block_counts(size) - 1).clamp(min=1)
+        corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([column, row]) / last).floor().long()
+        (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size.long()).tolist()
+        colours = even(self.scene, photograph, slice(top, bottom), slice(left, right)).permute(2, 0, 1)[None]
+        encoded = self.network.encode(colours.to(self.device), corner[None].to(colours).to(self.device))
+        for stride, block in encoded.items():
+            maps = self._maps[stride]
+            first = slot * self._texels(stride)
+            maps.rows[first : first + len(block.rows)] = block.rows.to(maps.rows.dtype)
+            maps.size[slot], maps.origin_px[slot] = block.size[0], block.origin_px[0]
+        self._held[key] = slot
+
+    def _texels(self, stride: int) -> int:
+        return math.prod(-(-side // stride) for side in self._side)
+
+    def _empty(self, stride: int, channels: int) -> FeatureMaps:
+        texels = self._texels(stride)
+        return FeatureMaps(
+            rows=torch.empty(self.slots * texels, channels, dtype=torch.float16, device=self.device),
+            first=torch.arange(self.slots, device=self.device) * texels,
+            size=torch.ones(self.slots, 2, dtype=torch.long, device=self.device),
+            origin_px=torch.zeros(self.slots, 2, device=self.device),
+            stride=stride,
+        )
+
+
+def _block_counts(size_px: Int[Tensor, "*B 2"]) -> Int[Tensor, "*B 2"]:
+    """Columns and rows of blocks that cover a photograph, evenly spaced and overlapping."""
+    step = BLOCK_PX - OVERLAP_PX
+    return 1 + (-(-(size_px - BLOCK_PX) // step)).clamp(min=0).long()
