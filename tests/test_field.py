@@ -133,5 +133,7 @@ def test_where_a_field_lies_is_stored_with_its_weights():
 
 
 def test_points_at_any_distance_have_features():
-    far = torch.tensor([[1e6, 0, 0], [-1e9, 1e9, 0], [0, 0, 1e12]])
-    assert Field(FieldConfig())(far).isfinite().all()
+    far = torch.tensor([[1e6, 0, 0], [-1e9, 1e9, 0], [0, 0, 1e12], [1e12, 0, 0]])
+    one_dense_level = FieldConfig(levels=1, coarsest=16, finest=16, log2_entries=13)
+    for config in (FieldConfig(), one_dense_level):
+        assert Field(config)(far).isfinite().all()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -65,13 +67,15 @@ def some_intervals() -> Intervals:
 def test_places_and_inverse_depths_are_each_others_inverse():
     intervals = some_intervals()
     place = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(intervals.place(intervals.inverse_depth(place)), place)
+    for k in range(3):
+        met = replace(intervals, expected=intervals.inverse_depth(place)[..., k])
+        torch.testing.assert_close(met.expected_place, place[..., k])
     ends = intervals.inverse_depth(torch.tensor([0.0, 1.0]).expand(2, 5, 2))
     torch.testing.assert_close(ends, torch.stack([intervals.near, intervals.far], -1))
-    torch.testing.assert_close(intervals.place(intervals.expected), torch.full((2, 5), 0.5))
+    torch.testing.assert_close(intervals.expected_place, torch.full((2, 5), 0.5))
 
 
-@pytest.mark.parametrize("bins", [2, 6, 24])
+@pytest.mark.parametrize("bins", [1, 2, 6, 24])
 @pytest.mark.parametrize("floor", [0.0, 0.05, 1.0])
 def test_a_histogram_conserves_mass_and_has_its_floor(bins: int, floor: float):
     generator = torch.Generator().manual_seed(0)

@@ -73,7 +73,8 @@ class Field(nn.Module):
     ) -> tuple[Int[Tensor, "P 8"], Float[Tensor, "P 8"]]:
         """Rows of the eight grid points around each point, and their trilinear weights."""
         place = unit * resolution
-        low = place.floor()
+        # Infinitely far away lies on the last grid point, which begins no cell.
+        low = place.floor().clamp(max=resolution - 1)
         part = place - low
         columns, shares = [], []
         for corner in range(8):

@@ -29,12 +29,10 @@ class Intervals:
     far: Float[Tensor, "T R"]
     expected: Float[Tensor, "T R"]
 
-    def place(self, inverse_depth: Float[Tensor, "T R *M"]) -> Float[Tensor, "T R *M"]:
-        """From inverse depths to places in [0, 1]."""
-        near, far = self.near, self.far
-        if inverse_depth.dim() == 3:
-            near, far = near[..., None], far[..., None]
-        return (near - inverse_depth) / (near - far)
+    @property
+    def expected_place(self) -> Float[Tensor, "T R"]:
+        """Where the surface is expected: 0 at the near end, 1 at the far end; NaN where nothing is known."""
+        return (self.near - self.expected) / (self.near - self.far)
 
     def inverse_depth(self, place: Float[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
         return self.near[..., None] + (self.far - self.near)[..., None] * place
@@ -90,6 +88,8 @@ def histogram(
 
     Every weight is shared by the two bins whose middles it lies between.
     """
+    if bins == 1:
+        return (1 - floor) * weights.sum(-1, keepdim=True) + floor
     spot = (place * bins - 0.5).clamp(0, bins - 1)
     low = spot.floor().clamp(max=bins - 2)
     part = spot - low

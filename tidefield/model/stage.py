@@ -126,7 +126,7 @@ class Stage(nn.Module):
         self, x: Float[Tensor, "T R M H"], samples: Samples, intervals: Intervals
     ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
         """Tell the samples where the surface is expected: as a feature, and as a bias of their density."""
-        expected = intervals.place(intervals.expected)
+        expected = intervals.expected_place
         known = expected.isfinite()[..., None]
         # In samples, so that it means the same for any number of them and any interval.
         offset = (samples.place - expected[..., None]) * samples.place.shape[-1]
