@@ -152,8 +152,8 @@ def render(
     Args:
         run: A trained run.
         out: The file to write; .mp4 for a video, .png with --camera.
-        path: orbit, cameras (through the photographs), strip (straight down, along the survey), or a camera-path JSON
-            as nerfstudio's viewer exports it.
+        path: orbit, cameras (a flight among the photographs), strip (straight down, along the survey), or a camera-path
+            JSON as nerfstudio's viewer exports it.
         camera: Name of a photograph whose camera is rendered instead of a path.
         frames: Frames of the video; 24 are a second.
         width: Width of the picture in pixels; that of the run's photographs if not given.
