@@ -1,0 +1,174 @@
+"""`python -m benchmarks speed | quality | memory | table`; without a name, speed.
+
+torch and the rest are imported inside the commands.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from tidefield.errors import RunError, TidefieldError
+
+DESCRIPTION = """What Tidefield achieves, and how fast: speed, quality, memory, and a page of all of them. Without a
+name, it is speed.
+
+A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes four commands:
+speed, quality and memory with the same --runs, then table."""
+
+
+def speed(
+    runs: Path | None = None,
+    scene: Path | None = None,
+    width: int | None = None,
+    device: str = "cpu",
+    quick: bool = False,
+) -> None:
+    """Rays per second of paper and swift, stage by stage, and their share of the machine's ceilings (2-3 minutes).
+
+    Args:
+        runs: Keep the figures in this folder's speed.json.
+        scene: Measure on this scene instead of the built-in one.
+        width: Width of its photographs in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+        quick: A few seconds, to see that it works; the figures mean little.
+    """
+    if quick and runs is not None:
+        raise RunError("--quick was given with --runs: such figures are not worth keeping; leave one of them out")
+    # As the tidefield command does, before torch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from rich.console import Console
+
+    from benchmarks.records import stamp, write_json
+    from benchmarks.speed import QUICK, Effort, measure_speed
+    from benchmarks.table import speed_tables
+    from tidefield.config import PRESETS
+    from tidefield.device import choose_device, keep_large_allocations
+
+    keep_large_allocations()
+    where, console = choose_device(device), Console()
+    effort = QUICK if quick else Effort()
+    with tempfile.TemporaryDirectory() as folder:
+        loaded = _scene(scene, width, quick, Path(folder))
+        configs = {name: PRESETS[name] for name in ("paper", "swift")}
+        report = measure_speed(loaded, configs, where, effort, console.print)
+    options = [] if scene is None else ["--scene SCENE", *([] if width is None else [f"--width {width}"])]
+    command = " ".join(["python -m benchmarks speed --runs RUNS", *options, f"--device {device}"])
+    report |= {"command": command, **stamp()}
+    for table in speed_tables(report):
+        console.print(table.for_the_console())
+    if runs is not None:
+        write_json(runs / "speed.json", report)
+
+
+def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> Any:
+    """The scene that is asked for, or the built-in one, made small."""
+    from tidefield.data.load import load_scene
+    from tidefield.data.synthetic import make_survey, write_survey
+
+    if folder is not None:
+        return load_scene(folder, width=width)
+    if width is not None:
+        raise RunError(
+            "--width was given without --scene: the built-in scene has its size; name a scene, or leave it out"
+        )
+    os.environ["XDG_CACHE_HOME"] = str(work / "cache")
+    survey = make_survey("river_mouths", seed=7, views=9 if quick else 16, width=64 if quick else 256)
+    write_survey(survey, work / "scene")
+    return load_scene(work / "scene")
+
+
+def quality(
+    data: Path,
+    runs: Path,
+    scenes: tuple[str, ...] = ("caliterra", "swindale", "turin_lot", "brighton_beach"),
+    minutes: float = 10.0,
+    width: int = 400,
+    presets: tuple[Literal["swift", "paper"], ...] = ("swift", "paper"),
+    floors: bool = True,
+    device: str = "cpu",
+) -> None:
+    """Train and evaluate on real scenes: the presets and the two floors, one after another, in processes of their own.
+
+    What is finished is not repeated: after an interruption, the same command goes on. With the evaluations it takes
+    hours.
+
+    Args:
+        data: Folder with the scenes.
+        runs: Folder for the results, as RUNS/SCENE/METHOD.
+        scenes: Names of scenes in the data folder.
+        minutes: Minutes of training of each preset on each scene.
+        width: Width of the photographs in pixels.
+        presets: Which to train.
+        floors: Evaluate the methods without training, too.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    from benchmarks.quality import FLOORS, Settings, measure_quality
+    from benchmarks.records import run_measured
+
+    methods = [*(FLOORS if floors else ()), *presets]
+    # Flushed, so that it stands before what the processes print.
+    say = partial(print, flush=True)
+    measure_quality(data, runs, scenes, methods, Settings(minutes, width, device), run_measured, say)
+
+
+def memory(
+    runs: Path,
+    preset: Literal["swift", "paper"] = "swift",
+    width: int = 4000,
+    photographs: int = 12,
+    device: str = "cpu",
+) -> None:
+    """Peak memory of rendering one frame of 4000 x 3000 pixels from photographs of that size (minutes, 1 GB of disk).
+
+    Args:
+        runs: Keep the figures in this folder's memory.json.
+        preset: Which network.
+        width: Width of photographs and frame in pixels; the height is three quarters of it.
+        photographs: How many the scene has.
+        device: auto, cpu, cuda, cuda:N or mps; the figure is of main memory in any case.
+    """
+    from benchmarks.memory import measure_memory
+
+    record = measure_memory(runs, preset, width, photographs, device)
+    print(f"{record['peak_memory_bytes'] / 1e9:.2f} GB, {record['seconds']:.0f} s")
+
+
+def table(runs: Path, out: Path = Path("docs/results.md")) -> None:
+    """Write the page of results from what the other commands kept.
+
+    Args:
+        runs: Folder with what they kept; what is missing is said to be.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.table import write_page
+
+    write_page(runs, out)
+    print(out)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Entry point: exit status 2 for a user's mistake, 130 after an interruption."""
+    words = list(sys.argv[1:] if words is None else words)
+    if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
+        words = ["speed", *words]
+    commands = {"speed": speed, "quality": quality, "memory": memory, "table": table}
+    try:
+        tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
+    except TidefieldError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("benchmarks: interrupted; the same command goes on", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

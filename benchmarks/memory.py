@@ -1,0 +1,105 @@
+"""Peak memory of rendering one large frame from a scene whose photographs are as large, by default 4000 x 3000.
+
+The scene is the built-in survey with its photographs enlarged, the network is fresh, and the photographs are decoded
+by the measured process, as on a machine that sees the scene for the first time.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from benchmarks.records import Runner, run_measured, stamp, tidefield, write_json
+
+SURVEY_WIDTH = 400
+MEMORY_FILE = "memory.json"
+
+
+def measure_memory(
+    runs: Path,
+    preset: str,
+    width: int,
+    photographs: int,
+    device: str,
+    run: Runner = run_measured,
+    prepare: Callable[[Path, str, int, int], str] | None = None,
+) -> dict[str, Any]:
+    """Render in a process of its own and keep what it took in RUNS/memory.json; returns what is kept.
+
+    Args:
+        runs: where the result goes; the scene lies there as long as it is needed.
+        preset: of the fresh network.
+        width: of photographs and frame; the height is three quarters of it.
+        photographs: of the scene.
+        device: where to render.
+        run: runs the command.
+        prepare: makes the run that is rendered, and names a held-out photograph.
+    """
+    runs.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=runs, prefix=".memory-") as folder:
+        work = Path(folder)
+        name = (prepare or _in_a_process_of_its_own)(work, preset, width, photographs)
+        command = [
+            "render",
+            str(work / "run"),
+            str(work / "frame.png"),
+            "--camera",
+            name,
+            "--device",
+            device,
+            "--quiet",
+        ]
+        took = run(tidefield(*command), {"XDG_CACHE_HOME": str(work / "cache")})
+    record = {
+        "preset": preset,
+        "size_px": [width, width * 3 // 4],
+        "photographs": photographs,
+        "device": device,
+        "command": f"python -m benchmarks memory --runs RUNS --preset {preset} --width {width} "
+        f"--photographs {photographs} --device {device}",
+        **asdict(took),
+        **stamp(),
+    }
+    write_json(runs / MEMORY_FILE, record)
+    return record
+
+
+def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
+    """A scene of large photographs in `work`/scene, and a run of a fresh network on it in `work`/run.
+
+    Returns:
+        The name of a held-out photograph.
+    """
+    import torch
+    from PIL import Image
+
+    from tidefield.config import PRESETS
+    from tidefield.data.load import load_scene
+    from tidefield.data.synthetic import make_survey, write_survey
+    from tidefield.train.checkpoint import Run, write_run
+    from tidefield.train.loop import Trainer
+
+    folder = work / "scene"
+    survey = make_survey("river_mouths", seed=7, views=photographs, width=min(width, SURVEY_WIDTH))
+    write_survey(survey, folder, suffix=".jpg")
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as picture:
+            large = picture.resize((width, width * 3 // 4), Image.Resampling.BICUBIC)
+        large.save(path, quality=95)
+    # Readers fit the cameras to photographs of another size than the model says. No weight depends on their size, so
+    # small ones will do here.
+    scene = load_scene(folder, width=min(width, 64))
+    Trainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
+    write_run(work / "run", Run(folder.resolve(), None, 0, PRESETS[preset]))
+    return scene.names[scene.test[-1]]
+
+
+def _in_a_process_of_its_own(work: Path, preset: str, width: int, photographs: int) -> str:
+    """`make_run`, without its memory in this process, which the measured one would be charged with."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(make_run, work, preset, width, photographs).result()
