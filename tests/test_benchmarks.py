@@ -208,7 +208,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         scene = load_scene(folder.parent / "scene")
         assert (scene.cameras.width, scene.cameras.height) == (96, 72)
         assert scene.names[scene.test[0]] == command[command.index("--camera") + 1]
-        monkeypatch.setattr(commands, "render", lambda *args, **options: asked.append(options["camera"]))
+        monkeypatch.setattr(commands, "render", lambda options, console: asked.append(options.camera))
         monkeypatch.setattr(sys, "argv", ["tidefield", *command[3:]])
         cli.main()
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import time
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tidefield import cli
+from tidefield import cli, commands, meter
+from tidefield.data import synthetic
 from tidefield.data.synthetic import make_survey, write_survey
 
 
@@ -120,6 +122,38 @@ def test_a_method_without_training_is_evaluated_on_a_scene(scene: Path, tmp_path
     report = json.loads((tmp_path / "floor" / "evaluation.json").read_text())
     assert report["width"] == 48
     assert report["configuration"] == {"method": "sparse-depth"}
+
+
+def test_the_demonstration_makes_all_that_it_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def smaller(category: str, seed: int, views: int, width: int) -> synthetic.Survey:
+        return make_survey(category, seed, views, width=width // 10, supersample=1)
+
+    monkeypatch.setattr(synthetic, "make_survey", smaller)
+    monkeypatch.setattr(commands, "DEMO_FRAMES", 4)
+    out = tmp_path / "demo"
+    call("demo", out, "--minutes", 0.01, "--device", "cpu")
+    named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("What was made:")[1].strip().splitlines()]
+    names = ["scene", "run/evaluation.json", "side-by-side.png", "run/pictures", "fly-through.mp4"]
+    assert named == [out / name for name in names]
+    assert all(path.exists() for path in named)
+
+
+def test_progress_is_told_where_there_is_no_terminal(
+    scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(meter, "LINE_SECONDS", 0.0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    command = "evaluate", scene, tmp_path / "floor", "--method", "sparse-depth", "--width", 40, "--overwrite"
+    call(*command)
+    told = capfd.readouterr()
+    assert re.search(r"^\d\d:\d\d:\d\d Reading photographs: 9 of 9$", told.err, flags=re.MULTILINE)
+    assert re.search(r"^\d\d:\d\d:\d\d Evaluating: 2 of 2$", told.err, flags=re.MULTILINE)
+    assert "Evaluating" not in told.out
+    call(*command, "-q")
+    told = capfd.readouterr()
+    assert (told.out, told.err) == ("", "")
 
 
 def test_help_does_not_import_torch() -> None:

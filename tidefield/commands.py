@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress, track
 
 from tidefield.baselines import plane_sweep, sparse_depth
 from tidefield.config import PRESETS, FieldConfig, config_to_json
@@ -20,9 +18,10 @@ from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
+from tidefield.meter import Meter
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
-from tidefield.model.rendering import Rendering
+from tidefield.options import Demo, Evaluate, Render, Train
 from tidefield.products.pictures import write_still
 from tidefield.products.trajectory import make_trajectory
 from tidefield.products.video import write_video
@@ -38,49 +37,31 @@ log = logging.getLogger(__name__)
 
 METHODS = {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth}
 DEFAULT_MINUTES = 10.0
+DEMO_FRAMES = 96
+DEMO_PICTURE = "river_mouths_0033.png"
+"""Of the held-out photographs of the built-in scene, the one with a creek, its banks and plants."""
 
 
-def train(
-    scene: Path,
-    folder: Path,
-    *,
-    preset: str,
-    minutes: float | None,
-    steps: int | None,
-    width: int | None,
-    device: str,
-    seed: int,
-    field: bool,
-    resume: bool,
-    overwrite: bool,
-    allow_missing: bool,
-    console: Console,
-) -> None:
+def train(options: Train, console: Console) -> None:
     """See `tidefield train --help`."""
+    minutes, steps, folder = options.minutes, options.steps, options.run
     if minutes is not None and steps is not None:
         raise RunError("both --minutes and --steps are given: expected one of them; leave one out")
-    where = choose_device(device)
-    if resume:
-        run = read_run(folder)
-        if run.scene != scene.resolve():
-            raise RunError(f"{folder} was trained on {run.scene}, not on {scene}: expected the same scene; name it")
-    else:
-        _refuse_run(folder, overwrite)
-        config = PRESETS[preset]
-        if field:
-            config = replace(config, network=replace(config.network, field=FieldConfig()))
-        run = Run(scene.resolve(), width, seed, config)
-    loaded = _load(run.scene, run.width, allow_missing, console)
-    if not loaded.train:
-        raise SceneError(f"{scene} has no training photographs: expected at least three; add photographs")
-    trainer = Trainer(run.config, loaded, run.seed, where)
-    if resume:
+    where = choose_device(options.device)
+    run = _resumed_run(options) if options.resume else _new_run(options)
+    scene = _load(run.scene, run.width, options.allow_missing, console)
+    if not scene.train:
+        raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
+    trainer = Trainer(run.config, scene, run.seed, where)
+    if options.resume:
         trainer.resume(folder)
     else:
         write_run(folder, run)
-    budget = Budget(steps, None if steps is not None else minutes or DEFAULT_MINUTES)
+    if steps is None and minutes is None:
+        minutes = DEFAULT_MINUTES
+    budget = Budget(steps, minutes)
     count = sum(p.numel() for p in trainer.network.parameters())
-    log.info(f"{len(loaded.train)} photographs, {len(loaded.test)} held out; {count:,} parameters on {where}")
+    log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {count:,} parameters on {where}")
     finished = train_loop(trainer, folder, budget, Display(console))
     progress = trainer.progress
     console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
@@ -89,88 +70,66 @@ def train(
         raise KeyboardInterrupt
 
 
-def evaluate(
-    path: Path,
-    out: Path | None,
-    *,
-    method: str | None,
-    width: int | None,
-    device: str,
-    download_lpips: bool,
-    overwrite: bool,
-    allow_missing: bool,
-    console: Console,
-) -> Evaluation:
+def evaluate(options: Evaluate, console: Console) -> Evaluation:
     """See `tidefield evaluate --help`."""
-    if download_lpips:
+    if options.download_lpips:
         download_lpips_weights()
+    path, out, method = options.path, options.out, options.method
     if method is None:
-        if width is not None:
+        if options.width is not None:
             raise RunError("--width belongs to --method: a run is evaluated at its own width; leave it out")
-        run, scene, render = _open_run(path, device, allow_missing, console)
-        configuration: dict[str, Any] = {"method": "tidefield", **config_to_json(run.config), "seed": run.seed}
-        configuration |= {"trained": render.trained}
-        return evaluate_method(
-            render, scene, out or path, configuration=configuration, overwrite=overwrite, console=console
-        )
-    if out is None:
-        raise RunError(f"nowhere to write: expected `tidefield evaluate {path} OUT --method {method}`; name a folder")
-    scene = _load(path, width, allow_missing, console)
-    return evaluate_method(
-        METHODS[method].make(scene), scene, out, configuration={"method": method}, overwrite=overwrite, console=console
-    )
+        scene, view, configuration = _open_run(path, options, console)
+        out = out or path
+    else:
+        if out is None:
+            raise RunError(
+                f"nowhere to write: expected `tidefield evaluate {path} OUT --method {method}`; name a folder"
+            )
+        scene = _load(path, options.width, options.allow_missing, console)
+        view, configuration = METHODS[method].make(scene), {"method": method}
+    return evaluate_method(view, scene, out, configuration=configuration, overwrite=options.overwrite, console=console)
 
 
-def render(
-    folder: Path,
-    out: Path,
-    *,
-    path: str,
-    camera: str | None,
-    frames: int,
-    width: int | None,
-    height: int | None,
-    device: str,
-    overwrite: bool,
-    allow_missing: bool,
-    console: Console,
-) -> None:
+def render(options: Render, console: Console) -> None:
     """See `tidefield render --help`."""
+    out, camera, overwrite = options.out, options.camera, options.overwrite
     wanted = ".mp4" if camera is None else ".png"
     if out.suffix.lower() != wanted:
         what = "a video" if camera is None else "one view (--camera)"
         raise RunError(f"{out.name} was asked for: {what} is written as {wanted}; change the name")
     if not overwrite:
         refuse_existing(out)
-    _, scene, renderer = _open_run(folder, device, allow_missing, console)
+    scene, view, _ = _open_run(options.run, options, console)
     if camera is not None:
         own = scene.cameras[scene.index(camera)]
-        size = _size(own, width, height)
-        for file in write_still(renderer(own.resized(*size)), out, overwrite=overwrite):
+        size = _size(own, options.width, options.height)
+        for file in write_still(view(own.resized(*size)), out, overwrite=overwrite):
             console.print(str(file), highlight=False, soft_wrap=True)
         return
-    size = _size(scene.cameras[scene.train[0]], width, height)
-    trajectory = make_trajectory(path, scene, frames=frames, width=size[0], height=size[1])
-    count = len(trajectory.cameras)
+    width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
+    trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
+    cameras = trajectory.cameras
+    with Meter(console, "Rendering") as meter:
+        write_video(
+            (view(cameras[k]) for k in range(len(cameras))),
+            out,
+            trajectory.frames_per_second,
+            overwrite=overwrite,
+            progress=lambda done: meter(done, len(cameras)),
+        )
+    console.print(f"{out}: {len(cameras)} frames", highlight=False, soft_wrap=True)
 
-    def views() -> Iterator[Rendering]:
-        quiet = not console.is_terminal
-        for k in track(range(count), "Rendering", console=console, disable=quiet, transient=True):
-            yield renderer(trajectory.cameras[k])
 
-    write_video(views(), out, trajectory.frames_per_second, overwrite=overwrite)
-    console.print(f"{out}: {count} frames", highlight=False, soft_wrap=True)
-
-
-def demo(out: Path, *, minutes: float, device: str, overwrite: bool, console: Console) -> None:
+def demo(options: Demo, console: Console) -> None:
     """See `tidefield demo --help`."""
     from tidefield.data.synthetic import make_survey, write_survey
 
-    if overwrite and out.exists():
+    out, device = options.out, options.device
+    if options.overwrite and out.exists():
         if not (out / "scene" / "truth").is_dir():
             raise RunError(f"{out} holds no demonstration: expected one to begin anew; choose another folder")
         shutil.rmtree(out)
-    scene, run = out / "scene", out / "run"
+    scene, run, video, picture = (out / name for name in ("scene", "run", "fly-through.mp4", "side-by-side.png"))
     if not scene.exists():
         console.print("Making a survey of a tidal flat ...")
         half = out / "scene.partial"
@@ -178,66 +137,56 @@ def demo(out: Path, *, minutes: float, device: str, overwrite: bool, console: Co
         write_survey(make_survey("river_mouths", seed=7, views=40, width=320), half)
         half.rename(scene)
     if not (run / CHECKPOINT_FILE).exists():
-        train(
-            scene,
-            run,
-            preset="swift",
-            minutes=minutes,
-            steps=None,
-            width=None,
-            device=device,
-            seed=0,
-            field=False,
-            resume=False,
-            overwrite=True,
-            allow_missing=False,
-            console=console,
-        )
-    common: dict[str, Any] = {"device": device, "overwrite": True, "allow_missing": False, "console": console}
-    evaluate(run, None, method=None, width=None, download_lpips=False, **common)
-    video = out / "fly-through.mp4"
-    render(run, video, path="cameras", camera=None, frames=96, width=None, height=None, **common)
-    pictures = sorted((run / "pictures").glob("*.png"))
-    middle = pictures[len(pictures) // 2]
-    side_by_side = out / "side-by-side.png"
-    shutil.copyfile(middle, side_by_side)
+        train(Train(scene, run, minutes=options.minutes, device=device, overwrite=True), console)
+    evaluate(Evaluate(run, device=device, overwrite=True), console)
+    render(Render(run, video, path="cameras", frames=DEMO_FRAMES, device=device, overwrite=True), console)
+    shutil.copyfile(run / "pictures" / DEMO_PICTURE, picture)
     console.print("\nWhat was made:")
     for what, path in (
         ("the survey, as COLMAP scene", scene),
         ("the numbers", run / "evaluation.json"),
-        ("truth | rendering | error | depth", side_by_side),
+        ("truth | rendering | error | depth", picture),
         ("more of these", run / "pictures"),
         ("the fly-through", video),
     ):
         console.print(f"  {what:<34} {path.resolve()}", highlight=False, soft_wrap=True)
 
 
-class _RunRenderer(Renderer):
-    """A run's renderer, with how far it was trained."""
+def _new_run(options: Train) -> Run:
+    """A run of what is asked for, in a folder that may be one."""
+    _refuse_run(options.run, options.overwrite)
+    config = PRESETS[options.preset]
+    if options.field:
+        config = replace(config, network=replace(config.network, field=FieldConfig()))
+    return Run(options.scene.resolve(), options.width, options.seed, config)
 
-    trained: dict[str, float]
+
+def _resumed_run(options: Train) -> Run:
+    """The run in the folder; what else is asked for was settled when it began."""
+    run = read_run(options.run)
+    if run.scene != options.scene.resolve():
+        raise RunError(
+            f"{options.run} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
+        )
+    return run
 
 
-def _open_run(folder: Path, device: str, allow_missing: bool, console: Console) -> tuple[Run, Scene, _RunRenderer]:
-    where = choose_device(device)
+def _open_run(folder: Path, options: Evaluate | Render, console: Console) -> tuple[Scene, Renderer, dict[str, Any]]:
+    """A run's scene, the run as a method, and what made it, for the record."""
+    where = choose_device(options.device)
     run = read_run(folder)
     network = Network(run.config.network)
     progress = load_network(folder, network)
-    scene = _load(run.scene, run.width, allow_missing, console)
-    renderer = _RunRenderer(network.to(where).eval(), scene, run.config, where)
-    renderer.trained = {"steps": progress.step, "seconds": progress.seconds}
-    return run, scene, renderer
+    scene = _load(run.scene, run.width, options.allow_missing, console)
+    trained = {"steps": progress.step, "seconds": progress.seconds}
+    configuration = {"method": "tidefield", **config_to_json(run.config), "seed": run.seed, "trained": trained}
+    return scene, Renderer(network.to(where).eval(), scene, run.config, where), configuration
 
 
 def _load(scene: Path, width: int | None, allow_missing: bool, console: Console) -> Scene:
     """Read a scene, with progress while photographs are decoded."""
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task("Reading photographs", total=None)
-
-        def show(ready: int, count: int) -> None:
-            progress.update(task, completed=ready, total=count)
-
-        return load_scene(scene, width=width, allow_missing=allow_missing, progress=show)
+    with Meter(console, "Reading photographs") as meter:
+        return load_scene(scene, width=width, allow_missing=allow_missing, progress=meter)
 
 
 def _refuse_run(folder: Path, overwrite: bool) -> None:

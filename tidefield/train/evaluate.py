@@ -17,7 +17,6 @@ from typing import Any
 import torch
 from PIL import Image
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from tidefield import __version__
@@ -25,6 +24,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
 from tidefield.files import completed_file
+from tidefield.meter import Meter
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.train.lpips import Lpips, load_lpips
 from tidefield.train.metrics import METRICS, SUFFIXES, Image8, flip_map, score
@@ -88,8 +88,8 @@ def evaluate(
     photographs: dict[str, dict[str, Any]] = {}
     memory: dict[str, int | None] = {}
     networks: dict[str, Lpips | str] = {}
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        for index, file in zip(progress.track(scene.test, description="Evaluating"), files, strict=True):
+    with Meter(console, "Evaluating") as meter:
+        for index, file in zip(scene.test, files, strict=True):
             rendering, seconds = _rendered(render, scene, index)
             if not memory:
                 # Here, so that the metrics' own networks do not count as the method's.
@@ -104,6 +104,7 @@ def evaluate(
                 "seconds": seconds,
             }
             _save_pictures(out, file, image, truth, rendering)
+            meter(len(photographs), len(scene.test))
     report = {
         "per_photograph": photographs,
         "mean": _mean(list(photographs.values())),

@@ -1,0 +1,123 @@
+"""What can be asked of each command: its arguments, their defaults and their help.
+
+The command line is made from these, and the commands take them whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+Preset = Literal["swift", "paper"]
+Method = Literal["plane-sweep", "sparse-depth"]
+Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
+AllowMissing = Annotated[bool, arg(help="Go on without photographs that the scene names but does not have.")]
+
+
+@dataclass(frozen=True)
+class Talk:
+    """How much is said."""
+
+    verbose: Annotated[bool, arg(aliases=["-v"])] = False
+    """Say more."""
+    quiet: Annotated[bool, arg(aliases=["-q"])] = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train on one scene and keep the result in a run folder.
+
+    Ctrl-C saves before it stops; --resume goes on from there.
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder with posed photographs: a COLMAP model, transforms.json, a Blender scene or LLFF."""
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder for the result; must be new, unless --resume or --overwrite is given."""
+    preset: Preset = "swift"
+    """swift is the best quality for the time; paper is the network as printed."""
+    minutes: float | None = None
+    """Train for so long; 10 if neither this nor --steps is given."""
+    steps: int | None = None
+    """Train for so many steps instead."""
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    device: Device = "auto"
+    seed: int = 0
+    """Of the weights and of the order of the photographs."""
+    field: bool = False
+    """Add the per-scene field (a hash grid) to what the neighbours say."""
+    resume: bool = False
+    """Go on with the run that is in the folder."""
+    overwrite: bool = False
+    """Replace the run that is in the folder."""
+    allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare renderings of the held-out photographs with the photographs.
+
+    Writes evaluation.json and pictures: `tidefield evaluate RUN` into the run, `tidefield evaluate SCENE OUT --method
+    sparse-depth` into a folder of its own, for methods that need no training.
+    """
+
+    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A run, or with --method a scene."""
+    out: Annotated[Positional[Path | None], arg(metavar="[OUT]")] = None
+    """Where to write; the run itself if not given."""
+    method: Method | None = None
+    """Evaluate this method on a scene instead of a run."""
+    width: int | None = None
+    """Width of the photographs in pixels, with --method; a run knows its own."""
+    device: Device = "auto"
+    download_lpips: bool = False
+    """Fetch the weights that LPIPS needs (AlexNet 233 MB, VGG 528 MB) if they are not there."""
+    overwrite: bool = False
+    """Replace an evaluation that is there."""
+    allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a video along a path (OUT.mp4), or the view of one photograph's camera with its depth (OUT.png)."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A trained run."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """The file to write; .mp4 for a video, .png with --camera."""
+    path: str = "orbit"
+    """orbit, cameras (a flight among them), strip (straight down) or a camera-path JSON of nerfstudio's viewer."""
+    camera: str | None = None
+    """Name of a photograph whose camera is rendered instead of a path."""
+    frames: int = 240
+    """Frames of the video; 24 are a second."""
+    width: int | None = None
+    """Width of the picture in pixels; that of the run's photographs if not given."""
+    height: int | None = None
+    """Height of the picture in pixels; in proportion to the width if not given."""
+    device: Device = "auto"
+    overwrite: bool = False
+    """Replace files that are there."""
+    allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole job on a built-in scene: make a survey of a tidal flat, train, evaluate, and render a fly-through."""
+
+    out: Annotated[Positional[Path], arg(metavar="[OUT]")] = Path("tidefield-demo")
+    """Folder to write to."""
+    minutes: float = 3.0
+    """Minutes of training."""
+    device: Device = "auto"
+    overwrite: bool = False
+    """Begin anew in a folder that holds a demonstration; without it, what is there is used and finished."""
+    talk: OmitArgPrefixes[Talk] = Talk()
