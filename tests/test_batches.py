@@ -56,7 +56,7 @@ def test_the_same_seed_draws_the_same_batch_and_another_seed_another(config: Tra
 def test_tiles_hold_the_pixels_they_claim_at_the_common_exposure(config: TrainConfig):
     own = scene()
     for drawn in seeds(own, config, 3):
-        assert drawn.inside.all()
+        assert (drawn.weight > 0).all()
         for t, (target, (u, v)) in enumerate(zip(drawn.targets.tolist(), drawn.corner_px.long().tolist(), strict=True)):
             pixels = own.photographs[target][v : v + 8, u : u + 8].float() / 255 / own.cameras.gain[target]
             torch.testing.assert_close(drawn.colours[t].reshape(8, 8, 3), pixels)
@@ -116,7 +116,7 @@ def test_a_photograph_smaller_than_a_tile_says_which_pixels_it_has():
     assert drawn
     for b in drawn:
         for t in (b.targets % 2 == 1).nonzero()[:, 0].tolist():
-            inside = b.inside[t].reshape(8, 8)
+            inside = b.weight[t].reshape(8, 8) > 0
             assert inside[:6].all()
             assert not inside[6:].any()
             assert not b.colours[t].reshape(8, 8, 3)[6:].any()
@@ -172,3 +172,23 @@ def test_a_batch_for_a_network_without_views_has_nothing_to_encode():
     assert drawn.neighbours.shape == (6, 0)
     assert drawn.images == ()
     assert drawn.colours.shape == (6, 64, 3)
+
+
+def test_pixels_that_fewer_than_two_others_see_weigh_as_little_as_is_said():
+    """Three cameras in a row: the outer ones' outer edges are seen by themselves alone."""
+    own = wall.scene(wall.cameras(3, step=1.5), ())
+    config = replace(CROPS, tile_px=8, unseen_weight=0.25)
+    weights = set()
+    for drawn in (draw_batch(own, Surfaces(own), config, 2, torch.Generator().manual_seed(k)) for k in range(6)):
+        for t, target in enumerate(drawn.targets.tolist()):
+            tile = own.cameras[target]
+            u, v = (drawn.corner_px[t] + 0.5).tolist()
+            pixels = torch.tensor([[u + x, v + y] for y in range(8) for x in range(8)])
+            spot = tile.directions_world(pixels[None])[0] * wall.DEPTH + tile.position_world
+            others = own.cameras[[i for i in range(3) if i != target]]
+            seen = ((others.project(spot)[0] > 0) & (others.project(spot)[0] < others.size_px[:, None])).all(-1).sum(0)
+            # Told by cells of four pixels, so at the border between seen and unseen it may differ.
+            agree = torch.where(seen >= 2, 1.0, 0.25) == drawn.weight[t]
+            assert agree.float().mean() >= 0.75
+            weights |= set(drawn.weight[t].tolist())
+    assert weights == {0.25, 1.0}

@@ -88,6 +88,9 @@ class TrainConfig:
     field_learning_rate: float = 1e-2
     warm_up: int = 50
     """Steps over which the learning rate rises."""
+    unseen_weight: float = 1.0
+    """In the loss, of pixels that fewer than two other training photographs see: little can be learned from what
+    cannot be known, and its large errors drown the rest."""
     neighbours: Literal["seen", "direction"] = "seen"
     """How neighbours are ranked: by what the target sees, or by viewing direction alone, as the paper does."""
 
@@ -123,7 +126,7 @@ SWIFT = Config(
         views=5,
         fold=True,
     ),
-    train=TrainConfig(tile_px=32, tiles=4, crop_px=96, learning_rate=3e-3),
+    train=TrainConfig(tile_px=32, tiles=4, crop_px=96, learning_rate=3e-3, unseen_weight=0.02),
 )
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from tidefield.config import TrainConfig
 from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
-from tidefield.data.prior import read_prior, surface_prior
+from tidefield.data.prior import STRIDE, read_prior, surface_prior
 from tidefield.data.scene import Scene
+from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras
 
 
@@ -26,7 +27,8 @@ class Batch:
         targets: the tiles' photographs.
         corner_px: the tiles' upper left pixel corners.
         colours: the truth.
-        inside: whether a pixel lies in its photograph; small photographs may be smaller than a tile.
+        weight: of each pixel in the loss: 0 outside its photograph, which may be smaller than a tile, and
+            `TrainConfig.unseen_weight` where fewer than two other training photographs see the surface.
         neighbours: photographs serving as the tiles' neighbouring views.
         which: for each neighbour, the image of `images` to read.
         images: what to encode, in groups of one size: crops of, or whole, photographs.
@@ -36,7 +38,7 @@ class Batch:
     targets: Int[Tensor, " T"]
     corner_px: Float[Tensor, "T 2"]
     colours: Float[Tensor, "T R 3"]
-    inside: Bool[Tensor, "T R"]
+    weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
@@ -74,12 +76,28 @@ def tile_surface(
     """Surface points that a tile shows: its middle and four points towards its corners."""
     spots = corner_px.new_tensor([[0.5, 0.5], [0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]])
     uv = corner_px[:, None] + spots * side_px
-    uv = torch.minimum(uv.clamp(min=0), camera.size_px[0].to(uv))
-    expected, near, far = read_prior(prior[None], uv.reshape(1, -1, 2))
+    return _surface(camera, prior, uv.reshape(-1, 2)).reshape(-1, 5, 3)
+
+
+def tile_doubly_seen(
+    camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "2"], side_px: int, others: Cameras
+) -> Bool[Tensor, " R"]:
+    """Which pixels of a tile show surface that two or more other cameras see, as the prior's cells tell it."""
+    cells = max(1, side_px // STRIDE)
+    line = (torch.arange(cells) + 0.5) * (side_px / cells)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    uv, z = others.project(_surface(camera, prior, corner_px + torch.stack([u, v], -1).reshape(-1, 2)))
+    seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
+    near = torch.arange(side_px) * cells // side_px
+    return seen[near][:, near].reshape(-1)
+
+
+def _surface(camera: Cameras, prior: Float[Tensor, "3 h w"], uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+    """Surface points at pixels of one camera; beyond the image they are those at its border."""
+    uv = torch.minimum(uv_px.clamp(min=0), camera.size_px[0].to(uv_px))[None]
+    expected, near, far = read_prior(prior[None], uv)
     inverse = torch.where(expected.isnan(), (near + far) / 2, expected)
-    return (
-        camera.position_world[:, None] + camera.directions_world(uv.reshape(1, -1, 2)) / inverse[..., None]
-    ).reshape(-1, 5, 3)
+    return (camera.position_world[:, None] + camera.directions_world(uv) / inverse[..., None])[0]
 
 
 def choose_neighbours(
@@ -111,22 +129,25 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     size = scene.cameras.size_px[targets]
     room = (size - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
-    surfaces_world, neighbours = [], []
+    surfaces_world, neighbours, weights = [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
-        camera = scene.cameras[target]
-        surface = tile_surface(camera, surfaces[target], at[None], side)
+        camera, prior = scene.cameras[target], surfaces[target]
+        surface = tile_surface(camera, prior, at[None], side)
         surfaces_world.append(surface[0, 0])
         neighbours.append(choose_neighbours(camera, surface, scene, views, config.neighbours, target)[0])
+        others = scene.cameras[train[train != target]]
+        weights.append(torch.where(tile_doubly_seen(camera, prior, at, side, others), 1.0, config.unseen_weight))
     chosen = torch.stack(neighbours)
     tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
     colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
+    weight = torch.stack(weights) * inside
     if not views:
         which, images, corners = chosen, (), ()
     elif config.crop_px is None:
         which, images, corners = _whole(scene, chosen)
     else:
         which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
-    return Batch(targets, corner, colours, inside, chosen, which, images, corners)
+    return Batch(targets, corner, colours, weight, chosen, which, images, corners)
 
 
 def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:

@@ -95,7 +95,9 @@ class Network(nn.Module):
             self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
         self.field = Field(config.field) if config.field else None
         field_channels = self.field.channels if self.field else 0
-        self.stages = nn.ModuleList(Stage(config, stage, field_channels) for stage in config.stages)
+        self.stages = nn.ModuleList(
+            Stage(config, stage, field_channels, first=k == 0) for k, stage in enumerate(config.stages)
+        )
         self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree)
 
     def forward(

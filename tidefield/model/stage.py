@@ -58,9 +58,15 @@ def place_samples(
 
 
 class Stage(nn.Module):
-    """Evidence, ray transformer and density of one pass."""
+    """Evidence, ray transformer and density of one pass.
 
-    def __init__(self, network: NetworkConfig, config: StageConfig, field_channels: int) -> None:
+    Args:
+        network, config: of the whole and of this pass.
+        field_channels: of the per-scene field; 0 without one.
+        first: nothing but the sparse points has said yet where the surface is.
+    """
+
+    def __init__(self, network: NetworkConfig, config: StageConfig, field_channels: int, first: bool) -> None:
         super().__init__()
         self.hidden = hidden = config.hidden
         if network.views:
@@ -72,11 +78,11 @@ class Stage(nn.Module):
         self.guided = network.guided
         if network.guided:
             self.guide = nn.Linear(3, hidden)
-            # At the start: density where the views agree and, within about a sample, the surface is expected; the
-            # network corrects it.
-            self.match = nn.Parameter(torch.tensor(1.0))
-            self.guide_height = nn.Parameter(torch.tensor(2.0))
-            self.guide_steepness = nn.Parameter(torch.tensor(1.0))
+            # At the start: density where the views agree and, in the first pass, within some samples of where the
+            # surface is expected; the network corrects it.
+            self.match = nn.Parameter(torch.tensor(3.0))
+            self.guide_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
+            self.guide_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
             nn.init.zeros_(self.density.weight)
             nn.init.zeros_(self.density.bias)
 
@@ -134,4 +140,4 @@ class Stage(nn.Module):
         features = torch.stack([offset / 4, torch.exp(-((offset / 2) ** 2)), torch.exp(-((offset / 8) ** 2))], dim=-1)
         # Beyond the floor it would shut off, for good, samples that the views may yet find to be the surface.
         bias = (self.guide_height - self.guide_steepness * offset.square()).clamp(min=-4)
-        return x + self.guide(features) * known[..., None], torch.where(known, bias, 0.0)
+        return x + self.guide(features) * known[..., None], torch.where(known, bias, self.guide_height)

@@ -19,25 +19,30 @@ def photometric(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """The loss, and the mean squared error of the colours alone (eq. 5 divided by the number of values).
 
-    A coarse stage's colours are compared with the means of the pixels that its rays stand for.
+    Both are weighted as the batch says. A coarse stage's colours are compared with the means of the pixels that its
+    rays stand for.
     """
-    inside = batch.inside[..., None].to(batch.colours)
-    error = _mean_square((rendering.colour - batch.colours) * inside, inside)
+    weight = batch.weight[..., None]
+    error = _mean_square(rendering.colour - batch.colours, weight)
     loss = error
-    truth = (batch.colours * inside).unflatten(1, (side_px, side_px)).permute(0, 3, 1, 2)
-    share = inside.unflatten(1, (side_px, side_px)).permute(0, 3, 1, 2)
+    weighted_truth, share = ((_picture(x, side_px)) for x in (batch.colours * weight, weight))
     for k, glimpse in enumerate(rendering.glimpses):
         stride, margin = network.config.stages[k].stride, network.margin(k)
         rows = side_px // stride + 2 * margin
         seen = glimpse.unflatten(1, (rows, rows))[:, margin : rows - margin, margin : rows - margin]
-        covered = F.avg_pool2d(share, stride).permute(0, 2, 3, 1)
-        mean = F.avg_pool2d(truth, stride).permute(0, 2, 3, 1)
-        loss = loss + GLIMPSE_WEIGHT * _mean_square(seen * covered - mean, covered)
+        total = F.avg_pool2d(share, stride).permute(0, 2, 3, 1)
+        mean = F.avg_pool2d(weighted_truth, stride).permute(0, 2, 3, 1) / total.clamp(min=1e-6)
+        loss = loss + GLIMPSE_WEIGHT * _mean_square(seen - mean, total)
     return loss, error
 
 
+def _picture(values: Float[Tensor, "T R C"], side_px: int) -> Float[Tensor, "T C S S"]:
+    return values.unflatten(1, (side_px, side_px)).permute(0, 3, 1, 2)
+
+
 def _mean_square(difference: Tensor, weight: Tensor) -> Tensor:
-    return difference.square().sum() / (weight.sum() * difference.shape[-1] / weight.shape[-1]).clamp(min=1.0)
+    """Weighted mean; where hardly any weight is, a sum over a tenth of the values, so that it does not become loud."""
+    return (difference.square() * weight).mean() / weight.mean().clamp(min=0.1)
 
 
 def psnr(mean_square: float) -> float:
