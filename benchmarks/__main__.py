@@ -43,7 +43,7 @@ def speed(
     if quick and runs is not None:
         raise RunError("--quick was given with --runs: such figures are not worth keeping; leave one of them out")
     # As the tidefield command does, before torch is imported.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     from rich.console import Console
 
     from benchmarks.records import stamp, write_json

@@ -51,9 +51,9 @@ def _run() -> None:
 
 def _begin(talk: Talk) -> Console:
     """Set up messages; returns the console that commands print to."""
-    # Before torch is imported: threads that wait spinning for work take the cores from those that have some, and on a
-    # busy machine a step takes ten times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Before torch is imported: threads that wait spinning for work take the cores from those that have some, and a
+    # busy machine becomes several times slower; those that do not spin at all wake up late on a quiet one.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     from rich.console import Console
     from rich.logging import RichHandler
 
