@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.baselines.gather import fill_unseen, read_photograph
-from tidefield.model.gather import gather, maps_from_images, weighted_rows
-from tidefield.model.renderer import joined
+from tidefield.model.gather import gather, joined, maps_from_images, weighted_rows
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -148,3 +147,18 @@ def test_weighted_rows_are_sums_with_the_right_gradient():
     share = torch.rand(2, 3, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(weighted_rows(rows, index, share), (rows[index] * share[..., None]).sum(1))
     assert torch.autograd.gradcheck(lambda r: weighted_rows(r, index, share), rows.requires_grad_())
+
+
+def test_a_cubic_reading_is_exact_on_quadratics_and_passes_through_the_texels():
+    """Keys' kernel with a = -1/2 reproduces polynomials of second degree."""
+    v, u = torch.meshgrid(torch.arange(12.0).double() + 0.5, torch.arange(14.0).double() + 0.5, indexing="ij")
+    picture = torch.stack([0.3 * u * u - u * v, 2 * v * v - u + 1, u * v])[None]
+    maps = maps_from_images(picture, torch.zeros(1, 2), 1)
+    uv = 3 + torch.rand(1, 1, 200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6
+    values, _ = gather(maps, torch.tensor([[0]]), uv, cubic=True)
+    x, y = uv[0, 0].unbind(-1)
+    torch.testing.assert_close(values[0, 0], torch.stack([0.3 * x * x - x * y, 2 * y * y - x + 1, x * y], -1))
+    corners = torch.tensor([[[[0.5, 0.5], [13.5, 11.5]]]], dtype=torch.float64)
+    values, inside = gather(maps, torch.tensor([[0]]), corners, cubic=True)
+    assert inside.all()
+    torch.testing.assert_close(values[0, 0], torch.stack([picture[0, :, 0, 0], picture[0, :, -1, -1]]))

@@ -42,7 +42,7 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
-    found = views.read(1, view.position_world[None] + 5 * directions, directions)
+    found = views.read(1, view.position_world[None] + 5 * directions, directions, detail=True)
     assert found.valid.all()
     assert len(views.which.unique()) == 4
     column, row = around.reshape(-1, 2).long().unbind(-1)

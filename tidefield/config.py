@@ -69,8 +69,9 @@ class NetworkConfig:
     """J of eq. 8."""
     doubt: float = 0.05
     """Share of a finer stage's samples that are spread evenly instead of where the coarser stage saw the surface."""
-    guided: bool = True
-    """Begin from what is known: look around the sparse points' surface first, and around each coarser stage's depth."""
+    as_printed: bool = False
+    """The paper's boxes and nothing else. Otherwise what we add to them takes part: a look around the sparse points'
+    surface first, density where features agree, sharpened photographs, views by angle before anything is learned."""
     field: FieldConfig | None = None
 
 
@@ -111,7 +112,7 @@ PAPER = Config(
         stages=(StageConfig(stride=1, samples=64, feature_stride=4, feature_channels=64, hidden=64),),
         views=8,
         fold=False,
-        guided=False,
+        as_printed=True,
     ),
     train=TrainConfig(tile_px=8, tiles=8, crop_px=None, learning_rate=5e-4, neighbours="direction"),
 )

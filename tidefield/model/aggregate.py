@@ -24,7 +24,8 @@ class Evidence:
         per_view: F_N,i, the feature of each view; None where there are no views.
         view_weight: w_n,i in (0, 1), how far each view is to be believed; 0 where it is invalid.
         mean_colour: the views' colours averaged with the direction weights; middle grey where there are none.
-        disagreement: how differently the views see the sample: a weighted sum of the variances of their features.
+        disagreement: how differently the views see the sample: a weighted sum of the variances of their features; not
+            in the paper, and 0 where a network is as printed.
         valid: whether anything is known of the sample.
     """
 
@@ -76,9 +77,10 @@ class Aggregate(nn.Module):
         hidden: H.
         folded: the part of the first layer that acts on F_i has been applied to the feature maps already (it commutes
             with bilinear interpolation), so channels == hidden and F_i enters as it is.
+        as_printed: without the disagreement.
     """
 
-    def __init__(self, channels: int, hidden: int, folded: bool) -> None:
+    def __init__(self, channels: int, hidden: int, folded: bool, as_printed: bool = False) -> None:
         super().__init__()
         assert not folded or channels == hidden, "a folded first layer hands on its outputs"
         # exp keeps s positive; 20 separates views 20 degrees apart by a factor of 3.
@@ -87,7 +89,7 @@ class Aggregate(nn.Module):
         self.shared = nn.Linear(2 * channels, hidden)
         self.second = nn.Linear(hidden, hidden)
         self.trust = nn.Linear(hidden, 1)
-        self.metric = nn.Parameter(torch.full((channels,), -math.log(channels)))
+        self.metric = None if as_printed else nn.Parameter(torch.full((channels,), -math.log(channels)))
         self.density = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
 
     def forward(
@@ -111,6 +113,6 @@ class Aggregate(nn.Module):
             per_view=per_view,
             view_weight=trust,
             mean_colour=(weight[..., None] * colours).sum(1) + 0.5 * ~seen[..., None],
-            disagreement=variance @ self.metric.exp(),
+            disagreement=torch.zeros_like(weight[:, 0]) if self.metric is None else variance @ self.metric.exp(),
             valid=seen,
         )

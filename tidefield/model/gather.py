@@ -1,7 +1,7 @@
 """Reading feature maps at projected samples (method.md, section 3).
 
-A map's texels lie in memory as rows of channels, so a bilinear read is a weighted sum of four rows: `embedding_bag`,
-which is several times faster than `grid_sample` for more than a few channels, on CPUs and GPUs alike.
+A map's texels lie in memory as rows of channels, so a read is a weighted sum of a few rows: `embedding_bag`, which is
+several times faster than `grid_sample` for more than a few channels, on CPUs and GPUs alike.
 
 Alphabet: K maps, Q texels of all maps together, T tiles, N views, P samples, C channels.
 """
@@ -53,31 +53,55 @@ def maps_from_images(images: Float[Tensor, "K C h w"], corner_px: Float[Tensor, 
     )
 
 
+def joined(maps: list[FeatureMaps]) -> FeatureMaps:
+    """Maps of several sizes as one set."""
+    offsets = torch.tensor([0, *(len(m.rows) for m in maps[:-1])], device=maps[0].rows.device).cumsum(0)
+    return FeatureMaps(
+        rows=torch.cat([m.rows for m in maps]),
+        first=torch.cat([m.first + o for m, o in zip(maps, offsets, strict=True)]),
+        size=torch.cat([m.size for m in maps]),
+        origin_px=torch.cat([m.origin_px for m in maps]),
+        stride=maps[0].stride,
+    )
+
+
 def gather(
-    maps: FeatureMaps, which: Int[Tensor, "T N"], uv_px: Float[Tensor, "T N P 2"]
+    maps: FeatureMaps, which: Int[Tensor, "T N"], uv_px: Float[Tensor, "T N P 2"], cubic: bool = False
 ) -> tuple[Float[Tensor, "T N P C"], Bool[Tensor, "T N P"]]:
-    """Bilinear values of map `which[t, n]` at pixels, and whether the pixel lies on the map.
+    """Values of map `which[t, n]` at pixels, and whether the pixel lies on the map.
 
     Beyond the outermost texels' centres the border is continued; "on the map" reaches half a stride beyond them.
+
+    Args:
+        cubic: interpolate by cubic convolution of 4 x 4 texels instead of bilinearly of 2 x 2.
     """
     size = maps.size[which][:, :, None]
     place = (uv_px - maps.origin_px[which][:, :, None]) / maps.stride
     inside = ((place >= -0.5) & (place <= size - 0.5)).all(-1)
     # NaN or huge places of invalid points must still index something.
     place = torch.where(inside[..., None], place, torch.zeros_like(place))
-    place = torch.minimum(place.clamp(min=0), (size - 1).to(place))
-    corner = torch.minimum(place.floor(), (size - 2).clamp(min=0).to(place))
-    fx, fy = (place - corner).unbind(-1)
-    column, row = corner.long().unbind(-1)
-    width = size[..., 0]
-    index = maps.first[which][:, :, None] + row * width + column
-    # A map one texel wide or high has no second column or row.
-    right = (width > 1).long()
-    below = torch.where(size[..., 1] > 1, width, 0)
-    indices = torch.stack([index, index + right, index + below, index + below + right], dim=-1)
-    share = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], dim=-1)
-    values = weighted_rows(maps.rows, indices.reshape(-1, 4), share.reshape(-1, 4).to(maps.rows.dtype))
-    return values.float().reshape(*uv_px.shape[:-1], -1), inside
+    corner = place.floor()
+    share = _cubic(place - corner) if cubic else torch.stack([1 - (place - corner), place - corner], dim=-1)
+    taps = share.shape[-1]
+    cell = corner.long()[..., None] + (torch.arange(taps, device=place.device) - (taps // 2 - 1))
+    column, row = torch.minimum(cell.clamp(min=0), size[..., None] - 1).unbind(-2)
+    first = (maps.first[which][:, :, None, None] + row * size[..., :1])[..., :, None]
+    indices = (first + column[..., None, :]).reshape(-1, taps * taps)
+    shares = (share[..., 1, :, None] * share[..., 0, None, :]).reshape(-1, taps * taps)
+    values = weighted_rows(maps.rows, indices, shares.to(maps.rows.dtype))
+    values = values.float() if values.dtype == torch.float16 else values
+    return values.reshape(*uv_px.shape[:-1], -1), inside
+
+
+def _cubic(part: Float[Tensor, "*B"]) -> Float[Tensor, "*B 4"]:
+    """Weights of the texels at -1, 0, 1 and 2 for a place between 0 and 1.
+
+    Keys, Cubic convolution interpolation for digital image processing, 1981, eq. 15 (a = -1/2).
+    """
+    distance = torch.stack([1 + part, part, 1 - part, 2 - part], dim=-1)
+    near = (1.5 * distance - 2.5) * distance.square() + 1
+    far = ((-0.5 * distance + 2.5) * distance - 4) * distance + 2
+    return torch.where(distance <= 1, near, far)
 
 
 def weighted_rows(

@@ -20,10 +20,10 @@ from tidefield.model.colour import ColourBlend
 from tidefield.model.compositing import composite
 from tidefield.model.encoder import Encoder
 from tidefield.model.field import Field
-from tidefield.model.gather import FeatureMaps, maps_from_images
+from tidefield.model.gather import maps_from_images
 from tidefield.model.intervals import Intervals, histogram, refined, sample
 from tidefield.model.stage import Samples, Stage, place_samples
-from tidefield.model.views import Gathered, Views
+from tidefield.model.views import Encoded, Gathered, Views
 
 
 @dataclass(frozen=True)
@@ -89,16 +89,15 @@ class Network(nn.Module):
         if config.views:
             wanted = {s.feature_stride: s.feature_channels for s in config.stages}
             self.encoder = Encoder(config.encoder, tuple(sorted(wanted.items(), reverse=True)))
-            self.descriptors = nn.ModuleDict(
-                {str(s): nn.Conv2d(3, c, 5, padding=2, padding_mode="replicate", bias=False) for s, c in wanted.items()}
-            )
-            self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
+            if not config.as_printed:
+                self.descriptors = nn.ModuleDict({str(s): _descriptor(c) for s, c in wanted.items()})
+                self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
         self.field = Field(config.field) if config.field else None
         field_channels = self.field.channels if self.field else 0
         self.stages = nn.ModuleList(
             Stage(config, stage, field_channels, first=k == 0) for k, stage in enumerate(config.stages)
         )
-        self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree)
+        self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree, config.as_printed)
 
     def forward(
         self,
@@ -152,7 +151,7 @@ class Network(nn.Module):
         uv = tiles.rays_px(config.stride, self.margin(k))
         samples = place_samples(tiles.cameras, uv, intervals, sample(density, config.samples, generator))
         points, directions = samples.points_world, samples.directions
-        gathered = views.read(config.feature_stride, points, directions) if views else None
+        gathered = views.read(config.feature_stride, points, directions, k + 1 == len(self.stages)) if views else None
         evidence = stage.evidence(gathered, self.field(points) if self.field else None)
         unit = self.field.unit if self.field and not views else None
         weights = stage.weights(evidence, samples, intervals, opaque, unit)
@@ -169,32 +168,39 @@ class Network(nn.Module):
         """Pixels at which `forward` wants its start intervals."""
         return tiles.rays_px(self.config.stages[0].stride, self.margin(0))
 
-    def encode(
-        self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None
-    ) -> dict[int, FeatureMaps]:
-        """Features of photographs of one size, or of crops, with the photographs themselves as first channels.
+    def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
+        """Features of photographs of one size, or of crops.
 
         Args:
             photographs: colours at the common exposure.
             corner_px: where in their photographs the crops' upper left corners lie; None for whole photographs.
         """
         corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
-        features = self.encoder(photographs)
         maps = {}
-        for stride, feature in zip(self.encoder.strides, features, strict=True):
-            colours = self._colours(photographs, stride)
-            feature = feature.float() + self.descriptors[str(stride)](colours)
-            maps[stride] = maps_from_images(torch.cat([colours, feature], dim=1), corner, stride)
-        return maps
+        for stride, feature in zip(self.encoder.strides, self.encoder(photographs), strict=True):
+            feature = feature.float()
+            means = _means(photographs, stride)
+            if not self.config.as_printed:
+                feature = feature + self.descriptors[str(stride)](means)
+            channels = [means, feature] if stride > 1 else [feature]
+            maps[stride] = maps_from_images(torch.cat(channels, dim=1), corner, stride)
+        colours = photographs if self.config.as_printed else self._sharpened(photographs)
+        return Encoded(maps, maps_from_images(colours, corner, 1), cubic=not self.config.as_printed)
 
-    def _colours(self, photographs: Float[Tensor, "K 3 H W"], stride: int) -> Float[Tensor, "K 3 h w"]:
-        """The photographs on the texels of a map: averaged if coarse, else sharpened against the bilinear reading.
-
-        The sharpening filter is learned, begins as none, and sums to one.
-        """
-        if stride > 1:
-            odd = stride + 1 - stride % 2
-            return F.avg_pool2d(photographs, odd, stride, odd // 2, count_include_pad=False)
+    def _sharpened(self, photographs: Float[Tensor, "K 3 H W"]) -> Float[Tensor, "K 3 H W"]:
+        """Against the blur of reading between pixels and of blending: learned, begins as none, and sums to one."""
         planes = F.pad(photographs.flatten(0, 1)[:, None], (2, 2, 2, 2), mode="replicate")
         detail = F.conv2d(planes, self.sharpen - self.sharpen.mean())
         return photographs + detail.reshape(photographs.shape)
+
+
+def _descriptor(channels: int) -> nn.Conv2d:
+    return nn.Conv2d(3, channels, 5, padding=2, padding_mode="replicate", bias=False)
+
+
+def _means(photographs: Float[Tensor, "K 3 H W"], stride: int) -> Float[Tensor, "K 3 h w"]:
+    """The photographs on the texels of a map: means over an odd number of pixels, so that they are centred there."""
+    if stride == 1:
+        return photographs
+    odd = stride + 1 - stride % 2
+    return F.avg_pool2d(photographs, odd, stride, odd // 2, count_include_pad=False)

@@ -11,7 +11,6 @@ from tidefield.data.batches import choose_neighbours, even, tile_surface
 from tidefield.data.prior import read_prior, surface_prior
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.gather import FeatureMaps
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, Tiles
 from tidefield.model.rendering import Rendering
@@ -108,15 +107,3 @@ def start_intervals(network: Network, tiles: Tiles, priors: Float[Tensor, "_ 3 h
     read = read_prior(priors, uv.reshape(len(priors), -1, 2))
     expected, near, far = (x.reshape(uv.shape[:2]) for x in read)
     return Intervals(near=near, far=far, expected=expected)
-
-
-def joined(maps: list[FeatureMaps]) -> FeatureMaps:
-    """Maps of several sizes as one set."""
-    offsets = torch.tensor([0, *(len(m.rows) for m in maps[:-1])], device=maps[0].rows.device).cumsum(0)
-    return FeatureMaps(
-        rows=torch.cat([m.rows for m in maps]),
-        first=torch.cat([m.first + o for m, o in zip(maps, offsets, strict=True)]),
-        size=torch.cat([m.size for m in maps]),
-        origin_px=torch.cat([m.origin_px for m in maps]),
-        stride=maps[0].stride,
-    )

@@ -16,7 +16,7 @@ from tidefield.data.batches import even
 from tidefield.data.scene import Scene
 from tidefield.model.gather import FeatureMaps
 from tidefield.model.network import Network
-from tidefield.model.views import Views
+from tidefield.model.views import Encoded, Views
 
 BLOCK_PX = 1024
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
@@ -46,10 +46,13 @@ class FeatureShelf:
         size = scene.cameras.size_px[list(scene.train)].clamp(max=BLOCK_PX)
         self._side = tuple(int(x) for x in size.amax(0))
         blocks = int(_block_counts(scene.cameras.size_px[list(scene.train)]).prod(-1).sum())
-        maps = {stage.feature_stride: 3 + stage.feature_channels for stage in network.config.stages}
-        room = budget_bytes // sum(2 * self._texels(stride) * channels for stride, channels in maps.items())
-        self.slots = max(min(blocks, room), network.config.views)
-        self._maps = {stride: self._empty(stride, channels) for stride, channels in maps.items()}
+        patch = torch.zeros(1, 3, 32, 32, device=device)
+        with torch.no_grad():
+            like = network.encode(patch)
+        texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
+        self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views)
+        features = {stride: self._empty(m) for stride, m in like.features.items()}
+        self._encoded = Encoded(features, self._empty(like.photographs), like.cubic)
         self._held: OrderedDict[tuple[int, int, int], int] = OrderedDict()
 
     def views(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> Views:
@@ -73,7 +76,7 @@ class FeatureShelf:
             if key not in self._held:
                 self._encode(key)
         which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.shape)
-        return Views(self.cameras[neighbours.reshape(-1).to(self.device)], which, self._maps)
+        return Views(self.cameras[neighbours.reshape(-1).to(self.device)], which, self._encoded)
 
     def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
         """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""
@@ -96,9 +99,8 @@ class FeatureShelf:
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size.long()).tolist()
         colours = even(self.scene, photograph, slice(top, bottom), slice(left, right)).permute(2, 0, 1)[None]
         encoded = self.network.encode(colours.to(self.device), corner[None].to(colours).to(self.device))
-        for stride, block in encoded.items():
-            maps = self._maps[stride]
-            first = slot * self._texels(stride)
+        for maps, block in zip(_maps(self._encoded), _maps(encoded), strict=True):
+            first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(block.rows)] = block.rows.to(maps.rows.dtype)
             maps.size[slot], maps.origin_px[slot] = block.size[0], block.origin_px[0]
         self._held[key] = slot
@@ -106,15 +108,19 @@ class FeatureShelf:
     def _texels(self, stride: int) -> int:
         return math.prod(-(-side // stride) for side in self._side)
 
-    def _empty(self, stride: int, channels: int) -> FeatureMaps:
-        texels = self._texels(stride)
+    def _empty(self, like: FeatureMaps) -> FeatureMaps:
+        texels, channels = self._texels(like.stride), like.rows.shape[1]
         return FeatureMaps(
             rows=torch.empty(self.slots * texels, channels, dtype=torch.float16, device=self.device),
             first=torch.arange(self.slots, device=self.device) * texels,
             size=torch.ones(self.slots, 2, dtype=torch.long, device=self.device),
             origin_px=torch.zeros(self.slots, 2, device=self.device),
-            stride=stride,
+            stride=like.stride,
         )
+
+
+def _maps(encoded: Encoded) -> list[FeatureMaps]:
+    return [*encoded.features.values(), encoded.photographs]
 
 
 def _block_counts(size_px: Int[Tensor, "*B 2"]) -> Int[Tensor, "*B 2"]:

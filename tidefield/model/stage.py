@@ -70,13 +70,13 @@ class Stage(nn.Module):
         super().__init__()
         self.hidden = hidden = config.hidden
         if network.views:
-            self.aggregate = Aggregate(config.feature_channels, hidden, network.fold)
+            self.aggregate = Aggregate(config.feature_channels, hidden, network.fold, network.as_printed)
             self.transformer = RayTransformer(hidden, network.heads)
         if field_channels:
             self.from_field = nn.Sequential(nn.Linear(field_channels, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
         self.density = nn.Linear(hidden, 1)
-        self.guided = network.guided
-        if network.guided:
+        self.as_printed = network.as_printed
+        if not network.as_printed:
             self.guide = nn.Linear(3, hidden)
             # At the start: density where the views agree and, in the first pass, within some samples of where the
             # surface is expected; the network corrects it.
@@ -114,7 +114,7 @@ class Stage(nn.Module):
         x = evidence.density.unflatten(1, shape[1:])
         valid = evidence.valid.unflatten(1, shape[1:])
         bias: Tensor | float = 0.0
-        if self.guided:
+        if not self.as_printed:
             x, bias = self._guide(x, samples, intervals)
             difference = torch.log(evidence.disagreement.unflatten(1, shape[1:]) + NOISE).masked_fill(~valid, 9.0)
             bias = bias - self.match * (difference - difference.amin(-1, keepdim=True))

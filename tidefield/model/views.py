@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.gather import FeatureMaps, gather
+from tidefield.model.gather import FeatureMaps, gather, joined
 
 
 @dataclass(frozen=True)
@@ -35,24 +35,49 @@ class Gathered:
 
 
 @dataclass(frozen=True)
+class Encoded:
+    """Photographs as the network reads them.
+
+    Attributes:
+        features: by stride; from stride 2 on the first three channels are the photographs' mean colours, at the common
+            exposure.
+        photographs: the colours themselves, at stride 1.
+        cubic: whether these are to be read by cubic instead of bilinear interpolation.
+    """
+
+    features: dict[int, FeatureMaps]
+    photographs: FeatureMaps
+    cubic: bool
+
+    @staticmethod
+    def joined(parts: list[Encoded]) -> Encoded:
+        """Groups of photographs of one size each as one set."""
+        features = {stride: joined([part.features[stride] for part in parts]) for stride in parts[0].features}
+        return Encoded(features, joined([part.photographs for part in parts]), parts[0].cubic)
+
+
+@dataclass(frozen=True)
 class Views:
     """N neighbouring photographs for each of T tiles, encoded: {(I_i, P_i, F_i)} of the paper.
 
     Attributes:
         cameras: of the T N views, tile by tile.
         which: the map of each view.
-        maps: by feature stride; the first three channels are the photograph itself at the common exposure.
+        encoded: all maps.
     """
 
     cameras: Cameras
     which: Int[Tensor, "T N"]
-    maps: dict[int, FeatureMaps]
+    encoded: Encoded
 
-    def read(self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"]) -> Gathered:
+    def read(
+        self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"], detail: bool
+    ) -> Gathered:
         """Project samples into every view and read the maps of one stride there.
 
         Args:
             directions: d, unit, from the target's camera to the samples.
+            detail: read the photographs themselves, not their means over the stride.
         """
         tiles, count = self.which.shape
         matrix = self.cameras.projection.unflatten(0, (tiles, count))
@@ -62,12 +87,15 @@ class Views:
         uv = homogeneous[..., :2] / torch.where(front, z, 1.0)
         size = self.cameras.size_px.reshape(tiles, count, 1, 2)
         inside = front[..., 0] & (uv >= 0).all(-1) & (uv <= size).all(-1)
-        values, on_map = gather(self.maps[stride], self.which, uv)
+        values, on_map = gather(self.encoded.features[stride], self.which, uv)
+        colours, features = values.split([3, values.shape[-1] - 3], dim=-1) if stride > 1 else (values, values)
+        if detail or stride == 1:
+            colours, on_map = gather(self.encoded.photographs, self.which, uv, self.encoded.cubic)
         offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
         theirs = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
         return Gathered(
-            colours=values[..., :3],
-            features=values[..., 3:],
+            colours=colours,
+            features=features,
             directions=theirs,
             cosine=(theirs * directions[:, None]).sum(-1),
             valid=inside & on_map,

@@ -20,8 +20,8 @@ from tidefield.data.batches import Batch, Surfaces, draw_batch
 from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
 from tidefield.model.network import Network, Tiles
-from tidefield.model.renderer import Renderer, joined, start_intervals
-from tidefield.model.views import Views
+from tidefield.model.renderer import Renderer, start_intervals
+from tidefield.model.views import Encoded, Views
 from tidefield.train.checkpoint import Progress, load_training, save_checkpoint
 from tidefield.train.display import Display
 from tidefield.train.losses import photometric, psnr
@@ -112,8 +112,7 @@ class Trainer:
             with mixed_precision(device):
                 for images, corner in zip(batch.images, batch.image_corner_px, strict=True):
                     parts.append(network.encode(images, corner))
-            maps = {stride: joined([part[stride] for part in parts]) for stride in parts[0]}
-            views = Views(self.cameras[batch.neighbours.reshape(-1)], batch.which, maps)
+            views = Views(self.cameras[batch.neighbours.reshape(-1)], batch.which, Encoded.joined(parts))
         tiles = Tiles(self.cameras[batch.targets], batch.corner_px, side)
         priors = torch.stack([self.surfaces[i] for i in batch.targets.tolist()]).to(device)
         opaque = self.scene.background_rgb is None
