@@ -17,8 +17,10 @@ from tidefield.model.rendering import Rendering
 from tidefield.model.shelf import FeatureShelf, NoRoom
 
 TILE_PX = 32
-RAYS_AT_ONCE = 8192
-"""Rays of the finest stage handled at once: enough to keep two cores or a GPU busy, few enough for the cache."""
+VALUES_AT_ONCE = 5_000_000
+"""Values gathered at once by a stage: enough to keep a few cores busy, few enough for their cache ..."""
+GPU_FACTOR = 16
+"""... and so many times as many keep a GPU busy."""
 BLOCK_TILES = 16
 """Tiles along the sides of the blocks that a view is made in, so that tiles that follow one another see the same."""
 
@@ -36,6 +38,10 @@ class Renderer:
     def __init__(self, network: Network, scene: Scene, config: Config, device: torch.device) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.shelf = FeatureShelf(network, scene, device) if network.config.views else None
+        stages, views = network.config.stages, max(1, network.config.views)
+        gathered = max((TILE_PX // s.stride) ** 2 * s.samples * views * s.feature_channels for s in stages)
+        room = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
+        self.tiles_at_once = max(1, room // gathered)
         means = [even(scene, i).mean((0, 1)) for i in scene.train]
         self.fallback = torch.stack(means).mean(0)
 
@@ -70,7 +76,7 @@ class Renderer:
         views, strategy = self.network.config.views, self.config.train.neighbours
         neighbours = choose_neighbours(camera, surface, self.scene, views, strategy) if views else None
         parts = []
-        for some in torch.arange(len(corners)).split(max(1, RAYS_AT_ONCE // TILE_PX**2)):
+        for some in torch.arange(len(corners)).split(self.tiles_at_once):
             chosen = None if neighbours is None else neighbours[some]
             parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
         stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 5)
