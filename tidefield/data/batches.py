@@ -16,7 +16,7 @@ from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
 from tidefield.data.prior import STRIDE, read_prior, surface_prior
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid, project
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,8 @@ def tile_doubly_seen(
 ) -> Bool[Tensor, " R"]:
     """Which pixels of a tile show surface that two or more other cameras see, as the prior's cells tell it."""
     cells = max(1, side_px // STRIDE)
-    line = (torch.arange(cells) + 0.5) * (side_px / cells)
-    v, u = torch.meshgrid(line, line, indexing="ij")
-    uv, z = others.project(_surface(camera, prior, corner_px + torch.stack([u, v], -1).reshape(-1, 2)))
+    middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
+    uv, z = others.project(_surface(camera, prior, middles))
     seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
     near = torch.arange(side_px) * cells // side_px
     return seen[near][:, near].reshape(-1)
@@ -135,8 +134,11 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
         surface = tile_surface(camera, prior, at[None], side)
         surfaces_world.append(surface[0, 0])
         neighbours.append(choose_neighbours(camera, surface, scene, views, config.neighbours, target)[0])
-        others = scene.cameras[train[train != target]]
-        weights.append(torch.where(tile_doubly_seen(camera, prior, at, side, others), 1.0, config.unseen_weight))
+        weight = torch.ones(side * side)
+        if config.unseen_weight != 1:
+            others = scene.cameras[train[train != target]]
+            weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
+        weights.append(weight)
     chosen = torch.stack(neighbours)
     tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
     colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
@@ -178,8 +180,7 @@ def _crops(
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
     points = middle_world.repeat_interleave(neighbours.shape[1], 0)
-    homogeneous = (cameras.projection @ torch.cat([points, torch.ones(len(points), 1)], 1)[..., None])[..., 0]
-    uv = homogeneous[:, :2] / homogeneous[:, 2:].clamp(min=1e-6)
+    uv = project(cameras, points[:, None])[0][:, 0]
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tidefield.config import NetworkConfig
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.aggregate import Evidence
 from tidefield.model.colour import ColourBlend
 from tidefield.model.compositing import composite
@@ -43,10 +43,8 @@ class Tiles:
     def rays_px(self, stride: int, margin: int) -> Float[Tensor, "T R 2"]:
         """Pixels of a tile's rays: centres of stride x stride squares, with `margin` more around the tile."""
         assert self.side_px % stride == 0, f"tiles of {self.side_px} px cannot be covered by rays every {stride} px"
-        count = self.side_px // stride
-        line = (torch.arange(-margin, count + margin, device=self.corner_px.device) + 0.5) * stride
-        v, u = torch.meshgrid(line, line, indexing="ij")
-        return self.corner_px[:, None] + torch.stack([u, v], dim=-1).reshape(1, -1, 2)
+        count = self.side_px // stride + 2 * margin
+        return self.corner_px[:, None] + (pixel_grid(count, count, self.corner_px.device) - margin) * stride
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tidefield.data.batches import even
 from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import project
 from tidefield.model.gather import FeatureMaps
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, Views
@@ -43,9 +44,9 @@ class FeatureShelf:
     def __init__(self, network: Network, scene: Scene, device: torch.device, budget_bytes: int = BUDGET_BYTES) -> None:
         self.network, self.scene, self.device = network, scene, device
         self.cameras = scene.cameras.to(device)
-        size = scene.cameras.size_px[list(scene.train)].clamp(max=BLOCK_PX)
-        self._side = tuple(int(x) for x in size.amax(0))
-        blocks = int(_block_counts(scene.cameras.size_px[list(scene.train)]).prod(-1).sum())
+        size = scene.cameras.size_px[list(scene.train)]
+        self._side = tuple(int(x) for x in size.clamp(max=BLOCK_PX).amax(0))
+        blocks = int(_block_counts(size).prod(-1).sum())
         patch = torch.zeros(1, 3, 32, 32, device=device)
         with torch.no_grad():
             like = network.encode(patch)
@@ -83,8 +84,7 @@ class FeatureShelf:
         photographs = neighbours.reshape(-1)
         cameras = self.scene.cameras[photographs]
         points = middle_world.repeat_interleave(neighbours.shape[1], 0)
-        homogeneous = (cameras.projection @ torch.cat([points, torch.ones(len(points), 1)], 1)[..., None])[..., 0]
-        uv = homogeneous[:, :2] / homogeneous[:, 2:].clamp(min=1e-6)
+        uv = project(cameras, points[:, None])[0][:, 0]
         last = _block_counts(cameras.size_px) - 1
         free = (cameras.size_px - BLOCK_PX).clamp(min=1)
         index = torch.minimum(((uv - BLOCK_PX / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
