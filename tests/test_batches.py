@@ -192,3 +192,36 @@ def test_pixels_that_fewer_than_two_others_see_weigh_as_little_as_is_said():
             assert agree.float().mean() >= 0.75
             weights |= set(drawn.weight[t].tolist())
     assert weights == {0.25, 1.0}
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE])
+def test_sparse_points_give_their_pixels_the_depth_of_the_wall(config: TrainConfig):
+    own, found = scene(), 0
+    points = own.points
+    assert points is not None
+    for drawn in seeds(own, config, 4):
+        for t, target in enumerate(drawn.targets.tolist()):
+            uv = points.uv_px[points.camera_index == target] - drawn.corner_px[t]
+            inside = uv[((uv >= 0) & (uv < 8)).all(-1)].long()
+            known = torch.zeros(64, dtype=torch.bool)
+            known[inside[:, 1] * 8 + inside[:, 0]] = True
+            assert torch.equal(drawn.depth_weight[t] > 0, known)
+            torch.testing.assert_close(drawn.inverse_depth[t], known / wall.DEPTH)
+            found += int(known.sum())
+    assert found > 20
+
+
+def test_a_point_of_large_reprojection_error_is_trusted_less():
+    own = scene()
+    assert own.points is not None
+    error = torch.ones(len(own.points.xyz_world))
+    error[::2] = 3
+    own = replace(own, points=replace(own.points, error_px=error))
+    expected = torch.where(torch.arange(len(error)) % 2 == 0, 1 / 10, 1 / 2)
+    torch.testing.assert_close(Surfaces(own).observed(0).weight, expected)
+
+
+def test_without_sparse_points_no_depth_is_held():
+    drawn = batch(replace(scene(), points=None), CROPS)
+    assert drawn.depth_weight.abs().max() == 0
+    assert drawn.inverse_depth.abs().max() == 0

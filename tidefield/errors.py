@@ -12,6 +12,10 @@ class SceneError(TidefieldError):
     """A scene on disk is missing, incomplete or inconsistent."""
 
 
+class SurveyError(TidefieldError):
+    """Photographs, their positions or ground control cannot be made a scene of."""
+
+
 class RunError(TidefieldError):
     """A run folder or a checkpoint cannot be used as asked."""
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tidefield.config import TrainConfig
 from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
-from tidefield.data.prior import STRIDE, read_prior, surface_prior
+from tidefield.data.prior import STRIDE, Observed, observed_depths, read_prior, surface_prior
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, pixel_grid, project
@@ -29,6 +29,8 @@ class Batch:
         colours: the truth.
         weight: of each pixel in the loss: 0 outside its photograph, which may be smaller than a tile, and
             `TrainConfig.unseen_weight` where fewer than two other training photographs see the surface.
+        inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
+        depth_weight: how far to trust these, 0 to 1; 0 where there is none.
         neighbours: photographs serving as the tiles' neighbouring views.
         which: for each neighbour, the image of `images` to read.
         images: what to encode, in groups of one size: crops of, or whole, photographs.
@@ -39,6 +41,8 @@ class Batch:
     corner_px: Float[Tensor, "T 2"]
     colours: Float[Tensor, "T R 3"]
     weight: Float[Tensor, "T R"]
+    inverse_depth: Float[Tensor, "T R"]
+    depth_weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
@@ -52,17 +56,24 @@ class Batch:
 
 
 class Surfaces:
-    """The prior of every camera of a scene (`surface_prior`), made when first asked for."""
+    """What a scene's sparse points say of every camera's surface, made when first asked for."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._priors: dict[int, Tensor] = {}
+        self._observed: dict[int, Observed] = {}
 
     def __getitem__(self, index: int) -> Float[Tensor, "3 h w"]:
         if index not in self._priors:
             cameras = self.scene.cameras
             self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras)
         return self._priors[index]
+
+    def observed(self, index: int) -> Observed:
+        """The sparse points that one photograph observed."""
+        if index not in self._observed:
+            self._observed[index] = observed_depths(self.scene.cameras[index], self.scene.points, index)
+        return self._observed[index]
 
 
 def even(scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)) -> Float[Tensor, "h w 3"]:
@@ -118,6 +129,16 @@ def choose_neighbours(
     return train[nearest(rank, out, count)]
 
 
+def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
+    """Inverse depths of a tile's pixels that show a sparse point, and how far to trust them; both 0 elsewhere."""
+    u, v = (observed.uv_px - corner_px).floor().long().unbind(-1)
+    inside = (u >= 0) & (u < side) & (v >= 0) & (v < side)
+    pixel, weight = (v * side + u)[inside], observed.weight[inside]
+    total = torch.zeros(side * side).index_add(0, pixel, weight)
+    inverse = torch.zeros(side * side).index_add(0, pixel, weight * observed.inverse_depth[inside])
+    return inverse / total.clamp(min=1e-12), total.clamp(max=1)
+
+
 def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int, generator: torch.Generator) -> Batch:
     """Random tiles of random training photographs."""
     side = config.tile_px
@@ -128,7 +149,7 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     size = scene.cameras.size_px[targets]
     room = (size - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
-    surfaces_world, neighbours, weights = [], [], []
+    surfaces_world, neighbours, weights, depths = [], [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], surfaces[target]
         surface = tile_surface(camera, prior, at[None], side)
@@ -139,17 +160,19 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
             others = scene.cameras[train[train != target]]
             weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
         weights.append(weight)
+        depths.append(_sparse_depth(surfaces.observed(target), at, side))
     chosen = torch.stack(neighbours)
     tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
     colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
     weight = torch.stack(weights) * inside
+    inverse_depth, depth_weight = (torch.stack(parts) for parts in zip(*depths, strict=True))
     if not views:
         which, images, corners = chosen, (), ()
     elif config.crop_px is None:
         which, images, corners = _whole(scene, chosen)
     else:
         which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
-    return Batch(targets, corner, colours, weight, chosen, which, images, corners)
+    return Batch(targets, corner, colours, weight, inverse_depth, depth_weight, chosen, which, images, corners)
 
 
 def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,8 @@
-"""Where along a camera's rays to look first: what the sparse points tell (method.md, section 13)."""
+"""What the sparse points tell of a camera's rays: where to look first, and depths to hold (method.md, section 13)."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,6 +24,35 @@ LONELY_MARGIN = 0.5
 """... and where the nearest of them is a tenth of the image's width away."""
 PARALLAX_MARGIN = 0.01
 """Share of the depth by which it goes beyond the expected surface in any case."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The K sparse points that one photograph observed.
+
+    Attributes:
+        uv_px: where.
+        inverse_depth: of their z-depth.
+        weight: how far to trust them, in (0, 1]: 1/2 where the reprojection error is the usual one of the scene.
+    """
+
+    uv_px: Float[Tensor, "K 2"]
+    inverse_depth: Float[Tensor, " K"]
+    weight: Float[Tensor, " K"]
+
+
+def observed_depths(camera: Cameras, points: SparsePoints | None, index: int) -> Observed:
+    """The sparse points that photograph `index`, whose camera this is, observed in front of it."""
+    if points is None:
+        return Observed(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0))
+    mine = points.camera_index == index
+    which = points.point_index[mine].long()
+    z = camera.project(points.xyz_world[which])[1][0]
+    # Cauchy's weight: a point of thrice the usual error counts a fifth of one of the usual error.
+    usual = points.error_px.median().clamp(min=1e-6)
+    weight = 1 / (1 + (points.error_px[which] / usual) ** 2)
+    front = z > 0
+    return Observed(points.uv_px[mine][front], 1 / z[front], weight[front])
 
 
 def surface_prior(camera: Cameras, points: SparsePoints | None, cameras: Cameras) -> Float[Tensor, "3 h w"]:

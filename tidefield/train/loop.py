@@ -24,7 +24,7 @@ from tidefield.model.renderer import Renderer, start_intervals
 from tidefield.model.views import Encoded, Views
 from tidefield.train.checkpoint import Progress, load_training, save_checkpoint
 from tidefield.train.display import Display
-from tidefield.train.losses import photometric, psnr
+from tidefield.train.losses import photometric, psnr, sparse_depth
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,10 @@ class Trainer:
         priors = torch.stack([self.surfaces[i] for i in batch.targets.tolist()]).to(device)
         opaque = self.scene.background_rgb is None
         rendering = network(tiles, views, start_intervals(network, tiles, priors), opaque, self.generator)
-        return photometric(rendering, batch, network, side)
+        loss, error = photometric(rendering, batch, network, side)
+        if self.config.train.depth_weight:
+            loss = loss + self.config.train.depth_weight * sparse_depth(rendering, batch, network, side)
+        return loss, error
 
     def _rate(self, share: float) -> float:
         warm = min(1.0, (self.progress.step + 1) / self.config.train.warm_up)

@@ -12,6 +12,8 @@ from tidefield.model.network import Network, TileRendering
 
 GLIMPSE_WEIGHT = 0.5
 """Of the coarse stages' own colours, without which nothing would teach them where the surface is."""
+DEPTH_SCALE = 0.01
+"""Share of its depth by which a surface may miss a sparse point before the penalty grows no faster (Huber)."""
 
 
 def photometric(
@@ -34,6 +36,29 @@ def photometric(
         mean = F.avg_pool2d(weighted_truth, stride).permute(0, 2, 3, 1) / total.clamp(min=1e-6)
         loss = loss + GLIMPSE_WEIGHT * _mean_square(seen - mean, total)
     return loss, error
+
+
+def sparse_depth(rendering: TileRendering, batch: Batch, network: Network, side_px: int) -> Float[Tensor, ""]:
+    """How far every stage's expected inverse depths are from the sparse points' (method.md, section 13).
+
+    Huber's penalty of their relative difference in units of `DEPTH_SCALE`, weighted by what the points' reprojection
+    errors say; a coarse stage's rays are held to the points within the pixels that they stand for.
+    """
+    weight = batch.depth_weight[..., None]
+    weighted, share = (_picture(x, side_px) for x in (batch.inverse_depth[..., None] * weight, weight))
+    loss = weight.new_zeros(())
+    for k, expected in enumerate(rendering.expected):
+        stride, margin = network.config.stages[k].stride, network.margin(k)
+        rows = side_px // stride + 2 * margin
+        found = expected.unflatten(1, (rows, rows))[:, margin : rows - margin, margin : rows - margin]
+        total = F.avg_pool2d(share, stride)[:, 0]
+        known = total > 0
+        mean = (F.avg_pool2d(weighted, stride)[:, 0] / total.clamp(min=1e-12))[known]
+        miss = (found[known] / mean - 1) / DEPTH_SCALE
+        loss = loss + (
+            F.huber_loss(miss, torch.zeros_like(miss), reduction="none") * total[known]
+        ).sum() / total.sum().clamp(min=1e-12)
+    return loss / len(rendering.expected)
 
 
 def _picture(values: Float[Tensor, "T R C"], side_px: int) -> Float[Tensor, "T C S S"]:

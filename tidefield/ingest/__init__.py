@@ -1,0 +1,1 @@
+"""From photographs as the camera wrote them to a Scene on disk."""
