@@ -15,7 +15,7 @@ only: their gains come from their metadata and their neighbours, never from thei
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -44,6 +44,9 @@ HUBER = 1.345
 ITERATIONS = 15
 SMALLEST_NOISE = 0.01
 """Of a log window mean: rounding to 8 bits and resampling are never better, and weights need a positive scale."""
+LOOSE = 1e-6
+"""Weight of a photograph's prior gain. It holds the overall level, which nothing else does, and photographs that
+nothing connects."""
 SUPPORT = 10
 """Observations that a training photograph needs before it takes part in judging the neighbours' likeness."""
 
@@ -70,7 +73,7 @@ def estimate_gains(
     """
     count, learned = len(cameras), np.asarray(train, dtype=np.int64)
     exposure, clock = _exposure_and_clock(metadata, count)
-    seen = _observe(photographs, points, train) if points is not None else None
+    seen = observe(photographs, points, train) if points is not None else None
     if seen is not None and len(seen.value):
         gains = _solve(seen, exposure, clock, cameras.position_world.double().cpu().numpy(), learned)
     else:
@@ -87,7 +90,7 @@ def disagreement(
         Root-mean-square of the log residuals (0.05 is 5% of a pixel's value), and 1.4826 times the median of their
         magnitudes, which outliers such as moving water do not move. NaN where no two photographs share a point.
     """
-    seen = _observe(photographs, points, which)
+    seen = observe(photographs, points, which)
     if not len(seen.value):
         return float("nan"), float("nan")
     residual = seen.centred(seen.value - np.log(gains.double().cpu().numpy())[seen.photograph])
@@ -98,18 +101,20 @@ def disagreement(
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """O usable observations of points that at least two photographs share.
 
     Attributes:
         value: log mean colour around the point, O x 3.
         point: the point, O.
         photograph: the photograph, O.
+        row: which of the sparse points' observations each is, O.
     """
 
     value: Array
     point: Index
     photograph: Index
+    row: Index
 
     def centred(self, value: Array, weight: Array | None = None) -> Array:
         """Values (O x 3) less the weighted mean of all values of the same point."""
@@ -123,15 +128,18 @@ class _Seen:
 class _Pairs:
     """Photographs whose gains are expected to be alike, and how far apart they are in time or space (1 = usual)."""
 
-    a: Index
-    b: Index
-    apart: Array
+    a: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    b: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    apart: Array = field(default_factory=lambda: np.zeros(0))
 
     def difference(self, value: Array) -> Array:
         return value[self.b] - value[self.a]
 
 
-def _observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> _Seen:
+_NOBODY = _Pairs()
+
+
+def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> Seen:
     """Mean log colours of a small window around every sparse point seen in the given photographs."""
     camera, uv = points.camera_index.cpu().numpy(), points.uv_px.double().cpu().numpy()
     values, rows = [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
@@ -144,7 +152,7 @@ def _observe(photographs: Photographs, points: SparsePoints, which: Sequence[int
     row = np.concatenate(rows)
     point = points.point_index.cpu().numpy()[row].astype(np.int64)
     shared = np.bincount(point, minlength=1)[point] > 1
-    return _Seen(np.concatenate(values)[shared], point[shared], camera[row][shared].astype(np.int64))
+    return Seen(np.concatenate(values)[shared], point[shared], camera[row][shared].astype(np.int64), row[shared])
 
 
 def _window_means(pixels: NDArray[np.uint8], uv_px: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -161,11 +169,10 @@ def _window_means(pixels: NDArray[np.uint8], uv_px: Array) -> tuple[Array, NDArr
     return value, inside & ((value > DARK) & (value < BRIGHT)).all(1) & (clipped[row, column] <= 0.1)
 
 
-def _solve(seen: _Seen, exposure: Array, clock: Array, position: Array, train: Index) -> Array:
+def _solve(seen: Seen, exposure: Array, clock: Array, position: Array, train: Index) -> Array:
     """Log gains from the observations alone, then again with the neighbours as far as these were alike."""
     count = len(exposure)
-    nobody = _Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
-    first, noise = _robust_gains(seen, nobody, np.zeros(0), np.zeros(count))
+    first, noise = robust_gains(seen, np.zeros(count))
     supported = train[np.bincount(seen.photograph, minlength=count)[train] >= SUPPORT]
     sequence = _in_sequence(clock, supported)
     slope = _exposure_slope(sequence.difference(first), sequence.difference(exposure), sequence.apart)
@@ -181,36 +188,49 @@ def _solve(seen: _Seen, exposure: Array, clock: Array, position: Array, train: I
         pairs.append(everyone)
         weights.append(noise**2 / (variance * everyone.apart))
     both = _Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "apart")))
-    gains, _ = _robust_gains(seen, both, np.concatenate(weights), prior)
+    gains, _ = robust_gains(seen, prior, both, np.concatenate(weights))
     return gains
 
 
-def _robust_gains(seen: _Seen, pairs: _Pairs, pair_weight: Array, prior: Array) -> tuple[Array, float]:
+def robust_gains(
+    seen: Seen, prior: Array, pairs: _Pairs = _NOBODY, pair_weight: Array | None = None
+) -> tuple[Array, float]:
     """Log gains (V x 3) by iteratively reweighted least squares, and the residuals' standard deviation.
 
     Minimises sum_o w_o |y_o - g - a|^2 + sum_pairs w |(g_b - g_a) - (prior_b - prior_a)|^2 + tiny |g - prior|^2
     with Huber's weights w_o over observations. The points' colours a are eliminated in closed form.
     """
     count, rows = len(prior), np.arange(len(pairs.a))
+    pair_weight = np.zeros(0) if pair_weight is None else pair_weight
     minus_plus = np.concatenate([-np.ones(len(rows)), np.ones(len(rows))])
     where = (np.concatenate([rows, rows]), np.concatenate([pairs.a, pairs.b]))
     incidence = sparse.csr_array((minus_plus, where), shape=(len(rows), count))
-    # The tiny term holds the overall level, which nothing else does, and photographs that nothing connects.
-    fixed = incidence.T @ sparse.diags_array(pair_weight) @ incidence + sparse.diags_array(np.full(count, 1e-6))
+    fixed = incidence.T @ sparse.diags_array(pair_weight) @ incidence + sparse.diags_array(np.full(count, LOOSE))
     weight, gains, noise = np.ones(len(seen.value)), np.zeros((count, 3)), 0.0
     for _ in range(ITERATIONS):
-        of_point, of_photograph = np.bincount(seen.point, weight), np.bincount(seen.photograph, weight, count)
-        table = sparse.csr_array((weight, (seen.point, seen.photograph)), shape=(len(of_point), count))
-        shared = table.T @ sparse.diags_array(1 / np.maximum(of_point, 1e-12)) @ table
-        right = weight[:, None] * seen.centred(seen.value, weight)
-        right = np.stack([np.bincount(seen.photograph, c, count) for c in right.T], 1)
-        system = sparse.csc_array(sparse.diags_array(of_photograph) - shared + fixed)
-        gains = np.asarray(spsolve(system, right + (fixed @ prior)[:, None])).reshape(count, 3)
-        # One weight for the three channels: what moved or shone did so in all of them.
-        residual = np.sqrt((seen.centred(seen.value - gains[seen.photograph], weight) ** 2).mean(1))
-        noise = max(float(1.4826 * np.median(residual)), SMALLEST_NOISE)
-        weight = np.minimum(1.0, HUBER * noise / np.maximum(residual, 1e-12))
+        gains = weighted_gains(seen, seen.value, weight, fixed, fixed @ prior)
+        weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
     return gains, noise
+
+
+def weighted_gains(seen: Seen, value: Array, weight: Array, fixed: sparse.sparray, pull: Array) -> Array:
+    """Least-squares gains (V x C) of values (O x C), beside the quadratic form `fixed` with right side `pull` (V)."""
+    count = len(pull)
+    of_point, of_photograph = np.bincount(seen.point, weight), np.bincount(seen.photograph, weight, count)
+    table = sparse.csr_array((weight, (seen.point, seen.photograph)), shape=(len(of_point), count))
+    shared = table.T @ sparse.diags_array(1 / np.maximum(of_point, 1e-12)) @ table
+    right = weight[:, None] * seen.centred(value, weight)
+    right = np.stack([np.bincount(seen.photograph, c, count) for c in right.T], 1)
+    system = sparse.csc_array(sparse.diags_array(of_photograph) - shared + fixed)
+    return np.asarray(spsolve(system, right + pull[:, None])).reshape(right.shape)
+
+
+def huber_weights(residual: Array) -> tuple[Array, float]:
+    """Weights of observations by their residuals (O x 3), and these residuals' standard deviation."""
+    # One weight for the three channels: what moved or shone did so in all of them.
+    size = np.sqrt((residual**2).mean(1))
+    noise = max(float(1.4826 * np.median(size)), SMALLEST_NOISE)
+    return np.minimum(1.0, HUBER * noise / np.maximum(size, 1e-12)), noise
 
 
 def _exposure_slope(gain_change: Array, exposure_change: Array, apart: Array) -> float:
@@ -248,7 +268,7 @@ def _in_sequence(clock: Array, which: Index) -> _Pairs:
 def _nearby(position: Array, which: Index) -> _Pairs:
     """Each of the given photographs with the two taken closest to it."""
     if len(which) < 3:
-        return _Pairs(which[:0], which[:0], np.zeros(0))
+        return _NOBODY
     usual = np.median(KDTree(position).query(position, k=2)[0][:, 1])
     found = KDTree(position[which]).query(position[which], k=3)
     distance, neighbour = (np.asarray(column)[:, 1:].ravel() for column in found)

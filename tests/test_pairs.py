@@ -1,0 +1,99 @@
+"""Which pairs are worth matching."""
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from tidefield.ingest.pairs import BEST, FEW, GLANCE, IN_SEQUENCE, MOST, NEARBY, candidates, glances, promising
+from tidefield.ingest.survey import Photograph, Position
+
+
+def photograph(k: int, latitude: float | None, longitude: float = 0.0, time_s: float | None = None) -> Photograph:
+    nan = float("nan")
+    place = None if latitude is None else Position(latitude, longitude, nan, nan, nan, "unknown", "EXIF")
+    return Photograph(
+        path=Path(f"{k:04d}.jpg"),
+        name=f"{k:04d}.jpg",
+        width=400,
+        height=300,
+        orientation=1,
+        camera="",
+        serial="",
+        focal_mm=nan,
+        lens=None,
+        time_s=float(k) if time_s is None else time_s,
+        log_exposure=nan,
+        position=place,
+        relative_altitude_m=nan,
+        gimbal_deg=None,
+    )
+
+
+def lawnmower(rows: int, columns: int) -> list[Photograph]:
+    """Photographs 20 m apart along lines 30 m apart, flown back and forth."""
+    made = []
+    for row in range(rows):
+        for column in range(columns) if row % 2 == 0 else reversed(range(columns)):
+            made.append(photograph(len(made), 54 + 30 * row / 111_000, 20 * column / 65_000))
+    return made
+
+
+def test_few_photographs_are_all_paired():
+    assert candidates([photograph(k, None) for k in range(FEW)]) == list(combinations(range(FEW), 2))
+
+
+def test_with_positions_pairs_grow_with_the_photographs_not_with_their_square():
+    small, large = lawnmower(8, 10), lawnmower(20, 100)
+    assert len(candidates(large)) < 1.3 * len(candidates(small)) * len(large) / len(small)
+    assert len(candidates(large)) <= len(large) * (NEARBY + IN_SEQUENCE)
+
+
+def test_nearest_photographs_are_paired_and_far_ones_are_not():
+    flight = lawnmower(20, 20)
+    pairs = set(candidates(flight))
+    position = np.array(
+        [[p.position.latitude_deg * 111_000, p.position.longitude_deg * 65_000] for p in flight if p.position]
+    )
+    for i, j in combinations(range(len(flight)), 2):
+        apart = np.linalg.norm(position[i] - position[j])
+        if apart < 45:
+            assert (i, j) in pairs
+        if apart > 200 and j - i > IN_SEQUENCE:
+            assert (i, j) not in pairs
+
+
+def test_a_photograph_without_position_is_paired_with_all():
+    flight = lawnmower(10, 10)
+    flight[37] = replace(flight[37], position=None)
+    pairs = set(candidates(flight))
+    assert all((min(37, k), max(37, k)) in pairs for k in range(100) if k != 37)
+
+
+def test_photographs_taken_one_after_the_other_are_paired_wherever_they_claim_to_be():
+    flight = lawnmower(10, 10)
+    assert flight[50].position is not None
+    flight[50] = replace(flight[50], position=replace(flight[50].position, latitude_deg=-10.0))
+    pairs = set(candidates(flight))
+    assert {(49, 50), (50, 51), (48, 50), (50, 52)} <= pairs
+
+
+def test_pairs_whose_largest_features_match_are_promising_and_every_photograph_keeps_its_best():
+    rng, count = np.random.default_rng(0), 40
+    # Photograph k shares half of its features with k + 1.
+    ground = rng.integers(0, 255, (count + 1, GLANCE // 2, 128))
+    table = glances([np.concatenate([ground[k], ground[k + 1]]) for k in range(count)])
+    kept = promising(list(combinations(range(count), 2)), table, lambda done, whole: None)
+    assert {(k, k + 1) for k in range(count - 1)} <= set(kept)
+    assert len(kept) <= count * MOST / 2
+    partners = [sum(k in pair for pair in kept) for k in range(count)]
+    assert min(partners) >= BEST
+
+
+def test_photographs_with_few_features_are_filled_with_what_matches_nothing():
+    table = glances([np.full((3, 128), 9), np.zeros((0, 128))])
+    assert table.shape == (2, GLANCE, 128)
+    assert table[0, :3].norm(dim=1).allclose(table.new_ones(3))
+    assert (table[0, 3:] == 0).all()
+    assert promising([(0, 1)], table, lambda done, whole: None) == [(0, 1)]

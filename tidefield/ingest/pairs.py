@@ -1,0 +1,108 @@
+"""Which photographs may show the same ground: pairs worth matching."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from tidefield.ingest.matching import matched
+from tidefield.ingest.survey import Photograph
+
+Pair = tuple[int, int]
+
+NEARBY = 24
+"""Photographs around each that may overlap it, where positions are known."""
+IN_SEQUENCE = 2
+"""Photographs taken just before and after are paired in any case."""
+FEW = 40
+"""So few photographs are all paired with each other; it takes a minute and misses nothing."""
+GLANCE = 300
+"""Features (the largest) by which a pair is judged before it is matched in full (preemptive matching: Wu, Towards
+Linear-Time Incremental Structure from Motion, 2013)."""
+PROMISING = 4
+"""Matches among these that make a pair promising."""
+BEST = 6
+"""Pairs of each photograph that are matched however few these matches are."""
+MOST = 30
+"""Pairs of each photograph that are matched at most."""
+
+
+def candidates(photographs: Sequence[Photograph]) -> list[Pair]:
+    """Pairs of indices (i < j) of photographs that may overlap, by their positions and times.
+
+    A photograph without a position is paired with all others.
+    """
+    count = len(photographs)
+    if count <= FEW:
+        return list(combinations(range(count), 2))
+    placed = [k for k, p in enumerate(photographs) if p.position is not None]
+    pairs: set[Pair] = set()
+    if len(placed) > NEARBY:
+        xy = _metres([photographs[k] for k in placed])
+        _, near = KDTree(xy).query(xy, k=NEARBY + 1)
+        pairs |= {_pair(placed[i], placed[j]) for i, row in enumerate(near) for j in row if i != j}
+    else:
+        placed = []
+    lost = sorted(set(range(count)) - set(placed))
+    pairs |= {_pair(k, other) for k in lost for other in range(count) if other != k}
+    order = sorted(range(count), key=lambda k: (photographs[k].time_s, photographs[k].name))
+    for ahead in range(1, IN_SEQUENCE + 1):
+        pairs |= {_pair(a, b) for a, b in zip(order, order[ahead:], strict=False)}
+    return sorted(pairs)
+
+
+def promising(
+    pairs: Sequence[Pair], glances: Float[Tensor, "V K D"], progress: Callable[[int, int], object]
+) -> list[Pair]:
+    """Those of the pairs whose largest features match, and every photograph's best.
+
+    Args:
+        glances: descriptors of unit length of each photograph's largest features; zeros where it has fewer.
+    """
+    partners: dict[int, list[int]] = {}
+    for i, j in pairs:
+        partners.setdefault(i, []).append(j)
+    score: dict[Pair, int] = {}
+    for done, (i, others) in enumerate(sorted(partners.items()), start=1):
+        for start in range(0, len(others), 64):
+            part = others[start : start + 64]
+            found = (matched(glances[i].expand(len(part), -1, -1), glances[part]) >= 0).sum(-1)
+            score |= {(i, j): int(n) for j, n in zip(part, found, strict=True)}
+        progress(done, len(partners))
+    ranked: dict[int, list[Pair]] = {}
+    for pair in sorted(score, key=lambda p: (-score[p], p)):
+        for k in pair:
+            ranked.setdefault(k, []).append(pair)
+    kept: set[Pair] = set()
+    for own in ranked.values():
+        kept |= set(own[:BEST]) | {pair for pair in own[:MOST] if score[pair] >= PROMISING}
+    return sorted(kept)
+
+
+def _metres(photographs: Sequence[Photograph]) -> np.ndarray:
+    """Positions on a plane, in metres: good enough to tell who is near."""
+    degrees = np.array([[p.position.longitude_deg, p.position.latitude_deg] for p in photographs if p.position])
+    east = np.cos(np.radians(np.median(degrees[:, 1])))
+    return degrees * [111_320 * east, 110_574]
+
+
+def _pair(i: int, j: int) -> Pair:
+    return (int(i), int(j)) if i < j else (int(j), int(i))
+
+
+def glances(descriptors: Sequence[np.ndarray]) -> Float[Tensor, "V K D"]:
+    """The largest features' descriptors (given largest first) of every photograph, of unit length.
+
+    What a photograph lacks are zeros, which match nothing.
+    """
+    table = torch.zeros(len(descriptors), GLANCE, 128)
+    for row, own in zip(table, descriptors, strict=True):
+        part = torch.as_tensor(own[:GLANCE], dtype=torch.float32)
+        row[: len(part)] = torch.nn.functional.normalize(part, dim=1)
+    return table
