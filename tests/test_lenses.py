@@ -61,10 +61,20 @@ def test_the_sixth_order_term_is_opencvs() -> None:
     np.testing.assert_allclose(own.project(xyz), theirs[:, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"])
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"])
 def test_other_camera_models_are_refused_with_a_way_out(model: str) -> None:
     with pytest.raises(SceneError, match=rf"{model}.*RADIAL.*image_undistorter"):
         lens_from_colmap(model, 320, 240, [1.0] * 8)
+
+
+def test_colmaps_full_model_is_read_up_to_its_sixth_order() -> None:
+    parameters = [200.0, 201.0, 160.0, 120.0, 0.1, -0.05, 0.002, 0.001, 0.03, 0.0, 0.0, 0.0]
+    own = lens_from_colmap("FULL_OPENCV", 320, 240, parameters)
+    camera = pycolmap.Camera(model="FULL_OPENCV", width=320, height=240, params=parameters)
+    xyz = np.random.default_rng(3).uniform((-0.7, -0.7, 1), (0.7, 0.7, 1), (50, 3))
+    np.testing.assert_allclose(own.project(xyz), camera.img_from_cam(xyz), atol=1e-9)
+    with pytest.raises(SceneError, match=r"k4, k5 or k6 .*image_undistorter"):
+        lens_from_colmap("FULL_OPENCV", 320, 240, [*parameters[:10], 0.01, 0.0])
 
 
 def test_unusable_calibrations_are_refused() -> None:

@@ -220,7 +220,10 @@ def test_point_clouds_are_read_whole_or_refused(tmp_path: Path, write: object) -
     assert callable(write)
     xyz = np.random.default_rng(0).normal(0, 5, (20, 3)).astype(np.float32).astype(np.float64)
     (tmp_path / "a.ply").write_bytes(write(xyz))
-    np.testing.assert_allclose(read_ply(tmp_path / "a.ply"), xyz, rtol=1e-7)
+    cloud = read_ply(tmp_path / "a.ply")
+    assert cloud is not None
+    np.testing.assert_allclose(cloud[0], xyz, rtol=1e-7)
+    assert cloud[1] is None  # red alone is no colour
     (tmp_path / "a.ply").write_bytes(write(xyz)[:-30])
     with pytest.raises(SceneError, match="no whole PLY"):
         read_ply(tmp_path / "a.ply")

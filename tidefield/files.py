@@ -5,20 +5,27 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NoReturn
 
 from tidefield.errors import RunError
 
 _USERS_TO_MEND = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
 
 
-def refuse_existing(*paths: Path) -> None:
-    """Raises: RunError when there is something under one of the names already."""
+def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
+    """Raises: RunError when there is something under one of the names already.
+
+    Args:
+        replaceable: whether the command that asks has an --overwrite.
+    """
     for path in paths:
         if os.path.lexists(path):
-            raise RunError(f"{path} is there already: expected a new name; choose one, or pass --overwrite")
+            or_replace = ", or pass --overwrite" if replaceable else ""
+            raise RunError(f"{path} is there already: expected a new name; choose one{or_replace}")
 
 
 @contextmanager
@@ -40,13 +47,38 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
-        if error.errno not in _USERS_TO_MEND:
-            raise
-        reason = error.strerror or os.strerror(error.errno)
-        raise RunError(
-            f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
-            "another place"
-        ) from error
+        _tell(path, error)
     finally:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has its final name
             partial.unlink()
+
+
+@contextmanager
+def completed_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path` to fill; it takes the final name when the block ends, and goes when it fails.
+
+    Raises:
+        RunError: `path` is there already, or the folder that it would be in cannot be written to.
+    """
+    refuse_existing(path, replaceable=False)
+    partial = path.with_name(f".{path.name}-{secrets.token_hex(4)}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        refuse_existing(path, replaceable=False)  # a folder that was made meanwhile would be replaced if it is empty
+        partial.rename(path)
+    except OSError as error:
+        _tell(path, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _tell(path: Path, error: OSError) -> NoReturn:
+    """Raises: RunError for what a user can mend, `error` itself for the rest."""
+    if error.errno not in _USERS_TO_MEND:
+        raise error
+    reason = error.strerror or os.strerror(error.errno)
+    raise RunError(
+        f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
+        "another place"
+    ) from error

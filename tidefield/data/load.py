@@ -18,6 +18,7 @@ from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, 
 from tidefield.data.readers.blender import read_blender
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.llff import read_llff
+from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
@@ -30,6 +31,7 @@ _LAYOUTS = """expected one of
   transforms.json and the photographs that it names                      nerfstudio, instant-ngp
   transforms_train.json, transforms_test.json and their pictures         a Blender scene
   images/ and poses_bounds.npy                                           LLFF
+  reconstruction.json or opensfm/reconstruction.json, and images/        OpenSfM, ODM
 ; make poses for the photographs first (COLMAP does it), or name the folder that holds these"""
 _FEWEST = 3
 _SMALLEST_WIDTH = 16
@@ -41,7 +43,7 @@ def load_scene(
     """Read a scene: poses, sparse points, and photographs without distortion at the working resolution.
 
     Args:
-        root: a folder in one of the four layouts; which of them is told from what lies in it.
+        root: a folder in one of the five layouts; which of them is told from what lies in it.
         width: of every photograph in pixels, its aspect kept; None and what is wider than a photograph mean its own.
         allow_missing: go on without photographs that are named but not there.
         progress: called with (ready, of how many) while photographs are decoded; not at all when they are cached.
@@ -51,12 +53,7 @@ def load_scene(
     """
     if width is not None and width < _SMALLEST_WIDTH:
         raise SceneError(f"photographs {width} pixels wide were asked for: expected at least {_SMALLEST_WIDTH}")
-    posed = _read(root, allow_missing)
-    if len(posed.names) < _FEWEST:
-        raise SceneError(
-            f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
-        )
-    posed = _sorted(replace(posed, T_world_camera=proper_rotations(posed.T_world_camera, posed.names, root)))
+    posed = read_posed(root, allow_missing)
     files = tuple(map(_photograph_file, posed.paths, posed.lenses, [width] * len(posed.paths)))
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
     posed = _moved(posed, origin)
@@ -83,6 +80,40 @@ def load_scene(
     )
 
 
+def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
+    """What a folder says of its photographs, sorted by their names; none of them is decoded.
+
+    Args:
+        root: a folder in one of the five layouts; COLMAP's model is read where there is another description, too.
+        allow_missing: go on without photographs that are named but not there.
+
+    Raises:
+        SceneError: when the folder is no scene, a damaged one, or one of fewer than three photographs.
+    """
+    posed = _read(root, allow_missing)
+    if len(posed.names) < _FEWEST:
+        raise SceneError(
+            f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
+        )
+    return _sorted(replace(posed, T_world_camera=proper_rotations(posed.T_world_camera, posed.names, root)))
+
+
+def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
+    """The lens at its photograph's own size, and whether the photograph has an opacity channel.
+
+    Raises:
+        SceneError: when the file cannot be read, or has another aspect than its lens.
+    """
+    own_width, own_height, has_alpha = read_header(path)
+    if abs(own_height - lens.height * own_width / lens.width) > 1:  # one pixel: an odd size was halved
+        turned = " (is it stored turned? EXIF orientation is not applied)" if own_width < own_height else ""
+        raise SceneError(
+            f"{path} has {own_width} x {own_height} pixels, but its camera has {lens.width} x {lens.height}: expected "
+            f"the same size or the same aspect{turned}; use the photographs that the poses were made with"
+        )
+    return lens.resized(own_width, own_height), has_alpha
+
+
 def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Choose the layout by what is in the folder."""
     if not root.is_dir():
@@ -95,6 +126,8 @@ def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
         return read_blender(root, allow_missing)
     if (root / "poses_bounds.npy").is_file():
         return read_llff(root)
+    if reconstruction := find_opensfm(root):
+        return read_opensfm(root, reconstruction, allow_missing)
     if model := find_colmap(root, "colmap/sparse/0"):
         return read_colmap(root, model, allow_missing)
     found = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
@@ -123,16 +156,10 @@ def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
 
 def _photograph_file(path: Path, lens: Lens, width: int | None) -> PhotographFile:
     """What to make of a photograph; its file may have another size than its lens, of the same aspect."""
-    own_width, own_height, has_alpha = read_header(path)
-    if abs(own_height - lens.height * own_width / lens.width) > 1:  # one pixel: an odd size was halved
-        turned = " (is it stored turned? EXIF orientation is not applied)" if own_width < own_height else ""
-        raise SceneError(
-            f"{path} has {own_width} x {own_height} pixels, but its camera has {lens.width} x {lens.height}: expected "
-            f"the same size or the same aspect{turned}; use the photographs that the poses were made with"
-        )
-    new_width = min(width or own_width, own_width)
-    new_height = max(1, round(own_height * new_width / own_width))
-    return PhotographFile(path, lens.resized(own_width, own_height), new_width, new_height, has_alpha)
+    own, has_alpha = own_lens(path, lens)
+    new_width = min(width or own.width, own.width)
+    new_height = max(1, round(own.height * new_width / own.width))
+    return PhotographFile(path, own, new_width, new_height, has_alpha)
 
 
 def _moved(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedPhotographs:

@@ -30,6 +30,7 @@ _COLMAP_MODELS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
 Points = Float[np.ndarray, "P 2"]
@@ -183,7 +184,7 @@ def lens_from_colmap(model: str, width: int, height: int, parameters: Sequence[f
     """The lens of a COLMAP camera.
 
     Raises:
-        SceneError: for fisheye and other models, and for a wrong number of parameters.
+        SceneError: for fisheye and other models, for FULL_OPENCV's k4, k5, k6, and for a wrong number of parameters.
     """
     if model not in _COLMAP_MODELS:
         raise SceneError(
@@ -196,6 +197,11 @@ def lens_from_colmap(model: str, width: int, height: int, parameters: Sequence[f
     values = dict(zip(names, map(float, parameters), strict=True))
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
+    if any([values.pop(name, 0.0) for name in ("k4", "k5", "k6")]):
+        raise SceneError(
+            "a FULL_OPENCV camera has k4, k5 or k6 other than 0: supported are k1, k2, k3, p1, p2; run COLMAP's "
+            "image_undistorter and open its output, or reconstruct again with --ImageReader.camera_model OPENCV"
+        )
     return Lens(width, height, **values)
 
 

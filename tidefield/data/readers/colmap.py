@@ -8,23 +8,29 @@ frames.bin. The poses of images in rigs are complete in the images file, so rigs
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Float64, Int, UInt8
 
 from tidefield.data.readers.posed import Observations, PosedPhotographs, bounded_bytes, inside, keep_present
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens, lens_from_colmap
 
 # Model number in cameras.bin -> name and number of parameters, of those that can be read; names of the others.
-_MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    6: ("FULL_OPENCV", 12),
+}
 _OTHER_MODELS = {
     5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
     7: "FOV",
     8: "SIMPLE_RADIAL_FISHEYE",
     9: "RADIAL_FISHEYE",
@@ -38,6 +44,7 @@ _OTHER_MODELS = {
     17: "EQUIRECTANGULAR",
 }
 _NO_POINT = -1
+_Points = tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
 _MEGABYTES = 20_000
 
@@ -74,7 +81,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     with _naming(images_file):
         images = list((_binary_images if binary else _text_images)(images_file))
     with _naming(points_file):
-        point_ids, xyz_world = (_binary_points if binary else _text_points)(points_file)
+        point_ids, xyz_world, rgb = (_binary_points if binary else _text_points)(points_file)
     unknown = next((image for image in images if image.camera not in lenses), None)
     if unknown:
         raise SceneError(
@@ -89,7 +96,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
         paths=tuple(paths[i] for i in present),
         lenses=tuple(lenses[image.camera] for image in images),
         T_world_camera=_poses(images),
-        points=_observations(images, point_ids, xyz_world),
+        points=_observations(images, point_ids, xyz_world, rgb),
     )
 
 
@@ -125,7 +132,10 @@ def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
 
 
 def _observations(
-    images: list[_Image], point_ids: Int[np.ndarray, " P"], xyz_world: Float64[np.ndarray, "P 3"]
+    images: list[_Image],
+    point_ids: Int[np.ndarray, " P"],
+    xyz_world: Float64[np.ndarray, "P 3"],
+    rgb: UInt8[np.ndarray, "P 3"],
 ) -> Observations | None:
     if len(point_ids) == 0 or not images:
         return None
@@ -135,7 +145,7 @@ def _observations(
     photograph = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
     place = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
     known = (point_ids[place] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[place]).all(axis=1)
-    return Observations(xyz_world, place[known], photograph[known], uv_px[known])
+    return Observations(xyz_world, place[known], photograph[known], uv_px[known], rgb)
 
 
 class _Reader:
@@ -187,18 +197,19 @@ def _binary_images(path: Path) -> Iterator[_Image]:
     reader.end()
 
 
-def _binary_points(path: Path) -> tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"]]:
+def _binary_points(path: Path) -> _Points:
     reader = _Reader(path)
-    ids, xyz = [], []
+    ids, xyz, rgb = [], [], []
     for _ in range(reader.count(51)):
         point, *position = reader.take("Q3d")
-        reader.take("3Bd")  # colour and error
+        *colour, _ = reader.take("3Bd")  # and the error
         track = reader.count(8)
         reader.at += 8 * track  # the images file says the same
         ids.append(point)
         xyz.append(position)
+        rgb.append(colour)
     reader.end()
-    return np.array(ids, dtype=np.int64), np.array(xyz, dtype=np.float64).reshape(-1, 3)
+    return _points(ids, xyz, rgb)
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -226,7 +237,15 @@ def _text_images(path: Path) -> Iterator[_Image]:
         yield _Image(name, int(camera), values[:4], values[4:], seen[:, :2], seen[:, 2].astype(np.int64))
 
 
-def _text_points(path: Path) -> tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"]]:
-    records = [line.split(maxsplit=4)[:4] for line in _lines(path) if line]
-    ids = np.array([int(record[0]) for record in records], dtype=np.int64)
-    return ids, np.array([record[1:] for record in records], dtype=np.float64).reshape(-1, 3)
+def _text_points(path: Path) -> _Points:
+    records = [line.split(maxsplit=7)[:7] for line in _lines(path) if line]
+    ids, colours = [int(record[0]) for record in records], [[int(c) for c in record[4:]] for record in records]
+    return _points(ids, [record[1:4] for record in records], colours)
+
+
+def _points(ids: Sequence[int], xyz: Sequence[Sequence[float | str]], rgb: Sequence[Sequence[int]]) -> _Points:
+    return (
+        np.array(ids, dtype=np.int64),
+        np.array(xyz, dtype=np.float64).reshape(-1, 3),
+        np.array(rgb, dtype=np.uint8).reshape(-1, 3),
+    )

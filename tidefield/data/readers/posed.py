@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import posixpath
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int, UInt8
 
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
@@ -25,18 +26,34 @@ class Observations:
         point_index: for each observation, the point.
         photograph_index: for each observation, the photograph.
         uv_px: for each observation, the pixel in the photograph as it was taken (distorted), at the lens's size.
+        rgb: the points' colours, where the format has them.
     """
 
     xyz_world: Float64[np.ndarray, "P 3"]
     point_index: Int[np.ndarray, " O"]
     photograph_index: Int[np.ndarray, " O"]
     uv_px: Float64[np.ndarray, "O 2"]
+    rgb: UInt8[np.ndarray, "P 3"] | None = None
 
     def by_photograph(self, photographs: int) -> list[Int[np.ndarray, " _"]]:
         """For each photograph, the indices of its observations."""
         order = np.argsort(self.photograph_index, kind="stable")
         starts = np.searchsorted(self.photograph_index[order], np.arange(1, photographs))
         return np.split(order, starts)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Where on Earth the origin of a world is whose axes are east, north and up there, in metres.
+
+    Attributes:
+        latitude_deg, longitude_deg: WGS 84.
+        height_m: above whatever the heights of the project's cameras count from; projects do not say.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
 
 
 @dataclass(frozen=True)
@@ -50,9 +67,11 @@ class PosedPhotographs:
         T_world_camera: OpenCV axes (+x right, +y down, +z forward).
         points: sparse points and who saw them, where the format has them.
         cloud_world: points without observations, where the format has only those.
+        cloud_rgb: their colours, where the format has them.
         near_far: z-depths, where the format states them.
         split: names of the photographs to learn from and of those held out, where the format has a split.
         background_rgb: what photographs with alpha are meant to be seen against, where the format says so.
+        reference: where the world is, where the format says so.
     """
 
     names: tuple[str, ...]
@@ -61,19 +80,33 @@ class PosedPhotographs:
     T_world_camera: Float64[np.ndarray, "V 3 4"]
     points: Observations | None = None
     cloud_world: Float64[np.ndarray, "P 3"] | None = None
+    cloud_rgb: UInt8[np.ndarray, "P 3"] | None = None
     near_far: Float64[np.ndarray, "V 2"] | None = None
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background_rgb: tuple[float, float, float] | None = None
+    reference: Reference | None = None
 
 
 def bounded_bytes(path: Path, megabytes: int) -> bytes:
     """A file's content, refused when it is larger than what it claims to be could be."""
+    with _readable(path, megabytes):
+        return path.read_bytes()
+
+
+def bounded_lines(path: Path, megabytes: int) -> Iterator[str]:
+    """A text's lines, one after the other, refused like `bounded_bytes`; UnicodeDecodeError where it is not UTF-8."""
+    with _readable(path, megabytes), path.open(encoding="utf-8") as lines:
+        yield from lines
+
+
+@contextmanager
+def _readable(path: Path, megabytes: int) -> Iterator[None]:
     try:
         if path.stat().st_size > megabytes * 1_000_000:
             raise SceneError(
                 f"{path} has {path.stat().st_size / 1e6:.0f} MB: expected at most {megabytes} MB of a file of this kind"
             )
-        return path.read_bytes()
+        yield
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}; make it a readable file") from error
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from tidefield.data.images import read_header
 from tidefield.data.readers.ply import read_ply
@@ -51,12 +51,14 @@ def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
     present = keep_present(paths, file, allow_missing)
     frames, paths, keys = [frames[i] for i in present], [paths[i] for i in present], [keys[i] for i in present]
     names = names_of(root, paths)
+    cloud = _cloud(top, root, file, allow_missing)
     return PosedPhotographs(
         names=names,
         paths=tuple(paths),
         lenses=tuple(lens_of({**top, **frame}, path, file) for frame, path in zip(frames, paths, strict=True)),
         T_world_camera=poses_of(frames, file),
-        cloud_world=_cloud(top, root, file, allow_missing),
+        cloud_world=None if cloud is None else cloud[0],
+        cloud_rgb=None if cloud is None else cloud[1],
         split=(
             frozenset(name for name, key in zip(names, keys, strict=True) if key in train),
             frozenset(name for name, key in zip(names, keys, strict=True) if key in test and key not in train),
@@ -73,7 +75,7 @@ def read_json(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{file} is not whole JSON ({error}); copy or export it again") from error
     if not isinstance(top, dict):
-        raise SceneError(f"{file} holds a {type(top).__name__}: expected an object with frames; export it again")
+        raise SceneError(f"{file} holds a {type(top).__name__}: expected an object; export it again")
     return top
 
 
@@ -169,7 +171,9 @@ def _listed(top: Mapping[str, Any], key: str, file: Path) -> frozenset[str]:
     return frozenset(map(posixpath.normpath, names))
 
 
-def _cloud(top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool) -> Float64[np.ndarray, "P 3"] | None:
+def _cloud(
+    top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None] | None:
     name = top.get("ply_file_path")
     if name is None:
         return None

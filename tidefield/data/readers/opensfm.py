@@ -1,0 +1,269 @@
+"""Projects of OpenSfM and OpenDroneMap (ODM): `reconstruction.json`, its photographs and, if there, its tracks.
+
+OpenSfM measures photographs from their middle, in units of their longer side s. With pixel corners at integers
+
+    u = s (f_x x_d + c_x) + width / 2,   v = s (f_y y_d + c_y) + height / 2
+
+where x_d, y_d are distorted as in `tidefield.geometry.lenses`. Photographs are meant as they are stored, not as EXIF's
+orientation turns them. A shot's rotation (an angle-axis vector) and translation take the world into the camera, whose
+axes are OpenCV's. (https://opensfm.org/docs/geometry.html; that page lacks two squares in Brown's tangential terms,
+which OpenSfM's code has.)
+
+ODM keeps OpenSfM's project in the folder opensfm and the photographs beside it. Where there is GPS it rewrites
+reconstruction.json in a map projection, which shears and scales it a little, and keeps the original, in metres east,
+north and up of reference_lla.json, as reconstruction.topocentric.json: then that is read.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import posixpath
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from scipy.spatial.transform import Rotation
+
+from tidefield.data.images import read_header
+from tidefield.data.readers.opensfm_tracks import Tracks, read_tracks
+from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference, bounded_bytes, inside, keep_present
+from tidefield.data.readers.transforms import number, read_json
+from tidefield.errors import SceneError
+from tidefield.geometry.lenses import Lens
+
+Object = dict[str, Any]
+
+_MEGABYTES, _LIST_MEGABYTES = 2_000, 64
+_TOPOCENTRIC = "reconstruction.topocentric.json"
+# Projection type -> its terms of distortion, of those that are pinhole cameras.
+_TERMS = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+}
+# Share of a photograph's longer side: OpenSfM leaves out what lies farther from where its point projects (its
+# bundle_outlier_fixed_threshold), but not from tracks.csv.
+_OUTLIER = 0.006
+_NAMED_AT_MOST = 5
+
+_log = logging.getLogger(__name__)
+
+
+def find_opensfm(root: Path) -> Path | None:
+    """The reconstruction to read of an ODM project or of an OpenSfM data set, or None."""
+    places = [root / folder / name for folder in ("opensfm", "") for name in (_TOPOCENTRIC, "reconstruction.json")]
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotographs:
+    """The largest reconstruction of a project.
+
+    Raises:
+        SceneError: for damaged files, lenses that are no pinhole cameras with Brown's distortion, missing photographs.
+    """
+    reconstruction = _largest(file)
+    shots, cameras = _objects(reconstruction, "shots", file), _objects(reconstruction, "cameras", file)
+    paths = _photographs(root, file, list(shots))
+    present = keep_present(paths, file, allow_missing)
+    names, paths = [list(shots)[i] for i in present], [paths[i] for i in present]
+    lenses = tuple(_lens(name, shots[name], cameras, path, file) for name, path in zip(names, paths, strict=True))
+    T_world_camera = _poses([shots[name] for name in names], names, file)
+    ids, xyz_world, rgb = _points(_objects(reconstruction, "points", file), file)
+    points = None
+    if (tracks_file := file.with_name("tracks.csv")).is_file():
+        points = _observations(read_tracks(tracks_file, names, ids), lenses, T_world_camera, xyz_world, rgb)
+    only_cloud = points is None and len(ids) > 0
+    return PosedPhotographs(
+        names=tuple(names),
+        paths=tuple(paths),
+        lenses=lenses,
+        T_world_camera=T_world_camera,
+        points=points,
+        cloud_world=xyz_world if only_cloud else None,
+        cloud_rgb=rgb if only_cloud else None,
+        reference=_reference(file, reconstruction),
+    )
+
+
+def _largest(file: Path) -> Object:
+    """The reconstruction of the most photographs; those of the others are named."""
+    try:
+        reconstructions = json.loads(bounded_bytes(file, _MEGABYTES))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file} is not whole JSON ({error}); copy or export it again") from error
+    if not isinstance(reconstructions, list) or not reconstructions or not all(map(_is_object, reconstructions)):
+        raise SceneError(f"{file} holds no list of reconstructions: expected what OpenSfM writes; run it again")
+    largest, *others = sorted(reconstructions, key=lambda r: len(_objects(r, "shots", file)), reverse=True)
+    left = [name for other in others for name in other["shots"]]
+    if left:
+        more = f" and {len(left) - _NAMED_AT_MOST} more" if len(left) > _NAMED_AT_MOST else ""
+        _log.warning(
+            f"{file} has {len(reconstructions)} reconstructions that do not hang together: the largest, of "
+            f"{len(largest['shots'])} photographs, is used; left out: {', '.join(left[:_NAMED_AT_MOST])}{more}"
+        )
+    return largest
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _objects(reconstruction: Mapping[str, Any], key: str, file: Path) -> dict[str, Object]:
+    objects = reconstruction.get(key, {})
+    if not isinstance(objects, dict) or not all(map(_is_object, objects.values())):
+        raise SceneError(f"{file} has {key} that are no table of objects: expected what OpenSfM writes; run it again")
+    return objects
+
+
+def _photographs(root: Path, file: Path, names: Sequence[str]) -> list[Path]:
+    """Where each photograph is, or should be: in a folder images, or where image_list.txt says."""
+    folders = list(dict.fromkeys((root / "images", file.parent / "images")))
+    image_list = file.with_name("image_list.txt")
+    listed = _listed(root, image_list) if image_list.is_file() else {}
+    paths = []
+    for name in names:
+        candidates = [inside(folder, name, file) for folder in folders]
+        if name in listed and not any(path.is_file() for path in candidates):
+            candidates.append(inside(root, listed[name], image_list))
+        paths.append(next((path for path in candidates if path.is_file()), candidates[0]))
+    return paths
+
+
+def _listed(root: Path, image_list: Path) -> dict[str, str]:
+    """Paths relative to `root` by photographs' names. Absolute ones are of the machine that ODM ran on, and skipped."""
+    try:
+        lines = bounded_bytes(image_list, _LIST_MEGABYTES).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{image_list} is no UTF-8 text ({error}): expected a path per line; correct it") from error
+    here = image_list.parent.relative_to(root).as_posix()
+    paths = [PurePosixPath(line.strip()) for line in lines if line.strip()]
+    return {path.name: posixpath.join(here, path) for path in paths if not path.is_absolute()}
+
+
+def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, file: Path) -> Lens:
+    camera = cameras.get(str(shot.get("camera")))
+    if camera is None:
+        raise SceneError(f"{file} says that {name} was taken by {shot.get('camera')!r}, a camera that it does not have")
+    kind = camera.get("projection_type", "perspective")
+    if kind not in _TERMS:
+        raise SceneError(
+            f"{file} has a camera of the projection type {kind!r}: supported are {', '.join(_TERMS)}; open the folder "
+            "undistorted instead, which `opensfm undistort` makes (ODM has it in opensfm/undistorted)"
+        )
+    width, height = (int(number(camera, key, file, 0.0)) for key in ("width", "height"))
+    if not (width and height):
+        width, height, _ = read_header(path)
+    longer = max(width, height)
+    focal = ("focal", "focal") if kind == "perspective" else ("focal_x", "focal_y")
+    fx, fy = (number({key: camera.get(key)}, key, file, 0.0) for key in focal)
+    # A perspective camera's principal point is in the middle, whatever else stands there.
+    cx, cy = (0.0 if kind == "perspective" else number(camera, key, file, 0.0) for key in ("c_x", "c_y"))
+    return Lens(
+        width,
+        height,
+        fx=fx * longer,
+        fy=fy * longer,
+        cx=cx * longer + width / 2,
+        cy=cy * longer + height / 2,
+        **{term: number(camera, term, file, 0.0) for term in _TERMS[kind]},
+    )
+
+
+def _poses(shots: Sequence[Object], names: Sequence[str], file: Path) -> Float64[np.ndarray, "V 3 4"]:
+    rotation, translation = (
+        np.array([_vector(shot.get(key), f"{key} of {name}", file) for shot, name in zip(shots, names, strict=True)])
+        for key in ("rotation", "translation")
+    )
+    R_world_camera = Rotation.from_rotvec(rotation.reshape(-1, 3)).as_matrix().transpose(0, 2, 1)
+    return np.concatenate([R_world_camera, -R_world_camera @ translation.reshape(-1, 3, 1)], axis=2)
+
+
+def _vector(value: object, what: str, file: Path) -> list[float]:
+    if not isinstance(value, list) or len(value) != 3:
+        raise SceneError(f"{file}: the {what} is {value!r}: expected three numbers; run OpenSfM again")
+    return [number({what: element}, what, file, 0.0) for element in value]
+
+
+def _points(
+    points: Mapping[str, Object], file: Path
+) -> tuple[list[str], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Names, positions and colours of the points at finite positions."""
+    try:
+        xyz = np.array([point["coordinates"] for point in points.values()], dtype=np.float64).reshape(len(points), 3)
+        grey = [128, 128, 128]
+        rgb = np.array([point.get("color", grey) for point in points.values()], dtype=np.float64)
+        rgb = rgb.reshape(len(points), 3)
+        if not ((rgb >= 0) & (rgb <= 255)).all():
+            raise ValueError("colours outside of 0 to 255")
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{file} has points that are none ({error}): expected coordinates and a color of three numbers each; run "
+            "OpenSfM again"
+        ) from error
+    names, finite = list(points), np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    return [names[i] for i in finite], xyz[finite], rgb[finite].astype(np.uint8)
+
+
+def _observations(
+    tracks: Tracks,
+    lenses: Sequence[Lens],
+    T_world_camera: Float64[np.ndarray, "V 3 4"],
+    xyz_world: Float64[np.ndarray, "P 3"],
+    rgb: UInt8[np.ndarray, "P 3"],
+) -> Observations | None:
+    """What OpenSfM's reconstruction counts among the observations of its points; None without any."""
+    sizes = np.array([(lens.width, lens.height) for lens in lenses], dtype=np.float64).reshape(-1, 2)
+    size = sizes[tracks.photograph_index]
+    uv_px = tracks.xy * size.max(axis=1, keepdims=True, initial=0) + size / 2
+    all_seen = Observations(xyz_world, tracks.point_index, tracks.photograph_index, uv_px, rgb)
+    good = np.zeros(len(uv_px), dtype=bool)
+    for lens, pose, mine in zip(lenses, T_world_camera, all_seen.by_photograph(len(lenses)), strict=True):
+        xyz_camera = (xyz_world[tracks.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
+        with np.errstate(all="ignore"):  # points in the camera's plane; they are left out
+            off_px = np.linalg.norm(lens.project(xyz_camera) - uv_px[mine], axis=1)
+        good[mine] = (xyz_camera[:, 2] > 0) & (off_px <= _OUTLIER * max(lens.width, lens.height))
+    if not good.any():
+        return None
+    return replace(
+        all_seen,
+        point_index=tracks.point_index[good],
+        photograph_index=tracks.photograph_index[good],
+        uv_px=uv_px[good],
+    )
+
+
+def _reference(file: Path, reconstruction: Mapping[str, Any]) -> Reference | None:
+    """Where the origin is, if that is said and the reconstruction is in metres east, north and up of it."""
+    # ODM's reconstruction.json is in a map projection once it is moved, and says so nowhere.
+    folder = file.resolve().parent
+    moved = folder.name == "opensfm" or (folder.parent / "odm_georeferencing").is_dir()
+    original = file.name == _TOPOCENTRIC or (folder / "reconstruction.geocoords.json").is_file()
+    source = file.with_name("reference_lla.json")
+    if source.is_file():
+        where = read_json(source)
+    else:
+        source, where = file, reconstruction.get("reference_lla")
+    if not isinstance(where, dict):
+        return None
+    latitude, longitude, height = (
+        number({key: where.get(key)}, key, source, 0.0) for key in ("latitude", "longitude", "altitude")
+    )
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        raise SceneError(
+            f"{source} has the latitude {latitude} and the longitude {longitude}: expected degrees of WGS 84; correct "
+            "them or remove the file"
+        )
+    if latitude == longitude == 0:  # what OpenSfM writes where no photograph has GPS
+        return None
+    if moved and not original:
+        _log.warning(
+            f"{file} may be in a map projection or not, as {_TOPOCENTRIC} is not beside it: where on Earth its origin "
+            "is stays unknown"
+        )
+        return None
+    return Reference(latitude, longitude, height)
