@@ -117,8 +117,16 @@ class Control:
 
 @dataclass(frozen=True)
 class Survey:
-    """Everything that was read; photographs are sorted by name."""
+    """Everything that was read.
+
+    Attributes:
+        folder: where the photographs are.
+        photographs: sorted by name.
+        control: ground control, if there is any.
+        remarks: what was left out or doubted while reading, one sentence each, for the report.
+    """
 
     folder: Path
     photographs: tuple[Photograph, ...]
     control: Control | None
+    remarks: tuple[str, ...] = ()
