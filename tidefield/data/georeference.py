@@ -1,0 +1,198 @@
+"""Where on the Earth a scene is, and how well that is known: `georeference.json` beside the photographs."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tidefield.errors import SceneError
+from tidefield.files import completed_file
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
+
+FILE_NAME = "georeference.json"
+_VERSION = 1
+
+Source = Literal["ground control", "GPS", "none"]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How far the scene's positions lie from those that were given, in metres of the world.
+
+    Attributes:
+        names: photographs or control points.
+        error_m: the scene's minus the given, east, north and up; NaN where none was given.
+    """
+
+    names: tuple[str, ...] = ()
+    error_m: Float64[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def horizontal_rms_m(self) -> float:
+        """NaN if there are none."""
+        return _rms(np.linalg.norm(self.error_m[:, :2], axis=1))
+
+    @property
+    def vertical_rms_m(self) -> float:
+        """NaN if there are none."""
+        return _rms(self.error_m[:, 2])
+
+    @property
+    def median_m(self) -> Float64[np.ndarray, " 3"]:
+        """What all have in common, such as a shift between datums; NaN if there are none."""
+        known = self.error_m[np.isfinite(self.error_m).all(axis=1)]
+        return np.median(known, axis=0) if len(known) else np.full(3, math.nan)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """An observation that was not believed.
+
+    Attributes:
+        kind: "GPS", "control point" or "mark".
+        name: the photograph, the control point, or "point in photograph".
+        reason: a sentence for the surveyor.
+    """
+
+    kind: Literal["GPS", "control point", "mark"]
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """How a scene's world lies on the Earth.
+
+    Attributes:
+        frame: None if nothing says where the scene is; the world then has its vertical from the photographs, and an
+            origin and a scale of its own.
+        source: what the frame rests on.
+        world_from_model: the similarity between the model as it was reconstructed and the world. With ground control
+            the model was adjusted further, in the world.
+        gps: of the cameras. Those that were left out are in it, for the report; the properties of `gps_used` are
+            without them.
+        control: of the control points, as the adjusted photographs see them, which they have been fitted to.
+        check: of the control points, each as seen by photographs that were adjusted without it. This is the figure
+            to believe.
+        left_out: what was not used.
+        notes: what else a surveyor should know, as sentences.
+    """
+
+    frame: LocalFrame | None
+    source: Source
+    world_from_model: Similarity
+    gps: Residuals
+    control: Residuals
+    check: Residuals
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def gps_used(self) -> Residuals:
+        """Of the cameras whose positions were used."""
+        wrong = {item.name for item in self.left_out if item.kind == "GPS"}
+        keep = [i for i, name in enumerate(self.gps.names) if name not in wrong]
+        return Residuals(tuple(self.gps.names[i] for i in keep), self.gps.error_m[keep])
+
+    def write(self, folder: Path) -> None:
+        """Write `georeference.json` into a scene's folder, over an older one.
+
+        Raises:
+            RunError: the folder cannot be written to.
+        """
+        with completed_file(folder / FILE_NAME, overwrite=True) as partial:
+            partial.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    def to_json(self) -> dict[str, Any]:
+        """What `read_georeference` reads, with figures for readers who have only the file."""
+        kinds = {"gps": self.gps, "gps_used": self.gps_used, "control": self.control, "check": self.check}
+        similarity = self.world_from_model
+        return {
+            "version": _VERSION,
+            "source": self.source,
+            "frame": None if self.frame is None else self.frame.to_json(),
+            "world_from_model": {
+                "scale": similarity.scale,
+                "rotation": similarity.rotation.tolist(),
+                "translation": similarity.translation.tolist(),
+            },
+            "residuals": {kind: _residuals_to_json(residuals) for kind, residuals in kinds.items()},
+            "left_out": [{"kind": item.kind, "name": item.name, "reason": item.reason} for item in self.left_out],
+            "notes": list(self.notes),
+        }
+
+
+def read_georeference(folder: Path) -> Georeference | None:
+    """`georeference.json` of a scene; None if it has none.
+
+    Raises:
+        SceneError: the file is damaged, or of a later version.
+    """
+    path = folder / FILE_NAME
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["version"] != _VERSION:
+            raise ValueError(f"it is of version {values['version']}, expected {_VERSION}")
+        return _from_json(values)
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SceneError(
+            f"{path} is damaged ({error}): expected what `tidefield prepare` writes; prepare the scene again, or "
+            "remove the file to use the scene in a frame of its own"
+        ) from error
+
+
+def _from_json(values: dict[str, Any]) -> Georeference:
+    if values["source"] not in ("ground control", "GPS", "none"):
+        raise ValueError(f"its source is {values['source']!r}")
+    similarity = values["world_from_model"]
+    residuals = {kind: _residuals_from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}
+    return Georeference(
+        frame=None if values["frame"] is None else LocalFrame.from_json(values["frame"]),
+        source=values["source"],
+        world_from_model=Similarity(
+            float(similarity["scale"]),
+            np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
+            np.array(similarity["translation"], dtype=np.float64).reshape(3),
+        ),
+        left_out=tuple(LeftOut(item["kind"], item["name"], item["reason"]) for item in values["left_out"]),
+        notes=tuple(str(note) for note in values["notes"]),
+        **residuals,
+    )
+
+
+def _residuals_to_json(residuals: Residuals) -> dict[str, Any]:
+    return {
+        "horizontal_rms_m": _number(residuals.horizontal_rms_m),
+        "vertical_rms_m": _number(residuals.vertical_rms_m),
+        "median_east_north_up_m": [_number(value) for value in residuals.median_m],
+        "each": [
+            {"name": name, "east_north_up_m": [_number(value) for value in error]}
+            for name, error in zip(residuals.names, residuals.error_m, strict=True)
+        ],
+    }
+
+
+def _residuals_from_json(values: dict[str, Any]) -> Residuals:
+    rows = [[math.nan if v is None else float(v) for v in each["east_north_up_m"]] for each in values["each"]]
+    return Residuals(
+        tuple(str(each["name"]) for each in values["each"]), np.array(rows, dtype=np.float64).reshape(-1, 3)
+    )
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _rms(values: Float64[np.ndarray, " N"]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt((known**2).mean())) if len(known) else math.nan
