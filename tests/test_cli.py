@@ -104,6 +104,22 @@ def test_a_folder_with_other_files_is_not_made_a_run(
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
+def test_an_imported_scene_is_told_of_and_can_be_used(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("import", scene, tmp_path / "own", "--link")
+    assert re.search(
+        r"own: 9 photographs, 2 of them held out; 1 camera; [\d,]+ sparse points, seen [\d,]+ times",
+        capsys.readouterr().out,
+    )
+    assert (tmp_path / "own" / "transforms.json").is_file()
+    assert "is there already" in fails(capsys, "import", scene, tmp_path / "own")
+    assert "no posed photographs" in fails(capsys, "import", tmp_path, tmp_path / "other")
+    call("evaluate", tmp_path / "own", tmp_path / "floor", "--method", "sparse-depth", "--width", 48, "-q")
+    names = json.loads((tmp_path / "floor" / "evaluation.json").read_text())["split"]["test"]
+    assert names == ["vegetation_0001.png", "vegetation_0009.png"]
+
+
 def test_users_mistakes_are_one_clear_message(
     scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

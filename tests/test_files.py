@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, completed_folder
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path):
@@ -45,3 +45,35 @@ def test_a_dangling_link_counts_as_something_that_is_there(tmp_path: Path):
     (tmp_path / "map.tif").symlink_to(tmp_path / "gone")
     with pytest.raises(RunError, match="is there already"), completed_file(tmp_path / "map.tif"):
         pytest.fail("nothing may be written")
+
+
+def test_a_folder_appears_when_it_is_complete(tmp_path: Path):
+    with completed_folder(tmp_path / "a" / "scene") as partial:
+        (partial / "images").mkdir()
+        assert not (tmp_path / "a" / "scene").exists()
+    assert os.listdir(tmp_path / "a") == ["scene"]
+    assert os.listdir(tmp_path / "a" / "scene") == ["images"]
+
+
+def test_a_folder_that_is_there_is_left_alone_even_if_it_was_made_meanwhile(tmp_path: Path):
+    (tmp_path / "old").mkdir()
+    with pytest.raises(RunError, match=r"old is there already"), completed_folder(tmp_path / "old"):
+        pytest.fail("nothing may be written")
+    with pytest.raises(RunError, match=r"new is there already"), completed_folder(tmp_path / "new"):
+        (tmp_path / "new").mkdir()
+    assert sorted(os.listdir(tmp_path)) == ["new", "old"]
+
+
+def test_a_folder_that_fails_leaves_nothing(tmp_path: Path):
+    def fill(error: BaseException) -> None:
+        with completed_folder(tmp_path / "scene") as partial:
+            (partial / "half").touch()
+            raise error
+
+    with pytest.raises(RunError, match=r"scene cannot be written \(No space left on device\)"):
+        fill(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    with pytest.raises(OSError, match="broken disk"):
+        fill(OSError(errno.EIO, "broken disk"))
+    with pytest.raises(KeyboardInterrupt):
+        fill(KeyboardInterrupt())
+    assert os.listdir(tmp_path) == []

@@ -1,4 +1,4 @@
-"""The command line: `tidefield train | evaluate | render | demo`.
+"""The command line: `tidefield import | train | evaluate | render | demo`.
 
 Only what is needed to answer --help is imported here; torch and the rest are imported once a command is known.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from tidefield.errors import TidefieldError
-from tidefield.options import Demo, Evaluate, Render, Talk, Train
+from tidefield.options import Demo, Evaluate, Import, Render, Talk, Train
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,14 +38,20 @@ def main() -> None:
 def _run() -> None:
     """Understand the command line and do what it says."""
     options = tyro.extras.subcommand_cli_from_dict(
-        {"train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo},
+        {"import": Import, "train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo},
         prog="tidefield",
         description="New views of tidal flats from drone photographs.",
     )
     console = _begin(options.talk)
     from tidefield import commands
 
-    todo = {Train: commands.train, Evaluate: commands.evaluate, Render: commands.render, Demo: commands.demo}
+    todo = {
+        Import: commands.import_project,
+        Train: commands.train,
+        Evaluate: commands.evaluate,
+        Render: commands.render,
+        Demo: commands.demo,
+    }
     todo[type(options)](options, console)
 
 

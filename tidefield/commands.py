@@ -18,10 +18,11 @@ from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
+from tidefield.ingest import convert
 from tidefield.meter import Meter
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
-from tidefield.options import Demo, Evaluate, Render, Train
+from tidefield.options import Demo, Evaluate, Import, Render, Train
 from tidefield.products.pictures import write_still
 from tidefield.products.trajectory import make_trajectory
 from tidefield.products.video import write_video
@@ -40,6 +41,21 @@ DEFAULT_MINUTES = 10.0
 DEMO_FRAMES = 96
 DEMO_PICTURE = "river_mouths_0033.png"
 """Of the held-out photographs of the built-in scene, the one with a creek, its banks and plants."""
+
+
+def import_project(options: Import, console: Console) -> None:
+    """See `tidefield import --help`."""
+    with Meter(console, "Placing photographs") as meter:
+        made = convert.import_project(
+            options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=meter
+        )
+    seen = f", seen {made.observations:,} times" if made.observations else ""
+    console.print(
+        f"{options.scene}: {made.photographs} photographs, {made.held_out} of them held out; {made.cameras} "
+        f"camera{'s' * (made.cameras > 1)}; {made.points:,} sparse points{seen}",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def train(options: Train, console: Console) -> None:

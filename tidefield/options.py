@@ -35,7 +35,7 @@ class Train:
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder with posed photographs: a COLMAP model, transforms.json, a Blender scene or LLFF."""
+    """Folder with posed photographs: a COLMAP model, transforms.json, ODM's or OpenSfM's project, Blender or LLFF."""
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder for the result; must be new, unless --resume or --overwrite is given."""
     preset: Preset = "swift"
@@ -105,6 +105,24 @@ class Render:
     device: Device = "auto"
     overwrite: bool = False
     """Replace files that are there."""
+    allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make a scene of a project of ODM or OpenSfM, of a COLMAP model, or of nerfstudio's transforms.json.
+
+    Poses and photographs stay as they are. The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio,
+    gsplat and OpenSplat open it, too.
+    """
+
+    project: Annotated[Positional[Path], arg(metavar="PROJECT")]
+    """The folder of the project or scene."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder for the scene; must be new."""
+    link: bool = False
+    """Give the photographs a second name (hard links) instead of copying them."""
     allow_missing: AllowMissing = False
     talk: OmitArgPrefixes[Talk] = Talk()
 
