@@ -80,6 +80,15 @@ def drop_astray(photographs: Sequence[Photograph]) -> tuple[list[Photograph], li
     return [replace(p, position=None) if p.name in astray else p for p in photographs], remarks
 
 
+def metres_around(positions: Sequence[Position]) -> Float64[np.ndarray, "N 2"]:
+    """East and north of the middle of some positions; on a sphere, good to some per cent over tens of kilometres."""
+    degrees = np.array([(position.longitude_deg, position.latitude_deg) for position in positions]).reshape(-1, 2)
+    east = (degrees[:, 0] - degrees[:1, 0] + 180) % 360 - 180  # also across the date line
+    scale = np.deg2rad(_EARTH_M) * np.array([np.cos(np.deg2rad(np.median(degrees[:, 1]))), 1.0])
+    metres = np.column_stack([east, degrees[:, 1]]) * scale
+    return metres - np.median(metres, axis=0)
+
+
 def _swapped(position: Position) -> Position:
     return replace(position, latitude_deg=position.longitude_deg, longitude_deg=position.latitude_deg)
 
