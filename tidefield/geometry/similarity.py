@@ -63,12 +63,14 @@ def hypotheses(
         down_source: roughly where -z of the target points in the source. With it two points make a similarity, so
             that points on one line will do.
     """
+    if len(source) < 2:
+        return []
     found = []
     spread = np.linalg.svd(source - source.mean(0), compute_uv=False)
     if len(source) >= 3 and spread[1] > ON_ONE_LINE * spread[0]:
         triples = _subsets(len(source), 3, generator)
         found += zip(*_umeyama(source[triples], target[triples]), strict=True)
-    if down_source is not None and len(source) >= 2:
+    if down_source is not None:
         pairs = _subsets(len(source), 2, generator)
         found += zip(*_level(source[pairs], target[pairs], down_source), strict=True)
     return [Similarity(float(scale), rotation, translation) for scale, rotation, translation in found]
@@ -181,7 +183,7 @@ def _level(
     length = np.linalg.norm(p[:, :2], axis=1)
     scale = np.linalg.norm(q[:, :2], axis=1) / np.maximum(length, 1e-300)
     turn = np.arctan2(q[:, 1], q[:, 0]) - np.arctan2(p[:, 1], p[:, 0])
-    rotation = Rotation.from_euler("z", turn).as_matrix().reshape(-1, 3, 3) @ upright
+    rotation = Rotation.from_rotvec(turn[:, None] * _UP).as_matrix() @ upright
     image = (rotation @ source.mean(1)[:, :, None])[:, :, 0]
     return scale, rotation, target.mean(1) - scale[:, None] * image
 

@@ -47,7 +47,8 @@ class PositionFit:
 
     Attributes:
         world_from_model: the similarity.
-        given_world: the positions.
+        centres_model: the cameras.
+        given_world: their positions.
         used: which were not gross errors.
         sigma_m: standard deviations (east, north, up) as they turned out, per position.
         left_out: the gross errors, named.
@@ -55,6 +56,7 @@ class PositionFit:
     """
 
     world_from_model: Similarity
+    centres_model: Float64[np.ndarray, "N 3"]
     given_world: Float64[np.ndarray, "N 3"]
     used: Bool[np.ndarray, " N"]
     sigma_m: Float64[np.ndarray, "N 3"]
@@ -124,7 +126,7 @@ def fit_positions(
     error = similarity(centres_model) - given
     if not _follow(given[used], error[used]):
         return None
-    return PositionFit(similarity, given, used, sigma, _gross(positions.names, error, used), notes)
+    return PositionFit(similarity, centres_model, given, used, sigma, _gross(positions.names, error, used), notes)
 
 
 def metres(length: float) -> str:

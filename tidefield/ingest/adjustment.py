@@ -1,0 +1,167 @@
+"""Bundle adjustment of a whole model with surveyed points, and how well it does without each of them.
+
+A survey that is laid onto its control points keeps the bend that its own matches left it with. Adjusted together with
+the matches, in the world, the marks of points that do not move take out the bend, and what of the lens flat ground
+cannot tell: a longer lens is a higher flight, but not with points at two heights or a bend to show for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from tidefield.ingest.ground_control import on_one_line
+from tidefield.ingest.marks import Marks, triangulate, triangulate_points
+
+Lens = Literal["held", "freed"]
+
+REPEATS = 4
+"""How often each mark counts. A matched point is as well seen as a mark, but its errors are shared with its neighbours'
+(the lens, the shutter), which the sum of squares does not know; repeats stand for that."""
+_FOLDS = 12
+_CHECK_POINTS = 20_000
+_CHECK_POINTS_PER_IMAGE = 100
+_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Control points as seen by photographs that were adjusted without them.
+
+    Attributes:
+        names: of the points; those that two photographs or more show.
+        error_m: seen minus surveyed, east, north and up.
+    """
+
+    names: tuple[str, ...]
+    error_m: Float64[np.ndarray, "N 3"]
+
+    @property
+    def rms_m(self) -> float:
+        """Over all points and directions together; infinite if there are none."""
+        return float(np.sqrt((self.error_m**2).sum(1).mean())) if self.names else np.inf
+
+
+def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap.Reconstruction:
+    """A copy of a model in the world, adjusted to its matches and to marks of points that stay where they are.
+
+    Args:
+        lens: "held" as it is; "freed" adjusts focal length, principal point and distortion too, of OpenCV's model.
+    """
+    copy = pycolmap.Reconstruction(model)
+    if lens == "freed":
+        for camera in copy.cameras.values():
+            _generalise(camera)
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in copy.reg_image_ids():
+        config.add_image(number)
+    for name, surveyed in marks.points.items():
+        config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary, options.refine_sensor_from_rig = False, False
+    freed = lens == "freed"
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = freed
+    solver = options.ceres.solver_options
+    solver.max_num_iterations, solver.function_tolerance = _STEPS, 1e-7
+    options.ceres.solver_options = solver
+    pycolmap.create_default_bundle_adjuster(options, config, copy).solve()
+    return copy
+
+
+def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None:
+    """Give a model the lenses, poses and points of its adjusted copy, and none of the control points."""
+    for number, camera in adjusted.cameras.items():
+        model.cameras[number].model = camera.model
+        model.cameras[number].params = camera.params
+    for number in model.reg_frame_ids():
+        model.frames[number].rig_from_world = adjusted.frames[number].rig_from_world
+    for number, point in model.points3D.items():
+        point.xyz = adjusted.points3D[number].xyz
+    model.update_point_3d_errors()
+
+
+def leave_one_out(
+    model: pycolmap.Reconstruction, marks: Marks, lens: Lens, progress: Callable[[int, int], object]
+) -> Checks:
+    """Adjust without each control point in turn, and see where its marks then put it.
+
+    With more than a dozen points a twelfth of them is left out at a time. Large models are thinned: the answer is the
+    same but for what fewer matches hold less well.
+
+    Args:
+        model: in the world, not yet adjusted to any of the points.
+        progress: called with how many adjustments of how many are done.
+    """
+    surveyed = marks.points
+    seen = [name for name in surveyed if np.count_nonzero(marks.of(name)) >= 2]
+    folds = [fold for fold in (seen[start::_FOLDS] for start in range(_FOLDS)) if fold]
+    names, errors = [], []
+    thinned = _thinned(model)
+    for done, fold in enumerate(folds):
+        progress(done, len(folds))
+        rest = marks.where(~marks.of(*fold))
+        if on_one_line(np.array(list(rest.points.values())).reshape(-1, 3)):
+            continue
+        adjusted = adjust(thinned, rest, lens)
+        for name in fold:
+            point = triangulate(adjusted, marks.where(marks.of(name)))
+            if point is not None:
+                names.append(name)
+                errors.append(point - surveyed[name])
+    progress(len(folds), len(folds))
+    return Checks(tuple(names), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def seen_control(adjusted: pycolmap.Reconstruction, marks: Marks) -> Checks:
+    """Control points as the photographs see them."""
+    seen, surveyed = triangulate_points(adjusted, marks, 1.0), marks.points
+    errors = [point - surveyed[name] for name, point in seen.items()]
+    return Checks(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def _add_control(model: pycolmap.Reconstruction, marks: Marks, surveyed: Float64[np.ndarray, " 3"]) -> int:
+    track = pycolmap.Track()
+    for number, uv in zip(marks.image, marks.uv_px, strict=True):
+        points = model.image(int(number)).points2D
+        for _ in range(REPEATS):
+            points.append(pycolmap.Point2D(uv))
+            track.add_element(int(number), len(points) - 1)
+    return model.add_point3D(surveyed, track)
+
+
+def _generalise(camera: pycolmap.Camera) -> None:
+    """The same lens as OpenCV's model with two radial and two tangential terms, if it is a simpler one."""
+    ids = pycolmap.CameraModelId
+    simpler = {ids.SIMPLE_PINHOLE: 0, ids.PINHOLE: 0, ids.SIMPLE_RADIAL: 1, ids.RADIAL: 2}
+    if camera.model not in simpler:
+        return
+    terms = camera.params[len(camera.params) - simpler[camera.model] :]
+    focal = camera.focal_length_x, camera.focal_length_y
+    centre = camera.principal_point_x, camera.principal_point_y
+    camera.model = ids.OPENCV
+    camera.params = [*focal, *centre, *np.pad(terms, (0, 4 - len(terms)))]
+
+
+def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with no more points than a check needs."""
+    copy = pycolmap.Reconstruction(model)
+    numbers = np.array(sorted(copy.point3D_ids()))
+    most = max(_CHECK_POINTS, _CHECK_POINTS_PER_IMAGE * copy.num_reg_images())
+    for number in np.random.default_rng(0).permutation(numbers)[most:]:
+        copy.delete_point3D(int(number))
+    return copy
+
+
+def worst(checks: Checks, factor: float, floor_m: float) -> str | None:
+    """The point that lies farther off than any other, if by a factor more than half of the others do."""
+    if len(checks.names) < 4:
+        return None
+    distance = np.linalg.norm(checks.error_m, axis=1)
+    last = int(np.argmax(distance))
+    typical = float(np.median(np.delete(distance, last)))
+    return checks.names[last] if distance[last] > max(factor * typical, floor_m) else None
