@@ -106,19 +106,21 @@ def histogram(title: str, axis: str, values: np.ndarray, digits: int) -> Bars | 
 
 def scatter(residuals: Residuals, unit: str) -> Scatter | None:
     """The plan of residuals; None if there are none."""
-    errors = residuals.east_north_up_m
-    if not len(errors) or not residuals.used.any():
+    known = np.all(np.isfinite(residuals.east_north_up_m), axis=1)
+    if not (known & residuals.used).any():
         return None
-    largest = max(float(np.abs(errors[residuals.used]).max()), 1e-6)
+    errors, used = residuals.east_north_up_m[known], residuals.used[known]
+    largest = max(float(np.abs(errors[used]).max()), 1e-6)
     step = round_step(largest / 3)
     reach = step * math.ceil(largest / step - 1e-9)
     middle = SCATTER / 2
     scale = (middle - 8) / reach
     places = np.clip(errors * scale, 4 - middle, middle - 4)  # a miss may lie far outside
     dots: dict[bool, list[tuple[float, float, float, str]]] = {True: [], False: []}
-    for name, (x, y, z), used in zip(residuals.names, places.tolist(), residuals.used.tolist(), strict=True):
-        dots[used].append((middle + x, middle - y, middle - z, name))
-    horizontal = np.hypot(errors[residuals.used, 0], errors[residuals.used, 1])
+    names = [name for name, shown in zip(residuals.names, known, strict=True) if shown]
+    for name, (x, y, z), kept in zip(names, places.tolist(), used.tolist(), strict=True):
+        dots[kept].append((middle + x, middle - y, middle - z, name))
+    horizontal = np.hypot(errors[used, 0], errors[used, 1])
     return Scatter(
         title=residuals.title,
         description=f"Residuals in plan, the largest {horizontal.max():.3f} {unit} long, and their heights beside.",

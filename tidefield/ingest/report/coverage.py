@@ -15,7 +15,7 @@ FINER = 4  # the outline is traced on a raster so many times finer, as it runs t
 SMALLEST_HOLE = 12  # cells; smaller parts and holes of the outline are left out
 SAME_PLACE = 0.02  # of the height: photographs nearer than this were taken from one place
 PARALLEL_DEG = 30.0
-Polygon = Float64[np.ndarray, "K 2"]
+Polygon = Float64[np.ndarray, "_ 2"]
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,10 @@ def overlap(
         order: photographs in the order of the flight, which says where it was heading.
         height: of the flight above ground.
     """
+    hulls = [_hull(outline) for outline in footprints]
     heading = _headings(position[:, :2], order)
     forward, side = np.full(len(position), np.nan), np.full(len(position), np.nan)
-    for i in np.flatnonzero([len(outline) > 0 for outline in footprints]):
+    for i in np.flatnonzero([len(hull) > 0 for hull in hulls]):
         offset = position[:, :2] - position[i, :2]
         along, across = offset @ heading[i], offset @ [-heading[i, 1], heading[i, 0]]
         distance = np.hypot(along, across)
@@ -124,11 +125,11 @@ def overlap(
         candidate = parallel & (distance > SAME_PLACE * height)
         ahead = candidate & (np.abs(along) > np.abs(across))
         near = [_nearest(distance, ahead & (along > 0)), _nearest(distance, ahead & (along < 0))]
-        shares = [_shared(footprints[i], footprints[j]) for j in near if j is not None]
+        shares = [_shared(hulls[i], hulls[j]) for j in near if j is not None]
         forward[i] = max(shares, default=np.nan)
         beside = _nearest(distance, candidate & ~ahead)
         if beside is not None:
-            side[i] = _shared(footprints[i], footprints[beside])
+            side[i] = _shared(hulls[i], hulls[beside])
     return Overlap(forward, side)
 
 
@@ -152,9 +153,31 @@ def _nearest(distance: Float64[np.ndarray, " N"], among: np.ndarray) -> int | No
 
 
 def _shared(one: Polygon, other: Polygon) -> float:
-    """Share of one footprint, as a convex outline, that another one covers."""
-    if not len(other):
-        return 0.0
-    middle = one.mean(0)
-    hulls = [cv2.convexHull((polygon - middle).astype(np.float32)[:, None]) for polygon in (one, other)]
-    return cv2.intersectConvexConvex(*hulls)[0] / cv2.contourArea(hulls[0])
+    """Share of one convex outline that another one covers."""
+    rest = one
+    # Cut off what lies outside each edge in turn (Sutherland and Hodgman); OpenCV's own errs where edges coincide.
+    for start, end in zip(other, np.roll(other, -1, axis=0), strict=True):
+        rest = _left_of(rest, start, end - start)
+        if len(rest) < 3:
+            return 0.0
+    return min(signed_area(rest) / signed_area(one), 1.0)
+
+
+def _hull(polygon: Polygon) -> Polygon:
+    """The convex hull, counter-clockwise."""
+    if not len(polygon):
+        return polygon
+    near_zero = (polygon - polygon[0]).astype(np.float32)
+    hull = polygon[cv2.convexHull(near_zero[:, None], returnPoints=False)[:, 0]]
+    return hull if signed_area(hull) > 0 else hull[::-1]
+
+
+def _left_of(polygon: Polygon, start: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"]) -> Polygon:
+    """The part of a convex polygon to the left of a line."""
+    following = np.roll(polygon, -1, axis=0)
+    side = along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0])
+    next_side = np.roll(side, -1)
+    crosses = side * next_side < 0
+    share = np.where(crosses, side / np.where(crosses, side - next_side, 1), 0)[:, None]
+    corners = np.stack([polygon, polygon + share * (following - polygon)], axis=1).reshape(-1, 2)
+    return corners[np.stack([side >= 0, crosses], axis=1).ravel()]

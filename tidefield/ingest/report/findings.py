@@ -22,9 +22,9 @@ class Residuals:
         kind: receiver positions of the cameras; control points that the model was fitted to; points held out of that.
         title: what is compared, in words, such as "Control points, each left out in turn".
         names: photographs or points.
-        east_north_up_m: found minus stated.
+        east_north_up_m: found minus stated; NaN where nothing was found.
         stated_world: where they are said to be.
-        used: whether each took part in the statistics; the others were found to be wrong.
+        used: whether each took part in the statistics; the others were found to be wrong, or not at all.
         remarks: whole sentences, such as which marks were left out and why.
     """
 

@@ -93,7 +93,7 @@ def round_step(least: float) -> float:
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= least * (1 - 1e-9))
 
 
-def spaced(value: float, digits: int = 0) -> str:
+def spaced(value: float | int, digits: int = 0) -> str:
     """A number with narrow spaces between its thousands and a true minus."""
     return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "\u2212")
 

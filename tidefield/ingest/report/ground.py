@@ -118,12 +118,12 @@ def _border_directions(camera) -> Float64[np.ndarray, "K 3"]:
 
 def _meet(
     ground: Ground, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "K 3"], reach: float
-) -> Float64[np.ndarray, "K 3"]:
+) -> Float64[np.ndarray, "_ 3"]:
     """Where rays meet the ground first, or where they end; nothing if none of them goes down."""
     fall = directions[:, :2] @ ground.plane[:2] - directions[:, 2]  # towards the plane, per unit of length
     if not (fall > 1e-6).any():
         return np.zeros((0, 3))
-    start = ground.above_plane(origin)
+    start = ground.above_plane(origin[None])[0]
     with np.errstate(divide="ignore"):
         enter = np.where(fall > 1e-6, (start - ground.residual.max()) / fall, np.inf).clip(0, reach)
         leave = np.where(fall > 1e-6, (start - ground.residual.min()) / fall, np.inf).clip(0, reach)

@@ -83,7 +83,7 @@ class SurveyMap:
 def draw_map(findings: Findings, statistics: Statistics) -> SurveyMap:
     """Lay the map out."""
     coverage, order, position = statistics.coverage, statistics.order, statistics.block.position[:, :2]
-    lost = _lost(findings, Sheet(coverage.corner, coverage.far_corner, 1, 0, 0))
+    lost = _lost(findings, Sheet(coverage.corner, coverage.far_corner, 1.0, 0.0, 0.0))
     sheet = _sheet(findings, statistics, lost)
     size = (sheet.high - sheet.low) * sheet.scale
     (west, south), (east, north) = sheet.at(np.stack([coverage.corner, coverage.far_corner])).tolist()

@@ -38,8 +38,8 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
         "reconstruction_statistics": _reconstruction(findings, statistics, bool(gps)),
         "camera_errors": {camera["name"]: camera["opensfm"] for camera in lenses(statistics)},
         "odm_processing_statistics": {
-            "total_time": sum(findings.seconds.values()),
-            "total_time_human": duration(sum(findings.seconds.values())),
+            "total_time": sum(findings.seconds.values(), 0.0),
+            "total_time_human": duration(sum(findings.seconds.values(), 0.0)),
             # ODM's unit; without a scale there is none.
             "average_gsd": 100 * _mean(statistics.gsd) if findings.frame else None,
         },
@@ -73,7 +73,7 @@ def _processing(findings: Findings, statistics: Statistics) -> Numbers:
     start, end = _capture(findings)
     size = np.ptp(statistics.block.position[:, :2], axis=0)
     return {
-        "steps_times": findings.seconds | {"Total Time": sum(findings.seconds.values())},
+        "steps_times": findings.seconds | {"Total Time": sum(findings.seconds.values(), 0.0)},
         "date": findings.date.strftime(_OPENSFM_TIME),
         "start_date": start.strftime(_OPENSFM_TIME) if start else "unknown",
         "end_date": end.strftime(_OPENSFM_TIME) if end else "unknown",

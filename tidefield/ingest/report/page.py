@@ -44,6 +44,7 @@ def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
     template = environment.get_template("page.html")
     return template.render(
         n=numbers,
+        made=f"{findings.date:%Y-%m-%d %H:%M} {findings.date.tzname() or ''}".strip(),
         ours=numbers["tidefield"],
         located=findings.frame is not None,
         map=draw_map(findings, statistics),
@@ -59,23 +60,23 @@ def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
 def _formats(located: bool) -> dict[str, Callable[..., Any]]:
     """Filters that write numbers, each inside a `data` element with the value that report.json holds."""
 
-    def written(value: float | None, text: Callable[[float], str]) -> str | Markup:
+    def written(value: float | int | None, text: Callable[[float], str]) -> str | Markup:
         if value is None:
             return UNKNOWN
         return Markup('<data value="{}">{}</data>').format(repr(value), text(value))
 
-    def number(value: float | None, digits: int = 0) -> str | Markup:
+    def number(value: float | int | None, digits: int = 0) -> str | Markup:
         return written(value, lambda v: spaced(v, digits))
 
-    def metres(value: float | None, digits: int = 2, unit: bool = True) -> str | Markup:
+    def metres(value: float | int | None, digits: int = 2, unit: bool = True) -> str | Markup:
         ending = ("\u00a0m" if located else "\u00a0units") * unit
         return written(value, lambda v: (spaced(v, digits) if located else f"{v:.3g}") + ending)
 
-    def gsd(value: float | None, unit: bool = True) -> str | Markup:
+    def gsd(value: float | int | None, unit: bool = True) -> str | Markup:
         ending = ("\u00a0cm/px" if located else "\u00a0units/px") * unit
         return written(value, lambda v: (_significant(100 * v) if located else f"{v:.3g}") + ending)
 
-    def area(value: float | None) -> str | Markup:
+    def area(value: float | int | None) -> str | Markup:
         def text(v: float) -> str:
             if not located:
                 return f"{v:.3g} square units"
