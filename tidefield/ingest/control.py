@@ -16,11 +16,12 @@ import numpy as np
 
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import parse_crs
-from tidefield.ingest.crs import read_crs, to_wgs84
+from tidefield.ingest.crs import read_crs
 from tidefield.ingest.gps_files import split_name
 from tidefield.ingest.names import Names, read_text, some
 from tidefield.ingest.pictures import upright_size, upright_uv
 from tidefield.ingest.survey import Control, Mark, Photograph
+from tidefield.ingest.which_crs import refuse_elsewhere
 
 CONTROL_FILES = ("gcp_list.txt",)
 """Found beside the photographs by themselves."""
@@ -28,8 +29,6 @@ CONTROL_FILES = ("gcp_list.txt",)
 _EXPECTED_LINE = "expected `x y z px py image [point]`"
 _SAME_POINT_M = 0.001
 _METRES_PER_DEGREE = 111_000.0
-# Control farther from the photographs than this is in another system than its header says, or of another place.
-_FAR_M = 20_000.0
 _OUTSIDE_AT_MOST = 0.5
 
 
@@ -63,12 +62,16 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     marks, outside = _upright_marks(path, named, by_name)
     used = {mark.point for mark in marks}
     points = {point: line.xyz for point, _, line in named if point in used}
-    _refuse_far(path, crs, points, photographs)
+    control = Control(crs, points, tuple(marks))
+    positions = [photograph.position for photograph in photographs if photograph.position is not None]
+    if positions:
+        middle = np.median([(position.longitude_deg, position.latitude_deg) for position in positions], axis=0)
+        refuse_elsewhere(control, *middle.tolist())
     remarks = []
     if missing:
         remarks.append(f"{path.name} marks points in photographs that are not there (left out): {some(missing)}.")
     remarks += [f"{path.name}: {reason} and is left out." for reason in outside]
-    return Control(crs, points, tuple(marks)), remarks
+    return control, remarks
 
 
 def _lines(path: Path, text: str, header: str) -> Iterator[_Line]:
@@ -155,23 +158,3 @@ def _upright_marks(
             "expected pixels of these files; if the photographs were reduced since, divide the marks by as much"
         )
     return list(marks.values()), outside
-
-
-def _refuse_far(
-    path: Path, crs: str, points: dict[str, tuple[float, float, float]], photographs: Sequence[Photograph]
-) -> None:
-    """Raises: SurveyError where the points, taken for coordinates in `crs`, are far from the photographs."""
-    positions = [p.position for p in photographs if p.position is not None]
-    lonlat = to_wgs84(crs, np.array([xyz[:2] for xyz in points.values()]))
-    wrong = f"expected the control of this survey, in the system of the first line ({crs}); correct one of them"
-    if not np.isfinite(lonlat).all():
-        first = next(iter(points.values()))
-        raise SurveyError(f"{path} has points such as {first} that its system does not reach: {wrong}")
-    if not positions:
-        return
-    middle = np.median([(p.longitude_deg, p.latitude_deg) for p in positions], axis=0)
-    east, north = np.median(lonlat, axis=0) - middle
-    east = (east + 180) % 360 - 180
-    away_m = _METRES_PER_DEGREE * math.hypot(north, east * math.cos(math.radians(middle[1])))
-    if away_m > _FAR_M:
-        raise SurveyError(f"{path} puts its points {away_m / 1000:.0f} km from the photographs: {wrong}")

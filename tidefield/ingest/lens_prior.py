@@ -93,7 +93,7 @@ def _size_of_original(metadata: Metadata, width: int, height: int) -> tuple[floa
     sides = metadata.number(ExifTags.Base.ExifImageWidth), metadata.number(ExifTags.Base.ExifImageHeight)
     shape = max(sides) / min(sides), max(width, height) / min(width, height)
     if not math.isclose(*shape, rel_tol=0.02):  # absent, or of a picture cut otherwise
-        return width, height
+        return float(width), float(height)
     return (max(sides), min(sides)) if width >= height else (min(sides), max(sides))
 
 
@@ -159,7 +159,7 @@ def _uncut(width: int, height: int, shape: float) -> tuple[float, float]:
     Wider pictures (16:9) are cut above and below, narrower ones left and right, but for those of 5:4: there are
     sensors of that shape.
     """
-    across, up = max(width, height), min(width, height)
+    across, up = float(max(width, height)), float(min(width, height))
     if across / up > shape:
         return across, across / shape
     return (across, up) if abs(across / up - 5 / 4) < 0.03 else (up * shape, up)

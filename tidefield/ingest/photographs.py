@@ -17,7 +17,7 @@ from tidefield.ingest.control import CONTROL_FILES, read_control
 from tidefield.ingest.gps_files import GPS_FILES, read_gps_file
 from tidefield.ingest.lens_prior import lens_prior
 from tidefield.ingest.names import Names, find_file, folded, some
-from tidefield.ingest.pictures import opened, refuse_truncated, upright_size
+from tidefield.ingest.pictures import opened, refuse_truncated, stored_size, upright_size
 from tidefield.ingest.positions import drop_astray, drop_impossible
 from tidefield.ingest.survey import Photograph, Survey
 
@@ -134,7 +134,7 @@ def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
     try:
         with opened(path) as picture:
             found = tags.read_metadata(picture)
-            width, height = picture.size
+            width, height = stored_size(picture)
             refuse_truncated(path, picture)
     except SurveyError as error:
         return str(error)

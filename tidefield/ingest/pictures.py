@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 from collections.abc import Callable, Iterator
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Shaped, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from tidefield.errors import SurveyError
@@ -28,7 +29,10 @@ _READERS: dict[bytes, Callable[[str], Image.Image]] = {
     b"II+\0": TiffImagePlugin.TiffImageFile,
     b"MM\0+": TiffImagePlugin.TiffImageFile,
 }
-_DAMAGES = (OSError, SyntaxError, ValueError, KeyError, IndexError, TypeError, EOFError, struct.error)
+_DAMAGES = (
+    *(OSError, SyntaxError, ValueError, KeyError, IndexError, TypeError, EOFError, struct.error),
+    Image.DecompressionBombError,  # of TIFFs, whose reader has a limit of its own
+)
 
 _TIFF_PARTS = ((273, 324), (279, 325))  # tags of where a TIFF's strips or tiles start, and of how long they are
 
@@ -59,10 +63,9 @@ def opened(path: Path) -> Iterator[Image.Image]:
         if reader is None:
             raise ValueError("it is empty" if not start else "it is no JPEG, PNG or TIFF, whatever its name says")
         with reader(str(path)) as picture:
-            if picture.width * picture.height > PIXELS_AT_MOST:
-                raise ValueError(
-                    f"it has {picture.width} x {picture.height} pixels, more than {PIXELS_AT_MOST // 10**6} million"
-                )
+            width, height = picture.size
+            if width * height > PIXELS_AT_MOST:
+                raise ValueError(f"it has {width} x {height} pixels, more than {PIXELS_AT_MOST // 10**6} million")
             yield picture
     except _DAMAGES as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
@@ -99,6 +102,13 @@ def _start_of_scan(content: mmap.mmap) -> int:
     return at
 
 
+def stored_size(picture: Image.Image) -> tuple[int, int]:
+    """Width and height of an opened picture as its file has it, before EXIF's orientation is applied."""
+    if isinstance(picture, TiffImagePlugin.TiffImageFile):  # may be turned already
+        return int(picture.tag_v2[256]), int(picture.tag_v2[257])
+    return picture.size
+
+
 def upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
     """Size of a photograph stored with `width` and `height` once it stands upright."""
     return (height, width) if orientation >= 5 else (width, height)
@@ -128,7 +138,7 @@ def upright(photograph: Photograph) -> UInt8[np.ndarray, "H W 3"]:
         SurveyError: it cannot be decoded whole.
     """
     with opened(photograph.path) as picture:
-        return _turned(np.asarray(_rgb(picture)), photograph.orientation)
+        return _turned(_rgb(picture), picture, photograph.orientation)
 
 
 def thumbnail(photograph: Photograph, side_px: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -138,13 +148,15 @@ def thumbnail(photograph: Photograph, side_px: int) -> UInt8[np.ndarray, "H W 3"
         SurveyError: it cannot be decoded whole.
     """
     with opened(photograph.path) as picture:
-        scale = min(1.0, side_px / max(picture.size))
-        size = max(1, round(picture.width * scale)), max(1, round(picture.height * scale))
-        picture.draft("RGB", size)  # only JPEG can; it gives the next size up that costs less
+        scale = side_px / max(picture.size)
+        # Only JPEG can: it decodes the next size up that costs less.
+        picture.draft("RGB", (math.ceil(picture.width * scale), math.ceil(picture.height * scale)))
         reduced = _rgb(picture)
-        if reduced.size != size:
+        scale = side_px / max(reduced.size)
+        if scale < 1:
+            size = max(1, round(reduced.width * scale)), max(1, round(reduced.height * scale))
             reduced = reduced.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-        return _turned(np.asarray(reduced), photograph.orientation)
+        return _turned(reduced, picture, photograph.orientation)
 
 
 def _rgb(picture: Image.Image) -> Image.Image:
@@ -159,7 +171,11 @@ def _rgb(picture: Image.Image) -> Image.Image:
     return picture.convert("RGB")
 
 
-def _turned(pixels: Shaped[np.ndarray, "h w 3"], orientation: int) -> Shaped[np.ndarray, "H W 3"]:
+def _turned(rgb: Image.Image, picture: Image.Image, orientation: int) -> UInt8[np.ndarray, "H W 3"]:
+    """The pixels of a decoded picture, stood up."""
+    pixels = np.asarray(rgb)
+    if isinstance(picture, TiffImagePlugin.TiffImageFile):  # Pillow has turned these while decoding
+        return np.array(pixels)
     if orientation >= 5:
         pixels = pixels.transpose(1, 0, 2)
     mirrored_x, mirrored_y = upright_rotation(orientation).sum(axis=1) < 0

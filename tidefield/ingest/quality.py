@@ -50,12 +50,12 @@ class Verdict:
     """What was found of one photograph.
 
     Attributes:
-        photograph: its name.
+        name: of the photograph.
         measures: None if it cannot be decoded; then it is left out whatever is asked for.
         left_out: why it should be, in a sentence with the measure and its limit; None if it should be kept.
     """
 
-    photograph: str
+    name: str
     measures: Measures | None
     left_out: str | None
 
@@ -105,7 +105,7 @@ def keep(survey: Survey, verdicts: Sequence[Verdict], keep_all: bool = False) ->
         SurveyError: fewer than three photographs are left.
     """
     out = [v for v in verdicts if v.measures is None or (v.left_out is not None and not keep_all)]
-    names = {verdict.photograph for verdict in out}
+    names = {verdict.name for verdict in out}
     photographs = tuple(photograph for photograph in survey.photographs if photograph.name not in names)
     if len(photographs) < FEWEST:
         kinds = Counter((verdict.left_out or "").partition(":")[0] for verdict in out)
@@ -114,7 +114,7 @@ def keep(survey: Survey, verdicts: Sequence[Verdict], keep_all: bool = False) ->
         hint = "" if keep_all else ", or keep them all the same with --keep-all"
         raise SurveyError(
             f"{len(photographs)} of the {len(verdicts)} photographs in {survey.folder} can be used ({counted}; such as "
-            f"{first.photograph}, {first.left_out}): expected at least {FEWEST}; take them again{hint}"
+            f"{first.name}, {first.left_out}): expected at least {FEWEST}; take them again{hint}"
         )
     control = survey.control
     if control is not None:
