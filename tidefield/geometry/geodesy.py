@@ -64,7 +64,7 @@ class LocalFrame:
             degrees = np.rad2deg(_radians_per_unit(_base(system)))
             products = _utm(origin[0] * degrees, origin[1] * degrees, system)
         name = _name(products)
-        known = vertical_datum or _vertical_name(system) or f"that of heights given with {parse_crs(name).name}"
+        known = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
         frame = cls(0.0, 0.0, 0.0, name, known)
         longitude, latitude, height = frame._geodetic(_name(system), np.array([origin], dtype=np.float64))[0]
         return cls(float(longitude), float(latitude), float(height), frame.crs, known)
@@ -253,11 +253,12 @@ def utm_zone(longitude_deg: float, latitude_deg: float) -> str:
 def _utm(longitude_deg: float, latitude_deg: float, geographic: CRS) -> CRS:
     """The UTM zone of a place, on the datum of a geographic system where it is defined and on WGS 84 otherwise."""
     zone = utm_zone(longitude_deg, latitude_deg)
-    for datum in (_base(geographic).name, "WGS 84"):
-        code = next((i.code for i in query_utm_crs_info(datum) if i.name == f"{datum} / UTM zone {zone}"), None)
-        if code is not None:
-            return CRS.from_epsg(code)
-    raise AssertionError(f"WGS 84 has no UTM zone {zone}")
+    datum = _base(geographic).name
+    code = (32600 if zone.endswith("N") else 32700) + int(zone[:-1])
+    if datum != "WGS 84":
+        own = (i.code for i in query_utm_crs_info(datum) if i.name == f"{datum} / UTM zone {zone}")
+        code = next(own, code)
+    return CRS.from_epsg(code)
 
 
 def _name(crs: CRS) -> str:

@@ -205,23 +205,23 @@ def _refuse_mirrored(
 ) -> None:
     """An error for positions that mirror the survey, which is so when something simple makes them fit."""
     given = positions.longitude_latitude_height
-    mirrored = {
+    mended = {
         "latitude and longitude are swapped": given[:, [1, 0, 2]],
-        "longitude has the wrong sign": given * [-1, 1, 1],
-        "latitude has the wrong sign": given * [1, -1, 1],
+        "the sign of one of the two is wrong": given * [-1, 1, 1],
     }
-    for what, places in mirrored.items():
+    for what, places in mended.items():
         possible = np.abs(places[:, 1]) < 90
         if np.count_nonzero(possible) < 3:
             continue
         longitude, latitude = np.median(places[possible], axis=0)[:2]
         frame = LocalFrame.at(WGS84, (float(longitude), float(latitude), 0.0))
-        _, mended = _upright(centres_model[possible], frame.from_geographic(places[possible]), down)
-        if mended < _MIRRORED * median:
+        _, least = _upright(centres_model[possible], frame.from_geographic(places[possible]), down)
+        if least < _MIRRORED * median:
             raise SurveyError(
                 f"the positions of the photographs (latitude {positions.middle[1]:.5f}, longitude "
-                f"{positions.middle[0]:.5f}) mirror what the photographs show: {what}; expected latitude "
-                f"{latitude:.5f}, longitude {longitude:.5f}; correct them where they were given"
+                f"{positions.middle[0]:.5f}) mirror what the photographs show: {what}; "
+                "expected latitude, counted positive to the north, and longitude, to the east; correct them where they "
+                "were given"
             )
 
 

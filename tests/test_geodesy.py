@@ -1,0 +1,170 @@
+"""Local metres: against pyproj's own transformations, there and back, and against distances on the ellipsoid."""
+
+import json
+
+import numpy as np
+import pytest
+from pyproj import Geod, Transformer
+
+from tidefield.geometry.geodesy import LocalFrame, parse_crs, utm_zone
+
+BNG_PROJ4 = (
+    "+proj=tmerc +lat_0=49 +lon_0=-2 +k=0.9996012717 +x_0=400000 +y_0=-100000 +ellps=airy "
+    "+towgs84=446.448,-125.157,542.06,0.15,0.247,0.842,-20.489 +units=m +no_defs"
+)
+PLACES = {
+    "EPSG:27700": (351139.0, 512875.0, 264.0),
+    "EPSG:7405": (351139.0, 512875.0, 264.0),
+    "EPSG:32756": (333000.0, 6256000.0, 10.0),
+    "EPSG:2193": (1600000.0, 5400000.0, 5.0),
+    "EPSG:2056": (2600000.0, 1200000.0, 500.0),
+    "EPSG:2263": (1000000.0, 200000.0, 30.0),
+    "EPSG:2263+6360": (1000000.0, 200000.0, 100.0),
+    "EPSG:27572": (600000.0, 2400000.0, 30.0),
+    "EPSG:4326": (-2.75, 54.5, 100.0),
+    "EPSG:4807": (0.0, 50.0, 3.0),
+    BNG_PROJ4: (351139.0, 512875.0, 264.0),
+}
+
+
+def somewhere(extent_m: float = 500.0) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (50, 3)) * (extent_m, extent_m, 100)
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_the_way_to_a_system_and_back_is_exact_and_begins_at_the_origin(crs):
+    frame = LocalFrame.at(crs, PLACES[crs])
+    np.testing.assert_allclose(frame.from_crs(frame.to_crs(somewhere())), somewhere(), atol=1e-6)
+    origin = frame.to_crs(np.zeros((1, 3)))
+    if parse_crs(crs).is_projected:
+        np.testing.assert_allclose(origin[0], PLACES[crs], atol=1e-6)
+    np.testing.assert_allclose(frame.from_system(crs, np.array([PLACES[crs]])), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_gps_and_back_is_exact_to_a_centimetre_and_leaves_heights_alone(crs):
+    frame = LocalFrame.at(crs, PLACES[crs])
+    there = frame.to_geographic(somewhere())
+    np.testing.assert_allclose(frame.from_geographic(there), somewhere(), atol=0.01)
+    np.testing.assert_allclose(there[:, 2].mean(), frame.height_m, atol=20)
+
+
+@pytest.mark.parametrize("crs", [crs for crs in PLACES if parse_crs(crs).is_projected])
+def test_gps_becomes_what_pyproj_makes_of_it(crs):
+    frame = LocalFrame.at(crs, PLACES[crs])
+    longitude, latitude, height = frame.to_geographic(somewhere()).T
+    horizontal = "EPSG:2263" if crs == "EPSG:2263+6360" else "EPSG:27700" if crs == "EPSG:7405" else crs
+    expected = Transformer.from_crs("EPSG:4326", horizontal, always_xy=True).transform(longitude, latitude)
+    found = frame.to_crs(frame.from_geographic(np.column_stack([longitude, latitude, height])))
+    np.testing.assert_allclose(found[:, :2], np.column_stack(expected), atol=0.01)
+
+
+def test_the_world_is_tangent_to_the_ellipsoid_that_pyproj_has():
+    frame = LocalFrame.at("EPSG:32630", (516190.0, 6039183.0, 100.0))
+    to_earth = Transformer.from_crs("EPSG:32630", "EPSG:4979", always_xy=True)
+    earth = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    grid = frame.to_crs(somewhere())
+    longitude, latitude, _ = to_earth.transform(516190.0, 6039183.0, 100.0)
+    u, v = np.deg2rad([longitude, latitude])
+    enu = np.array(
+        [
+            [-np.sin(u), np.cos(u), 0],
+            [-np.sin(v) * np.cos(u), -np.sin(v) * np.sin(u), np.cos(v)],
+            [np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)],
+        ]
+    )
+    x, y, _ = to_earth.transform(*grid.T)
+    away = np.column_stack(earth.transform(x, y, grid[:, 2])) - earth.transform(longitude, latitude, 100.0)
+    np.testing.assert_allclose(away @ enu.T, somewhere(), atol=1e-6)
+
+
+def test_distances_in_the_world_are_those_on_the_ground_and_not_those_on_the_grid():
+    frame = LocalFrame.at("EPSG:27700", (351000.0, 512000.0, 0.0))
+    grid = np.array([[350500.0, 511500.0, 0.0], [351500.0, 512500.0, 0.0]])
+    on_grid = np.linalg.norm(grid[1] - grid[0])
+    on_ground = Geod(ellps="airy").line_length(
+        *Transformer.from_crs("EPSG:27700", "EPSG:4277", always_xy=True).transform(*grid[:, :2].T)
+    )
+    in_world = np.linalg.norm(np.diff(frame.from_crs(grid), axis=0))
+    assert on_ground - on_grid > 0.5
+    np.testing.assert_allclose(in_world, on_ground, atol=1e-3)
+
+
+def test_grid_north_is_turned_from_true_north():
+    frame = LocalFrame.at("EPSG:27700", (351000.0, 512000.0, 0.0))
+    north = frame.from_crs(np.array([[351000.0, 513000.0, 0.0]]))[0]
+    convergence_deg = -np.rad2deg((2.0 - 2.756) / 57.2958 * np.sin(np.deg2rad(54.5)) * -1)  # grid lies west of 2 W
+    assert np.rad2deg(np.arctan2(north[0], north[1])) == pytest.approx(convergence_deg, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "zone"),
+    [
+        (-2.75, 54.5, "30N"),
+        (151.2, -33.8, "56S"),
+        (-180.0, 10.0, "1N"),
+        (179.99, 10.0, "60N"),
+        (180.0, 10.0, "1N"),
+        (5.3, 60.4, "32N"),
+        (2.9, 60.4, "31N"),
+        (5.3, 52.0, "31N"),
+        (15.6, 78.2, "33N"),
+        (8.9, 78.2, "31N"),
+        (21.5, 78.2, "35N"),
+        (34.0, 78.2, "37N"),
+        (-3.0, 78.2, "30N"),
+    ],
+)
+def test_the_utm_zone_chooses_itself(longitude, latitude, zone):
+    assert utm_zone(longitude, latitude) == zone
+    code = (32600 if zone[-1] == "N" else 32700) + int(zone[:-1])
+    assert LocalFrame.at("EPSG:4326", (longitude, latitude, 0.0)).epsg == code
+
+
+def test_the_utm_zone_is_on_the_datum_of_the_coordinates_where_there_is_one():
+    assert LocalFrame.at("EPSG:4258", (10.0, 50.0, 0.0)).epsg == 25832
+    assert LocalFrame.at("EPSG:4277", (-2.75, 54.5, 0.0)).epsg == 32630
+
+
+def test_the_tangent_says_its_largest_error():
+    frame = LocalFrame.at("EPSG:27700", (351200.0, 512900.0, 260.0))
+    corners = np.array([-500.0, -400.0, -20.0]), np.array([500.0, 400.0, 120.0])
+    linear = frame.linear(*corners)
+    inside = np.random.default_rng(0).uniform(*corners, (1000, 3))
+    off = inside @ linear.crs_from_world[:, :3].T + linear.crs_from_world[:, 3] - frame.to_crs(inside)
+    largest = np.linalg.norm(off, axis=1).max()
+    assert 0.5 * linear.largest_error_m < largest <= linear.largest_error_m < 0.05
+    np.testing.assert_allclose(linear.crs_from_world[:, 3], (351200.0, 512900.0, 260.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_a_frame_survives_json(crs):
+    frame = LocalFrame.at(crs, PLACES[crs])
+    again = LocalFrame.from_json(json.loads(json.dumps(frame.to_json())))
+    assert again == frame
+    np.testing.assert_array_equal(again.to_crs(somewhere()), frame.to_crs(somewhere()))
+
+
+def test_a_system_without_a_code_is_kept_in_full():
+    frame = LocalFrame.at(BNG_PROJ4, PLACES[BNG_PROJ4])
+    assert frame.epsg is None
+    assert "Airy" in frame.crs
+    assert LocalFrame.at("+proj=utm +zone=30 +datum=WGS84", (500000.0, 6000000.0, 0.0)).epsg == 32630
+
+
+def test_a_system_with_heights_gives_the_vertical_datum_and_their_unit():
+    assert LocalFrame.at("EPSG:7405", PLACES["EPSG:7405"]).vertical_datum == "ODN height"
+    feet = LocalFrame.at("EPSG:2263+6360", (1000000.0, 200000.0, 100.0))
+    assert feet.height_m == pytest.approx(30.48, abs=1e-3)
+    np.testing.assert_allclose(feet.from_crs(np.array([[1000000.0, 200000.0, 200.0]]))[0], (0, 0, 30.48), atol=1e-3)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:99999", "", "EPSG:5701", "the moon"])
+def test_what_is_no_map_system_is_refused(crs):
+    with pytest.raises(ValueError, match=r"coordinate reference system|neither projected nor geographic"):
+        LocalFrame.at(crs, (0.0, 0.0, 0.0))
+
+
+def test_coordinates_outside_of_a_system_are_refused():
+    with pytest.raises(ValueError, match="outside what the system can hold"):
+        LocalFrame.at("EPSG:27700", (351200.0, 512900.0, 0.0)).from_crs(np.array([[1e9, 1e9, 0.0]]))

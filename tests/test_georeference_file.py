@@ -1,0 +1,76 @@
+"""georeference.json: written whole, read back as it was, and refused when damaged."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tidefield.data.georeference import FILE_NAME, Georeference, LeftOut, Residuals, read_georeference
+from tidefield.errors import SceneError
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
+
+GPS = Residuals(("a.jpg", "b.jpg", "c.jpg"), np.array([[3.0, 4, 1], [0.0, 0, math.nan], [1e5, 0, 0]]))
+FOUND = Georeference(
+    frame=LocalFrame.at("EPSG:27700", (351200.0, 512900.0, 260.0), "Newlyn"),
+    source="ground control",
+    world_from_model=Similarity(42.0, np.eye(3), np.array([1.0, 2, 3])),
+    gps=GPS,
+    control=Residuals(("G1",), np.array([[0.01, 0.02, -0.03]])),
+    check=Residuals(),
+    left_out=(LeftOut("GPS", "c.jpg", "it is 100 km away"),),
+    notes=("A note.",),
+)
+
+
+def test_it_comes_back_as_it_was(tmp_path):
+    FOUND.write(tmp_path)
+    again = read_georeference(tmp_path)
+    assert again is not None
+    assert (again.frame, again.source, again.left_out, again.notes) == (
+        FOUND.frame,
+        FOUND.source,
+        FOUND.left_out,
+        FOUND.notes,
+    )
+    for kind in ("gps", "control", "check"):
+        assert getattr(again, kind).names == getattr(FOUND, kind).names
+        np.testing.assert_array_equal(getattr(again, kind).error_m, getattr(FOUND, kind).error_m)
+    np.testing.assert_array_equal(again.world_from_model.translation, [1, 2, 3])
+
+
+def test_figures_are_of_what_is_known_and_was_used(tmp_path):
+    assert FOUND.gps_used.names == ("a.jpg", "b.jpg")
+    assert FOUND.gps_used.horizontal_rms_m == pytest.approx(math.sqrt(12.5))
+    assert FOUND.gps_used.vertical_rms_m == pytest.approx(1)
+    assert math.isnan(FOUND.check.horizontal_rms_m)
+    np.testing.assert_array_equal(FOUND.gps_used.median_m, [3, 4, 1])
+    FOUND.write(tmp_path)
+    written = json.loads((tmp_path / FILE_NAME).read_text())
+    assert written["residuals"]["gps_used"]["horizontal_rms_m"] == pytest.approx(math.sqrt(12.5))
+    assert written["residuals"]["check"]["horizontal_rms_m"] is None
+    assert written["frame"]["epsg"] == 27700
+
+
+def test_a_scene_without_one_has_none(tmp_path):
+    assert read_georeference(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "[]",
+        lambda text: text.replace('"version": 1', '"version": 2'),
+        lambda text: text.replace('"ground control"', '"hearsay"'),
+        lambda text: text.replace("EPSG:27700", "EPSG:1"),
+        lambda text: text.replace('"rotation"', '"turn"'),
+    ],
+)
+def test_a_damaged_one_is_refused(tmp_path, change):
+    FOUND.write(tmp_path)
+    path = tmp_path / FILE_NAME
+    path.write_text(change(path.read_text()))
+    with pytest.raises(SceneError, match="is damaged"):
+        read_georeference(tmp_path)
