@@ -7,6 +7,7 @@ cannot tell: a longer lens is a higher flight, but not with points at two height
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -24,8 +25,12 @@ REPEATS = 4
 """How often each mark counts. A matched point is as well seen as a mark, but its errors are shared with its neighbours'
 (the lens, the shutter), which the sum of squares does not know; repeats stand for that."""
 _FOLDS = 12
+_FOLDS_OF_LARGE = 4
+_LARGE = 300  # photographs
 _CHECK_POINTS = 20_000
-_CHECK_POINTS_PER_IMAGE = 100
+_CHECK_POINTS_PER_IMAGE = 40
+_IMAGES_OF_A_LENS = 8
+"""A lens that took fewer photographs stays as it is."""
 _STEPS = 50
 
 
@@ -54,18 +59,20 @@ def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap
         lens: "held" as it is; "freed" adjusts focal length, principal point and distortion too, of OpenCV's model.
     """
     copy = pycolmap.Reconstruction(model)
-    if lens == "freed":
-        for camera in copy.cameras.values():
-            _generalise(camera)
     config = pycolmap.BundleAdjustmentConfig()
     for number in copy.reg_image_ids():
         config.add_image(number)
+    taken = Counter(copy.image(number).camera_id for number in copy.reg_image_ids())
+    for number, camera in copy.cameras.items():
+        if lens == "freed" and taken[number] >= _IMAGES_OF_A_LENS:
+            _generalise(camera)
+        elif taken[number]:
+            config.set_constant_cam_intrinsics(number)
     for name, surveyed in marks.points.items():
         config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.refine_sensor_from_rig = False, False
-    freed = lens == "freed"
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = freed
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = True
     solver = options.ceres.solver_options
     solver.max_num_iterations, solver.function_tolerance = _STEPS, 1e-7
     options.ceres.solver_options = solver
@@ -90,8 +97,8 @@ def leave_one_out(
 ) -> Checks:
     """Adjust without each control point in turn, and see where its marks then put it.
 
-    With more than a dozen points a twelfth of them is left out at a time. Large models are thinned: the answer is the
-    same but for what fewer matches hold less well.
+    With more than a dozen points a twelfth of them is left out at a time, of more than 300 photographs a quarter. Large
+    models are thinned: the answer is the same but for what fewer matches hold less well.
 
     Args:
         model: in the world, not yet adjusted to any of the points.
@@ -99,7 +106,8 @@ def leave_one_out(
     """
     surveyed = marks.points
     seen = [name for name in surveyed if np.count_nonzero(marks.of(name)) >= 2]
-    folds = [fold for fold in (seen[start::_FOLDS] for start in range(_FOLDS)) if fold]
+    count = _FOLDS if model.num_reg_images() <= _LARGE else _FOLDS_OF_LARGE
+    folds = [fold for fold in (seen[start::count] for start in range(count)) if fold]
     names, errors = [], []
     thinned = _thinned(model)
     for done, fold in enumerate(folds):
