@@ -61,7 +61,10 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     named, missing = _in_photographs(path, lines, Names(by_name), _same_place(crs))
     marks, outside = _upright_marks(path, named, by_name)
     used = {mark.point for mark in marks}
-    points = {point: line.xyz for point, _, line in named if point in used}
+    points: dict[str, tuple[float, float, float]] = {}
+    for point, _, line in named:
+        if point in used:
+            points.setdefault(point, line.xyz)
     control = Control(crs, points, tuple(marks))
     positions = [photograph.position for photograph in photographs if photograph.position is not None]
     if positions:
