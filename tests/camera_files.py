@@ -31,7 +31,7 @@ def texture(size: tuple[int, int], seed: int = 0) -> np.ndarray:
     generator = np.random.default_rng(seed)
     spectrum = np.fft.rfft2(generator.normal(size=(height, width)))
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
-    spectrum /= np.maximum(frequency, 1 / max(size)) ** 1.4
+    spectrum /= np.maximum(frequency, 1 / max(size)) ** 1.2
     spectrum[0, 0] = 0
     levels = np.fft.irfft2(spectrum, (height, width))
     levels = 110 + 35 * levels / levels.std()

@@ -21,6 +21,7 @@ AGREE = 0.6
 _NEAR_M = 3.0  # or this part of the height of flight; receivers are no better
 _NEAR_OF_HEIGHT = 0.05
 _IN_SEQUENCE = 3
+_COARSE = 16, 12
 _ALIKE = 0.5  # correlation of the coarse pictures that makes it worth looking, whatever the positions
 
 
@@ -33,7 +34,7 @@ def duplicates(
     those that look alike from afar.
     """
     outlines = [np.zeros((16, 16), np.int8) if outline is None else outline for outline in outlines]
-    coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(len(outlines), -1)
+    coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(-1, _COARSE[0] * _COARSE[1])
     order = sorted(range(len(photographs)), key=lambda i: (-(sharpness[i] if sharpness[i] > 0 else 0.0), i))
     by_time = sorted(range(len(photographs)), key=lambda i: (_time(photographs[i]), photographs[i].name))
     rank = np.argsort(np.array(by_time, dtype=np.int64))
@@ -73,7 +74,7 @@ def _twin(index: int, others: Sequence[int], outlines: Sequence[np.ndarray]) -> 
 
 def _coarse(outline: Int8[np.ndarray, "h w"]) -> Float32[np.ndarray, " 192"]:
     """A picture so small that a shift by a fiftieth does not matter, of unit length."""
-    small = cv2.resize(outline.astype(np.float32), (16, 12), interpolation=cv2.INTER_AREA).ravel()
+    small = cv2.resize(outline.astype(np.float32), _COARSE, interpolation=cv2.INTER_AREA).ravel()
     small = small - small.mean()
     return small / max(float(np.linalg.norm(small)), 1e-6)  # a flat one is like none
 

@@ -23,7 +23,7 @@ _NEAR, _FAR = 1, 8
 _BLOCK = 48
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _TEXTURED = 4.0  # mean squared difference (levels squared) from which on a block has texture to judge by
-_ABOVE_NOISE = 8.0  # or as many times the noise's variance
+_ABOVE_NOISE = 20.0  # or as many times the noise's variance
 _TEXTURED_AT_LEAST = 0.02
 _SHARPEST = 90
 # Immerkaer, Fast Noise Variance Estimation, 1996: blind to planes and straight edges.
@@ -44,7 +44,8 @@ class Measures:
         brightness: median.
         highlights: 95th percentile of brightness.
         light: median of the linear light, 1 is white.
-        clipped: share of pixels with at least two of the three colours at white.
+        clipped: share of pixels with at least one of the three colours at its upper end.
+        white: share of pixels with at least two of them there, which leave no detail.
         contrast: between the 1st and the 99th percentile, of the picture reduced to where noise averages out.
         sky: share of the picture that is a smooth bright region along the whole upper edge.
     """
@@ -54,6 +55,7 @@ class Measures:
     highlights: float
     light: float
     clipped: float
+    white: float
     contrast: float
     sky: float
 
@@ -66,12 +68,14 @@ def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Int8[np.ndarr
     small = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     low, high = np.percentile(small, (1, 99))
     median, highlights = np.percentile(grey, (50, 95))
+    clipped = (pixels >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
     measures = Measures(
         sharpness=sharpness(grey.astype(np.float32)),
         brightness=float(median),
         highlights=float(highlights),
         light=_linear(float(median)),
-        clipped=float(np.mean((pixels >= _CLIPPED).sum(axis=-1, dtype=np.uint8) >= 2)),
+        clipped=float(np.mean(clipped >= 1)),
+        white=float(np.mean(clipped >= 2)),
         contrast=float(high - low),
         sky=_sky(small),
     )

@@ -31,7 +31,8 @@ NEIGHBOURS = 6
 FLAT_CONTRAST = 10.0
 DARK_HIGHLIGHTS = 60.0
 DIM_HIGHLIGHTS, DIM_LIGHT = 80.0, 0.15  # of the neighbours' light
-CLIPPED = 0.2
+WHITE = 0.2
+GLARING_CLIPPED, GLARING_LIGHT = 0.2, 3.5  # times the neighbours' light
 # A blur of six pixels brings sharpness to 0.05 to 0.11, that of a soft lens (0.2) as that of a crisp one (0.5); a blur
 # of three pixels, which a scene survives, to 0.12 and more.
 SOFT, SOFT_OF_NEIGHBOURS, SOFT_OF_SURVEY = 0.11, 0.65, 0.7
@@ -185,14 +186,19 @@ def _flat(measures: Measures) -> str | None:
 
 
 def _exposed(measures: Measures, beside: Sequence[Measures]) -> str | None:
-    if measures.clipped > CLIPPED:
-        return f"over-exposed: {measures.clipped:.0%} of it is white; {CLIPPED:.0%} is the limit."
+    if measures.white > WHITE:
+        return f"over-exposed: {measures.white:.0%} of it is white; {WHITE:.0%} is the limit."
     if measures.highlights < DARK_HIGHLIGHTS:
         return (
             f"under-exposed: 95% of it is darker than level {measures.highlights:.0f} of 255; "
             f"{DARK_HIGHLIGHTS:.0f} is the limit."
         )
     around = float(np.median([other.light for other in beside])) if beside else math.nan
+    if measures.clipped > GLARING_CLIPPED and measures.light > GLARING_LIGHT * around:
+        return (
+            f"over-exposed: {measures.clipped:.0%} of it is clipped, and it has {measures.light / around:.1f} times "
+            f"the light of its {len(beside)} neighbours; {GLARING_CLIPPED:.0%} and {GLARING_LIGHT} times are the limit."
+        )
     if measures.highlights < DIM_HIGHLIGHTS and measures.light < DIM_LIGHT * around:
         return (
             f"under-exposed: it has {measures.light / around:.0%} of the light of its {len(beside)} neighbours; "
