@@ -58,14 +58,13 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
         descriptors = {number: rng.integers(0, 255, (128,)) for number in model.point3D_ids()}
         db.clear_matches()
         db.clear_two_view_geometries()
+        db.clear_descriptors()
         for image in db.read_all_images():
             points = model.image(image.image_id).points2D
             table = np.stack([descriptors.get(p.point3D_id, rng.integers(0, 255, (128,))) for p in points]).astype(
                 np.uint8
             )
             described = pycolmap.FeatureDescriptors(data=table, type=pycolmap.FeatureExtractorType.SIFT)
-            if db.exists_descriptors(image.image_id):
-                db.clear_descriptors()
             db.write_descriptors(image.image_id, described)
         names = sorted(image.name for image in db.read_all_images())
     pairs, calls = [(names[0], names[1]), (names[1], names[2])], []

@@ -1,4 +1,4 @@
-"""The command line: `tidefield import | train | evaluate | render | demo`.
+"""The command line: `tidefield prepare | import | train | evaluate | render | demo`.
 
 Only what is needed to answer --help is imported here; torch and the rest are imported once a command is known.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from tidefield.errors import TidefieldError
-from tidefield.options import Demo, Evaluate, Import, Render, Talk, Train
+from tidefield.options import Demo, Evaluate, Import, Prepare, Render, Talk, Train
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,7 +38,7 @@ def main() -> None:
 def _run() -> None:
     """Understand the command line and do what it says."""
     options = tyro.extras.subcommand_cli_from_dict(
-        {"import": Import, "train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo},
+        {"prepare": Prepare, "import": Import, "train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo},
         prog="tidefield",
         description="New views of tidal flats from drone photographs.",
     )
@@ -46,6 +46,7 @@ def _run() -> None:
     from tidefield import commands
 
     todo = {
+        Prepare: commands.prepare,
         Import: commands.import_project,
         Train: commands.train,
         Evaluate: commands.evaluate,

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pycolmap
 from rich.console import Console
 
 from tidefield.baselines import plane_sweep, sparse_depth
@@ -19,10 +20,16 @@ from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
 from tidefield.ingest import convert
+from tidefield.ingest.features import FeatureOptions
+from tidefield.ingest.findings import findings
+from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.prepare import Wishes
+from tidefield.ingest.prepare import prepare as prepare_scene
+from tidefield.ingest.report import write_report
 from tidefield.meter import Meter
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
-from tidefield.options import Demo, Evaluate, Import, Render, Train
+from tidefield.options import Demo, Evaluate, Import, Prepare, Render, Train
 from tidefield.products.pictures import write_still
 from tidefield.products.trajectory import make_trajectory
 from tidefield.products.video import write_video
@@ -41,6 +48,39 @@ DEFAULT_MINUTES = 10.0
 DEMO_FRAMES = 96
 DEMO_PICTURE = "river_mouths_0033.png"
 """Of the held-out photographs of the built-in scene, the one with a creek, its banks and plants."""
+
+
+def prepare(options: Prepare, console: Console) -> None:
+    """See `tidefield prepare --help`."""
+    if options.control is not None and options.no_control:
+        raise RunError("both --control and --no-control are given: expected one of them; leave one out")
+    survey = read_survey(options.photographs, options.gps, options.control)
+    # Its log tells every step of structure from motion.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.talk.verbose else pycolmap.logging.ERROR)
+    if options.no_control:
+        survey = replace(survey, control=None)
+    for remark in survey.remarks:
+        log.warning(remark)
+    wishes = Wishes(
+        keep_all=options.keep_all,
+        colour=options.colour,
+        features=FeatureOptions(options.feature_width, options.features),
+        redo=options.redo,
+    )
+    prepared = prepare_scene(survey, options.scene, wishes, choose_device(options.device), console)
+    asked = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "talk", "redo")}
+    report = write_report(findings(prepared, options.scene, asked), options.scene)
+    lost = len(survey.photographs) - len(prepared.models[0])
+    console.print(
+        f"{options.scene}: {len(prepared.models[0])} of {len(survey.photographs)} photographs"
+        + (
+            f"; why {lost} are missing, and more, stands in {report.page}"
+            if lost
+            else f"; more stands in {report.page}"
+        ),
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def import_project(options: Import, console: Console) -> None:

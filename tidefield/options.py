@@ -13,6 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 Preset = Literal["swift", "paper"]
 Method = Literal["plane-sweep", "sparse-depth"]
+Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Go on without photographs that the scene names but does not have.")]
 
@@ -106,6 +107,38 @@ class Render:
     overwrite: bool = False
     """Replace files that are there."""
     allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Make a scene of a folder of drone photographs: quality, poses, place on the Earth, colours and a report.
+
+    The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio, gsplat and OpenSplat open it, too. Ctrl-C
+    loses at most the running stage; the same command goes on, and a changed option redoes only what depends on it.
+    """
+
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder with the photographs (JPEG, PNG, TIFF), in sub-folders too."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder for the scene: a new one, or one to go on with."""
+    gps: Path | None = None
+    """Positions of the photographs (gps.csv or ODM's geo.txt), instead of EXIF's; without it, such a file beside the
+    photographs is used where EXIF has none."""
+    control: Path | None = None
+    """Ground control (ODM's gcp_list.txt); without it, such a file beside the photographs is used."""
+    no_control: Annotated[bool, arg(name="no-control", help="Use no ground control, even if it is there.")] = False
+    keep_all: bool = False
+    """Use photographs of low quality, too."""
+    colour: Literal["auto", "on", "off"] = "auto"
+    """Even out exposures and the lens' falloff: where it helps, always, or never."""
+    features: int = 6000
+    """Features to find in each photograph, at most."""
+    feature_width: int = 2400
+    """Longer side in pixels to which larger photographs are reduced to find features."""
+    redo: Stage | None = None
+    """Do this stage again, and all that follow."""
+    device: Device = "auto"
     talk: OmitArgPrefixes[Talk] = Talk()
 
 

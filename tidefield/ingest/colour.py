@@ -8,6 +8,7 @@ in their estimate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,18 +51,19 @@ class Evening:
     sees_falloff: bool
 
 
-def estimate_evening(scene: Scene, lenses: list[int]) -> Evening:
+def estimate_evening(scene: Scene, lenses: Sequence[int], always: bool = False) -> Evening:
     """Gains and falloff of all photographs of a scene.
 
     Args:
         scene: with sparse points; a small width is enough.
-        lenses: number of each photograph's lens.
+        lenses: any number for each photograph's lens.
+        always: apply gains even where they do not help.
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
     seen = observe(scene.photographs, scene.points, range(count)) if scene.points is not None else None
     if seen is None or not len(seen.value):
         return Evening(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
-    lens = np.asarray(lenses, dtype=np.int64)
+    lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
     power = _powers(scene, seen)
     # Whole points, not observations: a point on both sides would carry what was learned across.
     odd = np.random.default_rng(0).permutation(int(seen.point.max()) + 1)[seen.point] % 2 == 1
@@ -72,7 +74,7 @@ def estimate_evening(scene: Scene, lenses: list[int]) -> Evening:
         both = _gains_and_falloff(*own, lens, count)
         scores[k] = [_spread(*other, g, f, lens) for g, f in ((nothing, nothing), (gains, nothing), both)]
     before, alone, after = scores.mean(0)
-    helps = bool(min(alone, after) < HELPS * before)
+    helps = always or bool(min(alone, after) < HELPS * before)
     gains, falloff = _gains_and_falloff(seen, power, lens, count)
     sees = helps and bool(after < FALLOFF_HELPS * alone) and _darkens(falloff[lens[seen.photograph]], power)
     if not sees:

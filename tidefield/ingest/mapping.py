@@ -69,8 +69,8 @@ def reconstruct(database: Path, folder: Path, progress: Callable[[int, int], obj
     models = sorted(found.values(), key=lambda model: -model.num_reg_images())
     if not models:
         raise SurveyError(
-            f"none of the {count} photographs could be placed: expected photographs that overlap by half or more and show "
-            "ground with some texture; fly with more overlap, or add the photographs in between"
+            f"none of the {count} photographs could be placed: expected photographs that overlap by half or more and "
+            "show ground with some texture; fly with more overlap, or add the photographs in between"
         )
     return Models(models[0], tuple(tuple(registered_names(model)) for model in models[1:]))
 

@@ -63,7 +63,7 @@ def match(
         def features(name: str) -> tuple[NDArray[np.float64], Tensor]:
             number = images[name].image_id
             points = np.asarray(db.read_keypoints(number), dtype=np.float64)[:, :2]
-            descriptors = torch.from_numpy(np.asarray(db.read_descriptors(number).data)).to(device)
+            descriptors = torch.from_numpy(np.array(db.read_descriptors(number).data)).to(device)
             return points, torch.nn.functional.normalize(descriptors.float(), dim=1)
 
         def geometry(job: tuple[str, str, NDArray[np.uint32]]) -> pycolmap.TwoViewGeometry:

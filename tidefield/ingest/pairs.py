@@ -103,6 +103,6 @@ def glances(descriptors: Sequence[np.ndarray]) -> Float[Tensor, "V K D"]:
     """
     table = torch.zeros(len(descriptors), GLANCE, 128)
     for row, own in zip(table, descriptors, strict=True):
-        part = torch.as_tensor(own[:GLANCE], dtype=torch.float32)
+        part = torch.from_numpy(own[:GLANCE].astype(np.float32))
         row[: len(part)] = torch.nn.functional.normalize(part, dim=1)
     return table

@@ -86,8 +86,8 @@ class Stages:
                 raise ValueError("no table of stages")
         except ValueError as error:
             raise RunError(
-                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._folder} to begin "
-                "anew"
+                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._folder} to "
+                "begin anew"
             ) from error
         return records
 

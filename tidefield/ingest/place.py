@@ -1,0 +1,90 @@
+"""The photographs of a scene, as they are to be used: upright, and evened out where that helps.
+
+A file that needs no change is copied byte for byte.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from jaxtyping import Float32
+from PIL import ExifTags, Image
+
+from tidefield.files import completed_file
+from tidefield.ingest.colour import Evening, evened
+from tidefield.ingest.pictures import upright
+from tidefield.ingest.survey import Photograph
+
+STEP_PX = 8
+"""Distance at which a lens' angles are computed; between, they are interpolated."""
+JPEG_QUALITY = 95
+
+Tangents = Float32[np.ndarray, "H W"]
+
+
+def place_photographs(
+    photographs: Sequence[Photograph],
+    folder: Path,
+    evening: Evening | None,
+    lenses: Sequence[pycolmap.Camera],
+    progress: Callable[[int, int], object],
+) -> None:
+    """Write photographs into a folder under their names; what else the folder holds is removed.
+
+    Args:
+        evening: of these photographs, in this order; None leaves their colours alone.
+        lenses: of each photograph; photographs of one lens share the object.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {folder / photograph.name for photograph in photographs}
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and path not in wanted:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+    tangents = {lens.camera_id: tangent_map(lens) for lens in lenses} if evening and evening.sees_falloff else {}
+
+    def place(number: int) -> None:
+        photograph = photographs[number]
+        target = folder / photograph.name
+        if evening is None or not evening.helps:
+            if photograph.orientation == 1:
+                with completed_file(target, overwrite=True) as partial:
+                    shutil.copyfile(photograph.path, partial)
+                return
+            pixels = upright(photograph)
+        else:
+            tangent = tangents.get(lenses[number].camera_id, np.zeros((1, 1), dtype=np.float32))
+            pixels = evened(upright(photograph), evening.gain[number], evening.falloff[number], tangent)
+        _save(pixels, photograph.path, target)
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for done, _ in enumerate(pool.map(place, range(len(photographs))), start=1):
+            progress(done, len(photographs))
+
+
+def tangent_map(lens: pycolmap.Camera) -> Tangents:
+    """Tangent of the angle between each pixel's ray and the optical axis."""
+    columns, rows = (max(2, -(-x // STEP_PX)) for x in (lens.width, lens.height))
+    u = (np.arange(columns) + 0.5) * lens.width / columns
+    v = (np.arange(rows) + 0.5) * lens.height / rows
+    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    coarse = np.linalg.norm(np.asarray(lens.cam_from_img(uv)), axis=1).reshape(rows, columns).astype(np.float32)
+    return cv2.resize(coarse, (lens.width, lens.height), interpolation=cv2.INTER_LINEAR)
+
+
+def _save(pixels: np.ndarray, source: Path, target: Path) -> None:
+    """Write pixels in the format of the target's name, with what the source's EXIF says of how they were taken."""
+    with Image.open(source) as original:
+        exif = original.getexif()
+    exif[ExifTags.Base.Orientation] = 1
+    more = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+    with completed_file(target, overwrite=True) as partial:
+        Image.fromarray(pixels).save(partial, exif=exif, **more)
