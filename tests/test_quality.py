@@ -12,6 +12,7 @@ from PIL import Image
 
 from tidefield.errors import SurveyError
 from tidefield.ingest.measures import sharpness
+from tidefield.ingest.off_survey import off_survey
 from tidefield.ingest.photographs import read_survey
 from tidefield.ingest.pictures import upright
 from tidefield.ingest.quality import Verdict, judge, keep
@@ -201,6 +202,17 @@ def test_a_second_field_and_a_low_flight_are_parts_of_the_survey(tmp_path):
         for index, p in enumerate(survey.photographs)
     ]
     assert not left_out(replace(survey, photographs=tuple(photographs)))
+
+
+def test_a_survey_of_many_fields_is_one_survey(tmp_path):
+    survey = flight(tmp_path)
+    fields = []
+    for field in range(30):
+        for taken in survey.photographs:
+            assert taken.position is not None
+            east = replace(taken.position, longitude_deg=taken.position.longitude_deg + 0.01 * field)
+            fields.append(replace(taken, name=f"{field:02d}/{taken.name}", position=east))
+    assert off_survey(fields) == {}
 
 
 def test_a_flat_set_is_one_clear_error(tmp_path):

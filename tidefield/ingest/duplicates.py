@@ -20,9 +20,10 @@ AGREE = 0.6
 
 _NEAR_M = 3.0  # or this part of the height of flight; receivers are no better
 _NEAR_OF_HEIGHT = 0.05
+_FAR_M = 20.0  # positions are not so wrong that farther photographs could be from one place
 _IN_SEQUENCE = 3
 _COARSE = 16, 12
-_ALIKE = 0.5  # correlation of the coarse pictures that makes it worth looking, whatever the positions
+_ALIKE = 0.5  # correlation of the coarse pictures that makes it worth looking
 
 
 def duplicates(
@@ -30,8 +31,8 @@ def duplicates(
 ) -> dict[int, str]:
     """Index and reason of each photograph that a sharper one makes superfluous.
 
-    Compared are photographs that were taken within 3 m (or 5% of the height of flight) or three of each other, and
-    those that look alike from afar.
+    Compared are photographs that were taken within 3 m (or 5% of the height of flight) of each other; and, if their
+    positions are unknown or within 20 m, those that were taken within three of each other or look alike from afar.
     """
     outlines = [np.zeros((16, 16), np.int8) if outline is None else outline for outline in outlines]
     coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(-1, _COARSE[0] * _COARSE[1])
@@ -48,9 +49,9 @@ def duplicates(
         others = np.array(kept, dtype=np.int64)
         height_m = photographs[index].relative_altitude_m
         near_m = max(_NEAR_M, _NEAR_OF_HEIGHT * height_m if height_m > 0 else 0.0)
-        close = np.linalg.norm(xy_m[others] - xy_m[index], axis=1) < near_m
-        close |= np.abs(rank[others] - rank[index]) <= _IN_SEQUENCE
-        close |= coarse[others] @ coarse[index] > _ALIKE
+        away_m = np.linalg.norm(xy_m[others] - xy_m[index], axis=1)  # NaN where a position is unknown
+        likely = (np.abs(rank[others] - rank[index]) <= _IN_SEQUENCE) | (coarse[others] @ coarse[index] > _ALIKE)
+        close = (away_m < near_m) | (likely & ~(away_m > _FAR_M))
         twin = _twin(index, others[close].tolist(), outlines)
         if twin is None:
             kept.append(index)

@@ -18,8 +18,10 @@ APART = 6.0
 """As many times the median distance between neighbours is a gap in the survey."""
 APART_IN_HEIGHTS = 3.0
 """Or as many flight heights, where these are known: about two footprints."""
-FEW = 0.05
-"""A larger share of the photographs beyond a gap is a part of the survey."""
+FEW, FEW_AT_MOST = 0.05, 10
+"""A larger share or number of photographs beyond a gap is a part of the survey."""
+FEW_IN_ALL = 0.1
+"""Where more than this lies beyond gaps, the survey has gaps."""
 LOW = 0.35
 """Of the median height above take-off; lower photographs show the take-off or the landing."""
 FEW_LOW = 0.1
@@ -46,9 +48,13 @@ def _beyond_a_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
     sizes = np.bincount(part)
     bulk = sizes.argmax()
     rest = KDTree(xy_m[part == bulk])
+    small = sizes <= max(1.0, min(FEW_AT_MOST, FEW * len(located)))
+    small[bulk] = False
+    if sizes[small].sum() > max(1.0, FEW_IN_ALL * len(located)):
+        return {}
     reasons = {}
     for (index, _), xy, own in zip(located, xy_m, part.tolist(), strict=True):
-        if own != bulk and sizes[own] <= max(1.0, FEW * len(located)):
+        if small[own]:
             away_m = float(rest.query(xy)[0])
             reasons[index] = (
                 f"off the survey: it was taken {away_m:.0f} m from the nearest of the others; {gap_m:.0f} m is the "

@@ -37,9 +37,9 @@ _FOREIGN_FOLDERS = ("@eadir", "__macosx", "opensfm", "odm_")
 def read_survey(folder: Path, gps: Path | None = None, control: Path | None = None) -> Survey:
     """All photographs (JPEG, PNG, TIFF) in a folder and its sub-folders, with positions and ground control.
 
-    Hidden folders and those of scenes and results (with a `sparse` folder or a `georeference.json` in them) are passed
-    over. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose EXIF has none, an
-    ODM `gcp_list.txt` ground control.
+    Hidden folders and those of scenes (with a `sparse` folder or a `georeference.json` in them) and of OpenDroneMap's
+    results are passed over. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose
+    EXIF has none, an ODM `gcp_list.txt` ground control.
 
     Args:
         folder: the photographs.
@@ -100,7 +100,8 @@ def _walk(folder: Path) -> Iterator[Path]:
 
 
 def _is_foreign(folder: Path) -> bool:
-    is_scene = (folder / "sparse").is_dir() or (folder / "georeference.json").is_file()
+    # The last is in a scene that is still being prepared.
+    is_scene = any((folder / part).exists() for part in ("sparse", "georeference.json", "prepare/stages.json"))
     return is_scene or folder.name.casefold().startswith(_FOREIGN_FOLDERS)
 
 

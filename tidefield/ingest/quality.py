@@ -74,12 +74,12 @@ def judge(survey: Survey, progress: Progress | None = None) -> tuple[Verdict, ..
             beside = [other for other in (measured[i] for i in near[index]) if other is not None]
             reasons[index] = _flat(measures) or _exposed(measures, beside)
     # What is no picture of the ground must not be what the others are compared with.
-    sound = [None if reason else measures for measures, reason in zip(measured, reasons, strict=True)]
-    for index, measures in enumerate(sound):
-        if measures is not None:
-            alike = [sound[i] for i in _alike(photographs, index)]
-            reasons[index] = _blurred(measures, alike, [sound[i] for i in near[index]])
-            reasons[index] = reasons[index] or _horizon(photographs[index], measures)
+    sharp = [_sharpness(None if reason else measures) for measures, reason in zip(measured, reasons, strict=True)]
+    usual = _usual(photographs, sharp)
+    for index, measures in enumerate(measured):
+        if measures is not None and reasons[index] is None:
+            around = _median([sharp[i] for i in near[index]])
+            reasons[index] = _blurred(sharp[index], usual[index], around) or _horizon(photographs[index], measures)
     for index, reason in off_survey(photographs).items():
         reasons[index] = reasons[index] or reason
     kept = [index for index, reason in enumerate(reasons) if reason is None]
@@ -135,7 +135,8 @@ def _measure(
             return f"undecodable: {error}"
 
     measured, outlines, reasons = [], [], []
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+    try:
         for done, found in enumerate(pool.map(look, photographs), start=1):
             measures, outline = (None, None) if isinstance(found, str) else found
             measured.append(measures)
@@ -143,6 +144,8 @@ def _measure(
             reasons.append(found if isinstance(found, str) else None)
             if progress:
                 progress(done, len(photographs))
+    finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C waits for the photographs in hand, not for all
     return measured, outlines, reasons
 
 
@@ -166,14 +169,14 @@ def _neighbours(photographs: Sequence[Photograph]) -> list[list[int]]:
     return near
 
 
-def _alike(photographs: Sequence[Photograph], index: int) -> list[int]:
-    """Photographs of the same camera and size."""
-    this = photographs[index]
-    return [
-        i
-        for i, other in enumerate(photographs)
-        if other.camera == this.camera and {other.width, other.height} == {this.width, this.height}
-    ]
+def _usual(photographs: Sequence[Photograph], values: Sequence[float]) -> list[float]:
+    """For each photograph the median over all of its camera and size."""
+    kinds = [(p.camera, min(p.width, p.height), max(p.width, p.height)) for p in photographs]
+    by_kind: dict[tuple[str, int, int], list[float]] = {}
+    for kind, value in zip(kinds, values, strict=True):
+        by_kind.setdefault(kind, []).append(value)
+    median = {kind: _median(several) for kind, several in by_kind.items()}
+    return [median[kind] for kind in kinds]
 
 
 def _flat(measures: Measures) -> str | None:
@@ -211,11 +214,10 @@ def _sharpness(measures: Measures | None) -> float:
     return math.nan if measures is None else measures.sharpness
 
 
-def _blurred(measures: Measures, alike: Sequence[Measures | None], beside: Sequence[Measures | None]) -> str | None:
-    sharpness = measures.sharpness
+def _blurred(sharpness: float, survey: float, around: float) -> str | None:
+    """By its own sharpness, the survey's and its neighbours', where these are known."""
     if math.isnan(sharpness):
         return None
-    survey, around = (_median([_sharpness(other) for other in others]) for others in (alike, beside))
     of_survey, of_neighbours = sharpness / survey, sharpness / (around if around > 0 else survey)
     soft = sharpness < SOFT and of_neighbours < SOFT_OF_NEIGHBOURS and of_survey < SOFT_OF_SURVEY
     if soft or (of_neighbours < SOFTER_OF_NEIGHBOURS and of_survey < SOFTER_OF_SURVEY):
