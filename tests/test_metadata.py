@@ -174,6 +174,17 @@ def test_damaged_numbers_are_unknown(tmp_path):
     assert math.isnan(read.focal_mm)
 
 
+def test_exif_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
+    survey_folder(tmp_path, count=2)
+    path = photograph(tmp_path / "this.jpg", table=exif({Base.Make: "DJI", Base.FocalLength: 3.61}, place=BRIGHTON))
+    data = path.read_bytes()
+    start = data.index(b"Exif\0\0")
+    path.write_bytes(data[: start + 40] + b"\xff" * 60 + data[start + 100 :])
+    read = named(read_survey(tmp_path), "this.jpg")
+    assert (read.width, read.height) == (64, 48)
+    assert read.position is None or math.isnan(read.focal_mm)
+
+
 def test_png_and_tiff_have_exif_too(tmp_path):
     survey_folder(tmp_path, count=2)
     for name in ("a.png", "b.tif"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -57,7 +58,9 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
     remarks = []
     if undeveloped:
         remarks.append(f"{len(undeveloped)} camera raw files are not read ({some(undeveloped)}): develop them first.")
-    with ThreadPoolExecutor(min(8, 2 * (os.cpu_count() or 1))) as pool:
+    with ThreadPoolExecutor(min(8, 2 * (os.cpu_count() or 1))) as pool, warnings.catch_warnings():
+        # Pillow's, of tags that it cannot read; they name no file, and what is not read is unknown.
+        warnings.simplefilter("ignore", UserWarning)
         read = list(pool.map(_read, paths, names))
     photographs = [photograph for photograph in read if isinstance(photograph, tuple)]
     unread = [f"Left out: {problem}" for problem in read if isinstance(problem, str)]
