@@ -4,8 +4,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
-from located_surveys import FRAME, fly, in_a_frame_of_its_own, name_of
+from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
 
 from tidefield.errors import SurveyError
 from tidefield.ingest.alignment import camera_centres, find_down
@@ -195,3 +196,66 @@ def test_zeros_are_no_positions():
     _, found = located(flight, survey)
     assert [(item.kind, item.name) for item in found.left_out] == [("GPS", name_of(3))]
     assert found.gps.horizontal_rms_m < 0.01
+
+
+def differential(survey: Survey) -> Survey:
+    return all_moved(survey, lambda position: {"horizontal_m": 0.015, "vertical_m": 0.025})
+
+
+@pytest.fixture(scope="module")
+def bowl():
+    """A survey that was reconstructed with the wrong distortion, and is bent; its positions are good to 2 cm."""
+    lens = [FOCAL, FOCAL, WIDTH / 2 - 4, HEIGHT / 2 + 6, -0.03, 0.01, 0.002, -0.001]
+    camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=lens, camera_id=1)
+    true = fly(lines=4, each=7, position_m=0.015, camera=camera)
+    model = pycolmap.Reconstruction(true.model)
+    model.cameras[1].model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    model.cameras[1].params = [FOCAL, WIDTH / 2, HEIGHT / 2, 0.02]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(model, options)
+    return replace(true, model=model), true.model
+
+
+def ground_off_m(truth, model, frame) -> np.ndarray:
+    numbers = sorted(truth.points3D)
+    there = frame.from_geographic(FRAME.to_geographic(np.array([truth.points3D[k].xyz for k in numbers])))
+    return np.array([model.points3D[k].xyz for k in numbers]) - there
+
+
+def test_differential_positions_take_out_the_bend_that_others_leave(bowl):
+    flight, truth = bowl
+    model, found = located(flight)
+    bent = ground_off_m(truth, model, found.frame)
+    assert found.notes == ()
+    model, found = located(flight, differential(flight.survey))
+    straight = ground_off_m(truth, model, found.frame)
+    assert "adjusted to their differential positions" in found.notes[0]
+    assert found.gps.horizontal_rms_m < 0.05
+    assert np.median(np.abs(straight[:, 2])) < 0.15
+    assert np.median(np.abs(straight[:, 2])) < 0.4 * np.median(np.abs(bent[:, 2]))
+    assert model.cameras[1].params[0] == pytest.approx(FOCAL), "positions at one height do not tell it"
+
+
+def test_a_differential_position_that_is_worse_than_it_states_is_not_followed(bowl):
+    flight, _ = bowl
+    survey = differential(flight.survey)
+    place = next(p.position for p in survey.photographs if p.name == name_of(9))
+    _, found = located(flight, moved(survey, {name_of(9): {"height_m": place.height_m + 1.2}}))
+    assert any(name_of(9) in note and "worse than they state" in note for note in found.notes)
+    assert found.gps.horizontal_rms_m < 0.05
+    others = [i for i, name in enumerate(found.gps.names) if name != name_of(9)]
+    assert np.abs(found.gps.error_m[others]).max() < 0.1
+
+
+def test_differential_positions_help_where_there_is_control_too(bowl):
+    flight, truth = bowl
+    survey = replace(
+        differential(flight.survey), control=with_control(replace(flight, model=truth), CONTROL[:3]).control
+    )
+    model, found = located(flight, survey)
+    assert found.source == "ground control"
+    assert "differential" in found.notes[0]
+    numbers = sorted(truth.points3D)
+    there = found.frame.from_crs(FRAME.to_crs(np.array([truth.points3D[k].xyz for k in numbers])))
+    assert np.median(np.abs(np.array([model.points3D[k].xyz for k in numbers]) - there)[:, 2]) < 0.15

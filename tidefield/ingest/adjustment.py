@@ -62,12 +62,7 @@ def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap
     config = pycolmap.BundleAdjustmentConfig()
     for number in copy.reg_image_ids():
         config.add_image(number)
-    taken = Counter(copy.image(number).camera_id for number in copy.reg_image_ids())
-    for number, camera in copy.cameras.items():
-        if lens == "freed" and taken[number] >= _IMAGES_OF_A_LENS:
-            _generalise(camera)
-        elif taken[number]:
-            config.set_constant_cam_intrinsics(number)
+    generalise_lenses(copy, config, freed=lens == "freed")
     for name, surveyed in marks.points.items():
         config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
     options = pycolmap.BundleAdjustmentOptions()
@@ -130,6 +125,16 @@ def seen_control(adjusted: pycolmap.Reconstruction, marks: Marks) -> Checks:
     seen, surveyed = triangulate_points(adjusted, marks, 1.0), marks.points
     errors = [point - surveyed[name] for name, point in seen.items()]
     return Checks(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, freed: bool) -> None:
+    """Make lenses that are to be adjusted ones of OpenCV's model; hold all others (those of few photographs too)."""
+    taken = Counter(model.image(number).camera_id for number in model.reg_image_ids())
+    for number, camera in model.cameras.items():
+        if freed and taken[number] >= _IMAGES_OF_A_LENS:
+            _generalise(camera)
+        elif taken[number]:
+            config.set_constant_cam_intrinsics(number)
 
 
 def _add_control(model: pycolmap.Reconstruction, marks: Marks, surveyed: Float64[np.ndarray, " 3"]) -> int:

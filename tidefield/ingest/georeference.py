@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -18,7 +18,8 @@ from tidefield.ingest.control_adjustment import adjust_to_control
 from tidefield.ingest.gps import GivenPositions, given_positions
 from tidefield.ingest.ground_control import fit_control
 from tidefield.ingest.marks import place_marks
-from tidefield.ingest.survey import Control, Survey
+from tidefield.ingest.position_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
+from tidefield.ingest.survey import Control, Photograph, Survey
 from tidefield.ingest.which_crs import refuse_elsewhere
 
 
@@ -27,59 +28,113 @@ def georeference(
 ) -> Georeference:
     """Lay a model onto the Earth, in place: it comes in any frame and is in the world afterwards.
 
-    With three control points or more the whole model is adjusted to them, and checked without each of them in turn.
+    Positions of differential receivers take the bend out of the model. With three control points or more the whole
+    model is adjusted to these, and checked without each of them in turn.
 
     Args:
         model: with photographs' names as its images' names.
-        progress: called with how much of how much is done.
+        progress: called with how much of how much is done, from the beginning for each of several parts.
 
     Raises:
         SurveyError: the positions mirror the survey, or ground control is of another place or fits nothing.
     """
     photographs = [p for p in survey.photographs if p.name in camera_centres(model)]
-    positions, down = given_positions(photographs), find_down(model, photographs)
-    if survey.control is None:
-        return _by_positions(model, positions, down)
-    if positions.names:
+    positions = given_positions(photographs)
+    if survey.control is not None and positions.names:
         refuse_elsewhere(survey.control, *positions.middle)
-    frame = _control_frame(survey.control)
-    fit = _fit(model, positions, frame, down)
-    marks, unplaced = place_marks(model, survey.control, survey.photographs, frame)
-    similarity, agree = fit_control(model, marks, down, fit)
-    _move(model, similarity)
-    result = adjust_to_control(model, marks, agree, progress)
-    return Georeference(
-        frame=frame,
-        source="ground control",
-        world_from_model=similarity,
-        gps=_gps_residuals(model, positions, frame),
-        control=result.control,
-        check=result.check,
-        left_out=(*positions.left_out, *(fit.left_out if fit else ()), *unplaced, *result.left_out),
-        notes=result.notes,
-    )
-
-
-def _by_positions(model: pycolmap.Reconstruction, positions: GivenPositions, down: Down) -> Georeference:
-    frame = positions.frame() if positions.names else None
-    fit = None if frame is None else _fit(model, positions, frame, down)
-    if frame is None or fit is None:
-        return _upright_only(model, positions, down)
-    ground = round(_ground(fit.world_from_model(_points(model))))
+    frame = _frame(survey, positions)
+    if frame is None:
+        return _upright_only(model, positions, find_down(model, photographs))
+    laid = _lay_onto_positions(model, positions, frame, photographs, progress)
+    if survey.control is not None:
+        return _by_control(model, survey, survey.control, positions, frame, laid, progress)
+    if laid.fit is None:
+        return _upright_only(model, positions, find_down(model, photographs))
+    ground = round(_ground(_points(model)))
+    down_to_it = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground]))
     frame = replace(frame, height_m=float(ground))
-    translation = fit.world_from_model.translation - [0, 0, ground]
-    similarity = replace(fit.world_from_model, translation=translation)
-    _move(model, similarity)
+    _move(model, down_to_it)
     return Georeference(
         frame=frame,
         source="GPS",
-        world_from_model=similarity,
+        world_from_model=down_to_it @ laid.world_from_model,
         gps=_gps_residuals(model, positions, frame),
         control=Residuals(),
         check=Residuals(),
-        left_out=(*positions.left_out, *fit.left_out),
-        notes=fit.notes,
+        left_out=(*positions.left_out, *laid.fit.left_out),
+        notes=laid.notes,
     )
+
+
+@dataclass(frozen=True)
+class _Laid:
+    """A model that has been laid onto its cameras' positions, if that could be.
+
+    Attributes:
+        fit: of the model as it is now, to its positions; None if they place nothing.
+        world_from_model: from the model as it came.
+        notes: what was done.
+    """
+
+    fit: PositionFit | None
+    world_from_model: Similarity
+    notes: tuple[str, ...]
+
+
+def _lay_onto_positions(
+    model: pycolmap.Reconstruction,
+    positions: GivenPositions,
+    frame: LocalFrame,
+    photographs: Sequence[Photograph],
+    progress: Callable[[int, int], object],
+) -> _Laid:
+    fit = _fit(model, positions, frame, find_down(model, photographs))
+    if fit is None:
+        return _Laid(None, Similarity(1.0, np.eye(3), np.zeros(3)), ())
+    _move(model, fit.world_from_model)
+    adjusted = adjust_to_positions(model, _differential(positions, fit, frame), progress)
+    again = _fit(model, positions, frame, find_down(model, photographs))
+    assert again is not None, "the model has just been laid onto them"
+    _move(model, again.world_from_model)
+    final = _fit(model, positions, frame, find_down(model, photographs))
+    return _Laid(final, again.world_from_model @ fit.world_from_model, (*again.notes, *adjusted))
+
+
+def _by_control(
+    model: pycolmap.Reconstruction,
+    survey: Survey,
+    control: Control,
+    positions: GivenPositions,
+    frame: LocalFrame,
+    laid: _Laid,
+    progress: Callable[[int, int], object],
+) -> Georeference:
+    marks, unplaced = place_marks(model, control, survey.photographs, frame)
+    similarity, agree = fit_control(model, marks, find_down(model, survey.photographs), laid.fit)
+    _move(model, similarity)
+    result = adjust_to_control(model, marks, agree, progress)
+    astray = laid.fit.left_out if laid.fit else ()
+    return Georeference(
+        frame=frame,
+        source="ground control",
+        world_from_model=similarity @ laid.world_from_model,
+        gps=_gps_residuals(model, positions, frame),
+        control=result.control,
+        check=result.check,
+        left_out=(*positions.left_out, *astray, *unplaced, *result.left_out),
+        notes=(*laid.notes, *result.notes),
+    )
+
+
+def _frame(survey: Survey, positions: GivenPositions) -> LocalFrame | None:
+    """In the system of the control, with a round coordinate amid it as its origin; else about the positions."""
+    if survey.control is None:
+        return positions.frame() if positions.names else None
+    control = survey.control
+    middle = np.median(np.array(list(control.points.values()), dtype=np.float64), axis=0)
+    digits = 5 if parse_crs(control.crs).is_geographic else 0
+    x, y, height = (float(round(value, n)) for value, n in zip(middle, (digits, digits, 0), strict=True))
+    return LocalFrame.at(control.crs, (x, y, height))
 
 
 def _upright_only(model: pycolmap.Reconstruction, positions: GivenPositions, down: Down) -> Georeference:
@@ -105,19 +160,20 @@ def _upright_only(model: pycolmap.Reconstruction, positions: GivenPositions, dow
     )
 
 
-def _control_frame(control: Control) -> LocalFrame:
-    """In the system of the control, with a round coordinate in the middle of it as its origin."""
-    middle = np.median(np.array(list(control.points.values()), dtype=np.float64), axis=0)
-    digits = 5 if parse_crs(control.crs).is_geographic else 0
-    x, y, height = (float(round(value, digits)) for value, digits in zip(middle, (digits, digits, 0), strict=True))
-    return LocalFrame.at(control.crs, (x, y, height))
-
-
 def _fit(
     model: pycolmap.Reconstruction, positions: GivenPositions, frame: LocalFrame, down: Down
 ) -> PositionFit | None:
     centres = camera_centres(model)
     return fit_positions(np.array([centres[n] for n in positions.names]).reshape(-1, 3), positions, frame, down)
+
+
+def _differential(positions: GivenPositions, fit: PositionFit, frame: LocalFrame) -> Differential:
+    """Those positions that state centimetres and are no gross errors."""
+    given = frame.from_geographic(positions.longitude_latitude_height)
+    stated = positions.stated_m[:, [0, 0, 1]]
+    good = np.flatnonzero(fit.used & (stated < DIFFERENTIAL_M).all(axis=1))
+    names = [positions.names[i] for i in good]
+    return Differential(dict(zip(names, given[good], strict=True)), dict(zip(names, stated[good], strict=True)))
 
 
 def _gps_residuals(model: pycolmap.Reconstruction, positions: GivenPositions, frame: LocalFrame) -> Residuals:
