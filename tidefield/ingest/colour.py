@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float, Float64, UInt8
 from numpy.typing import NDArray
 from scipy import sparse
 
@@ -25,7 +26,6 @@ FALLOFF_HELPS = 0.99
 """... and a falloff where it falls by so much again."""
 
 Array = NDArray[np.float64]
-Image8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -83,20 +83,25 @@ def estimate_evening(scene: Scene, lenses: Sequence[int], always: bool = False) 
     return Evening(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
 
 
-def evened(photograph: Image8, gain: Array, falloff: Array, tangent: Array) -> Image8:
+def evened(
+    photograph: UInt8[np.ndarray, "H W 3"],
+    gain: Float64[np.ndarray, "3"],
+    falloff: Float64[np.ndarray, "3"],
+    tangent: Float[np.ndarray, "_ _"],
+) -> UInt8[np.ndarray, "H W 3"]:
     """A photograph at the common exposure, without its lens' falloff.
 
     Args:
         photograph: H x W x 3.
         gain: 3.
         falloff: k1, k2, k3.
-        tangent: H x W, of the angle between each pixel's ray and the optical axis.
+        tangent: H x W, of the angle between each pixel's ray and the optical axis; 1 x 1 where there is no falloff.
     """
     shade = np.exp(_polynomial(tangent) @ falloff)[..., None]
     return np.clip(np.rint(photograph / (shade * gain)), 0, 255).astype(np.uint8)
 
 
-def _polynomial(tangent: Array) -> Array:
+def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
     square = np.square(tangent)
     return np.stack([square, square**2, square**3], axis=-1)
 

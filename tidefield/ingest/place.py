@@ -26,8 +26,6 @@ STEP_PX = 8
 """Distance at which a lens' angles are computed; between, they are interpolated."""
 JPEG_QUALITY = 95
 
-Tangents = Float32[np.ndarray, "H W"]
-
 
 def place_photographs(
     photographs: Sequence[Photograph],
@@ -70,7 +68,7 @@ def place_photographs(
             progress(done, len(photographs))
 
 
-def tangent_map(lens: pycolmap.Camera) -> Tangents:
+def tangent_map(lens: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     """Tangent of the angle between each pixel's ray and the optical axis."""
     columns, rows = (max(2, -(-x // STEP_PX)) for x in (lens.width, lens.height))
     u = (np.arange(columns) + 0.5) * lens.width / columns
