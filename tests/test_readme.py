@@ -32,7 +32,8 @@ def command_lines(program: str) -> list[str]:
 @pytest.mark.parametrize("line", command_lines("tidefield"))
 def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words, called = shlex.split(line), []
-    monkeypatch.setattr(commands, words[1], lambda options, console: called.append(options))
+    function = {"import": "import_project"}.get(words[1], words[1])
+    monkeypatch.setattr(commands, function, lambda options, console: called.append(options))
     monkeypatch.setattr(cli, "_begin", lambda talk: None)
     monkeypatch.setattr(sys, "argv", words)
     cli.main()
@@ -40,7 +41,14 @@ def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyP
 
 
 def test_every_command_is_shown() -> None:
-    assert {line.split()[1] for line in command_lines("tidefield")} == {"train", "evaluate", "render", "demo"}
+    assert {line.split()[1] for line in command_lines("tidefield")} == {
+        "prepare",
+        "import",
+        "train",
+        "evaluate",
+        "render",
+        "demo",
+    }
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="there is no make on this machine")

@@ -18,6 +18,7 @@ from tidefield.ingest import report
 from tidefield.ingest.alignment import camera_centres
 from tidefield.ingest.colour import Evening
 from tidefield.ingest.features import opened
+from tidefield.ingest.lens_choice import told
 from tidefield.ingest.pictures import thumbnail
 from tidefield.ingest.prepare import Prepared
 from tidefield.ingest.survey import Photograph
@@ -48,7 +49,7 @@ def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> rep
             "pycolmap": pycolmap.__version__,
             "Python": platform.python_version(),
         },
-        remarks=(*located.notes, *prepared.survey.remarks),
+        remarks=(*located.notes, *told(prepared.lenses), *prepared.survey.remarks),
     )
 
 
