@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | quality | memory | table`; without a name, speed.
+"""`python -m benchmarks speed | quality | memory | table | surveys`; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -141,6 +141,30 @@ def memory(
     print(f"{record['peak_memory_bytes'] / 1e9:.2f} GB, {record['seconds']:.0f} s")
 
 
+def surveys(
+    photographs: Path,
+    runs: Path,
+    names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
+    exhaustive: bool = True,
+    out: Path = Path("docs/surveys.md"),
+) -> None:
+    """Prepare surveys as they came from the camera, beside exhaustive structure from motion; write the page (hours).
+
+    Args:
+        photographs: Folder with the surveys' folders.
+        runs: Folder for the results, as RUNS/SURVEY.
+        names: Of the surveys.
+        exhaustive: Place the photographs exhaustively, too.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.records import run_measured
+    from benchmarks.surveys import measure_surveys, write_page
+
+    measure_surveys(photographs, runs, names, exhaustive, run_measured, partial(print, flush=True))
+    write_page(runs, names, out)
+    print(out)
+
+
 def table(runs: Path, out: Path = Path("docs/results.md")) -> None:
     """Write the page of results from what the other commands kept.
 
@@ -159,7 +183,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    commands = {"speed": speed, "quality": quality, "memory": memory, "table": table}
+    commands = {"speed": speed, "quality": quality, "memory": memory, "table": table, "surveys": surveys}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
     except TidefieldError as error:

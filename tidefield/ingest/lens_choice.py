@@ -65,14 +65,20 @@ def choose_lens(
         _adjust(copy, lens, focal)
         trials.append(Trial(lens, copy.compute_mean_reprojection_error(), _off_m(copy, photographs)))
         progress(len(trials), len(TERMS) + 1)
+    best = best_of(trials)
+    _adjust(model, best.lens, focal)
+    progress(1, 1)
+    return (*(trial for trial in trials if trial is not best), best)
+
+
+def best_of(trials: Sequence[Trial]) -> Trial:
+    """The richest of lenses, given the simplest first, that improves the matches and does not bend the model."""
     best = trials[0]
     for trial in trials[1:]:
         bends = trial.off_m is not None and best.off_m is not None and trial.off_m > BENDS * best.off_m
         if trial.error_px < WORTH * best.error_px and not bends:
             best = trial
-    _adjust(model, best.lens, focal)
-    progress(1, 1)
-    return (*(trial for trial in trials if trial is not best), best)
+    return best
 
 
 def told(trials: Sequence[Trial]) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ Pair = tuple[int, int]
 
 NEARBY = 24
 """Photographs around each that may overlap it, where positions are known."""
+FAR = 4.0
+"""Times the usual distance to the middle one of them; photographs farther apart show nothing in common."""
 IN_SEQUENCE = 2
 """Photographs taken just before and after are paired in any case."""
 FEW = 40
@@ -45,8 +47,11 @@ def candidates(photographs: Sequence[Photograph]) -> list[Pair]:
     pairs: set[Pair] = set()
     if len(placed) > NEARBY:
         xy = _metres([photographs[k] for k in placed])
-        _, near = KDTree(xy).query(xy, k=NEARBY + 1)
-        pairs |= {_pair(placed[i], placed[j]) for i, row in enumerate(near) for j in row if i != j}
+        apart, near = KDTree(xy).query(xy, k=NEARBY + 1)
+        # Where a field has fewer photographs than that, the next are those of another field, far away.
+        far = FAR * np.median(np.asarray(apart)[:, NEARBY // 2])
+        rows = zip(np.asarray(near), np.asarray(apart), strict=True)
+        pairs |= {_pair(placed[i], placed[j]) for i, (row, d) in enumerate(rows) for j in row[d <= far] if i != j}
     else:
         placed = []
     lost = sorted(set(range(count)) - set(placed))

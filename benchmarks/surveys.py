@@ -1,0 +1,163 @@
+"""`tidefield prepare` on surveys as they came from the camera, beside exhaustive structure from motion.
+
+RUNS/SURVEY/scene is the prepared scene, RUNS/SURVEY/exhaustive the other's model, and RUNS/SURVEY/prepare.json and
+exhaustive/exhaustive.json hold what they took. What is there is not repeated.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.records import Runner, read_json, stamp, tidefield, write_json
+from benchmarks.table import NOTHING, Table
+from tidefield.errors import SurveyError
+from tidefield.files import completed_file
+
+SURVEYS = ("brighton_beach", "turin_lot", "swindale")
+
+
+def measure_surveys(
+    photographs: Path, runs: Path, surveys: Sequence[str], exhaustive: bool, run: Runner, say: Callable[[str], object]
+) -> None:
+    """Prepare every survey, and place its photographs exhaustively.
+
+    Raises:
+        SurveyError: a survey is not there.
+        RunError: a command failed.
+    """
+    for survey in surveys:
+        source, folder = photographs / survey, runs / survey
+        if not source.is_dir():
+            raise SurveyError(f"{source} is not there: expected a folder of photographs; name others with --surveys")
+        if read_json(folder / "prepare.json") is None:
+            say(f"{survey}: prepare")
+            took = run(tidefield("prepare", source, folder / "scene"), {})
+            write_json(folder / "prepare.json", {**asdict(took), **stamp()})
+        if exhaustive and read_json(folder / "exhaustive" / "exhaustive.json") is None:
+            say(f"{survey}: exhaustive")
+            run([sys.executable, "-m", "benchmarks.exhaustive", str(source), str(folder / "exhaustive")], {})
+
+
+def write_page(runs: Path, surveys: Sequence[str], out: Path) -> None:
+    """What `measure_surveys` left, as Markdown."""
+    records = {survey: _read(runs / survey) for survey in surveys}
+    made = stamp()["machine"]
+    text = "\n\n".join(
+        [
+            "# Surveys",
+            '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS"` wrote this page; nothing is typed by hand.',
+            f"On {made['cores']} cores of {made['processor']}, without a GPU. Exhaustive means COLMAP's defaults, as "
+            "the same library (pycolmap) runs them: every photograph matched with every other, focal length free.",
+            _quality(records).markdown(),
+            _time(records).markdown(),
+        ]
+    )
+    with completed_file(out, overwrite=True) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    return {
+        "report": read_json(folder / "scene" / "report.json"),
+        "took": read_json(folder / "prepare.json"),
+        "exhaustive": read_json(folder / "exhaustive" / "exhaustive.json"),
+    }
+
+
+def _quality(records: dict[str, dict[str, Any]]) -> Table:
+    columns = ["", *records]
+    rows: list[list[str]] = []
+
+    def row(title: str, value: Callable[[dict[str, Any]], str | None]) -> None:
+        cells = [NOTHING if record["report"] is None else value(record) or NOTHING for record in records.values()]
+        rows.append([title, *cells])
+
+    def residual(kind: str, name: str, unit: float) -> Callable[[dict[str, Any]], str | None]:
+        def cell(record: dict[str, Any]) -> str | None:
+            found = [r for r in record["report"]["tidefield"]["residuals"] if r["kind"] == kind]
+            return f"{unit * found[0][name]:.{2 if unit == 1 else 1}f}" if found else None
+
+        return cell
+
+    shots = "reconstruction_statistics"
+    row(
+        "photographs placed",
+        lambda r: f"{r['report'][shots]['reconstructed_shots_count']} of {r['report'][shots]['initial_shots_count']}",
+    )
+    row("mean reprojection error, px", lambda r: f"{r['report']['tidefield']['reprojection']['mean_px']:.2f}")
+    row("focal length, px", lambda r: ", ".join(f"{c['focal_px']:.0f}" for c in r["report"]["tidefield"]["cameras"]))
+    row("height above ground, m (mean)", lambda r: _mean(r, "height_above_ground"))
+    row("the drone's own relative altitude, m (mean)", lambda r: _mean(r, "relative_altitude"))
+    for kind, title in (("gps", "GPS"), ("control", "control points"), ("check", "control points left out in turn")):
+        unit, name = (1, "m") if kind == "gps" else (100, "cm")
+        row(f"{title}, RMS horizontal, {name}", residual(kind, "rms_horizontal", unit))
+        row(f"{title}, RMS vertical, {name}", residual(kind, "rms_vertical", unit))
+    row("photographs disagree in colour by, % (before)", lambda r: _colour(r, "before"))
+    row("photographs disagree in colour by, % (after)", lambda r: _colour(r, "after"))
+    return Table("What came out", columns, rows)
+
+
+def _mean(record: dict[str, Any], name: str) -> str | None:
+    value = (record["report"]["tidefield"]["resolution"].get(name) or {}).get("mean")
+    return None if value is None else f"{value:.1f}"
+
+
+def _colour(record: dict[str, Any], when: str) -> str | None:
+    colour = record["report"]["tidefield"]["colour"]
+    return f"{colour['changes'][0][when]:.1f}" if colour else None
+
+
+def _time(records: dict[str, dict[str, Any]]) -> Table:
+    columns = ["", *records]
+    rows: list[list[str]] = []
+    stages = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
+    for stage in stages:
+        cells = []
+        for record in records.values():
+            times = {} if record["report"] is None else record["report"]["processing_statistics"]["steps_times"]
+            cells.append(f"{times[stage]:.0f}" if stage in times else NOTHING)
+        rows.append([f"prepare: {stage}, s", *cells])
+    rows.append(["prepare: all, s", *(_seconds(r["took"]) for r in records.values())])
+    rows.append(["prepare: peak memory, GB", *(_memory(r["took"]) for r in records.values())])
+    others = [record["exhaustive"] for record in records.values()]
+    for stage in ("features", "matches", "poses"):
+        rows.append(
+            [f"exhaustive: {stage}, s", *(NOTHING if o is None else f"{o['seconds'][stage]:.0f}" for o in others)]
+        )
+    rows.append(["exhaustive: all, s", *(NOTHING if o is None else f"{_whole(o):.0f}" for o in others)])
+    rows.append(
+        [
+            "exhaustive: photographs placed",
+            *(NOTHING if o is None else f"{o['registered']} of {o['photographs']}" for o in others),
+        ]
+    )
+    rows.append(
+        [
+            "exhaustive: focal length, px",
+            *(NOTHING if o is None else ", ".join(f"{f:.0f}" for f in o["focal_px"]) for o in others),
+        ]
+    )
+    ratios = [
+        NOTHING
+        if r["took"] is None or r["exhaustive"] is None
+        else f"{_whole(r['exhaustive']) / r['took']['seconds']:.1f}"
+        for r in records.values()
+    ]
+    rows.append(["exhaustive / prepare", *ratios])
+    return Table("Time", columns, rows)
+
+
+def _whole(exhaustive: dict[str, Any]) -> float:
+    return sum(exhaustive["seconds"].values())
+
+
+def _seconds(took: dict[str, Any] | None) -> str:
+    return NOTHING if took is None else f"{took['seconds']:.0f}"
+
+
+def _memory(took: dict[str, Any] | None) -> str:
+    return NOTHING if took is None else f"{took['peak_memory_bytes'] / 1e9:.1f}"
