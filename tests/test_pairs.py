@@ -67,10 +67,10 @@ def test_nearest_photographs_are_paired_and_far_ones_are_not():
 def test_photographs_of_fields_far_apart_are_not_paired():
     here = lawnmower(4, 5)
     there = [
-        replace(p, time_s=p.time_s + 1e6, position=replace(p.position, latitude_deg=55)) for p in here if p.position
+        replace(p, time_s=p.time_s + 1e6, position=replace(p.position, latitude_deg=55.0)) for p in here if p.position
     ]
     also = [
-        replace(p, time_s=p.time_s + 2e6, position=replace(p.position, latitude_deg=56)) for p in here if p.position
+        replace(p, time_s=p.time_s + 2e6, position=replace(p.position, latitude_deg=56.0)) for p in here if p.position
     ]
     pairs = candidates([*here, *there, *also])
     assert len([pair for pair in pairs if pair[0] // 20 != pair[1] // 20]) <= 2 * (1 + IN_SEQUENCE)  # in sequence

@@ -45,6 +45,11 @@ class Residuals:
         return _rms(self.error_m[:, 2])
 
     @property
+    def rms_m(self) -> float:
+        """Of all directions together; NaN if there are none."""
+        return _rms(np.linalg.norm(self.error_m, axis=1))
+
+    @property
     def median_m(self) -> Float64[np.ndarray, " 3"]:
         """What all have in common, such as a shift between datums; NaN if there are none."""
         known = self.error_m[np.isfinite(self.error_m).all(axis=1)]

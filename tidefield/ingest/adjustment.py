@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
+from tidefield.data.georeference import Residuals
 from tidefield.ingest.ground_control import on_one_line
 from tidefield.ingest.marks import Marks, triangulate, triangulate_points
 
@@ -31,25 +31,8 @@ _CHECK_POINTS = 20_000
 _CHECK_POINTS_PER_IMAGE = 40
 _IMAGES_OF_A_LENS = 8
 """A lens that took fewer photographs stays as it is."""
-_STEPS = 50
-
-
-@dataclass(frozen=True)
-class Checks:
-    """Control points as seen by photographs that were adjusted without them.
-
-    Attributes:
-        names: of the points; those that two photographs or more show.
-        error_m: seen minus surveyed, east, north and up.
-    """
-
-    names: tuple[str, ...]
-    error_m: Float64[np.ndarray, "N 3"]
-
-    @property
-    def rms_m(self) -> float:
-        """Over all points and directions together; infinite if there are none."""
-        return float(np.sqrt((self.error_m**2).sum(1).mean())) if self.names else np.inf
+_STEPS = 200
+_TOLERANCE = 1e-7
 
 
 def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap.Reconstruction:
@@ -65,12 +48,8 @@ def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap
     generalise_lenses(copy, config, freed=lens == "freed")
     for name, surveyed in marks.points.items():
         config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_sensor_from_rig = False, False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = True
-    solver = options.ceres.solver_options
-    solver.max_num_iterations, solver.function_tolerance = _STEPS, 1e-7
-    options.ceres.solver_options = solver
+    options = adjustment_options()
+    options.refine_focal_length = True
     pycolmap.create_default_bundle_adjuster(options, config, copy).solve()
     return copy
 
@@ -89,7 +68,7 @@ def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction
 
 def leave_one_out(
     model: pycolmap.Reconstruction, marks: Marks, lens: Lens, progress: Callable[[int, int], object]
-) -> Checks:
+) -> Residuals:
     """Adjust without each control point in turn, and see where its marks then put it.
 
     With more than a dozen points a twelfth of them is left out at a time, of more than 300 photographs a quarter. Large
@@ -104,27 +83,38 @@ def leave_one_out(
     count = _FOLDS if model.num_reg_images() <= _LARGE else _FOLDS_OF_LARGE
     folds = [fold for fold in (seen[start::count] for start in range(count)) if fold]
     names, errors = [], []
-    thinned = _thinned(model)
+    light = thinned(model)
     for done, fold in enumerate(folds):
         progress(done, len(folds))
         rest = marks.where(~marks.of(*fold))
         if on_one_line(np.array(list(rest.points.values())).reshape(-1, 3)):
             continue
-        adjusted = adjust(thinned, rest, lens)
+        adjusted = adjust(light, rest, lens)
         for name in fold:
             point = triangulate(adjusted, marks.where(marks.of(name)))
             if point is not None:
                 names.append(name)
                 errors.append(point - surveyed[name])
     progress(len(folds), len(folds))
-    return Checks(tuple(names), np.array(errors, dtype=np.float64).reshape(-1, 3))
+    return Residuals(tuple(names), np.array(errors, dtype=np.float64).reshape(-1, 3))
 
 
-def seen_control(adjusted: pycolmap.Reconstruction, marks: Marks) -> Checks:
+def seen_control(adjusted: pycolmap.Reconstruction, marks: Marks) -> Residuals:
     """Control points as the photographs see them."""
     seen, surveyed = triangulate_points(adjusted, marks, 1.0), marks.points
     errors = [point - surveyed[name] for name, point in seen.items()]
-    return Checks(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+    return Residuals(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def adjustment_options() -> pycolmap.BundleAdjustmentOptions:
+    """All is adjusted but the focal length and how the cameras of a rig sit on it; until nothing much changes."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_sensor_from_rig = options.refine_focal_length = False
+    options.refine_principal_point = options.refine_extra_params = True
+    solver = options.ceres.solver_options
+    solver.max_num_iterations, solver.function_tolerance = _STEPS, _TOLERANCE
+    options.ceres.solver_options = solver
+    return options
 
 
 def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, freed: bool) -> None:
@@ -160,7 +150,7 @@ def _generalise(camera: pycolmap.Camera) -> None:
     camera.params = [*focal, *centre, *np.pad(terms, (0, 4 - len(terms)))]
 
 
-def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """A copy with no more points than a check needs."""
     copy = pycolmap.Reconstruction(model)
     numbers = np.array(sorted(copy.point3D_ids()))
@@ -168,13 +158,3 @@ def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     for number in np.random.default_rng(0).permutation(numbers)[most:]:
         copy.delete_point3D(int(number))
     return copy
-
-
-def worst(checks: Checks, factor: float, floor_m: float) -> str | None:
-    """The point that lies farther off than any other, if by a factor more than half of the others do."""
-    if len(checks.names) < 4:
-        return None
-    distance = np.linalg.norm(checks.error_m, axis=1)
-    last = int(np.argmax(distance))
-    typical = float(np.median(np.delete(distance, last)))
-    return checks.names[last] if distance[last] > max(factor * typical, floor_m) else None

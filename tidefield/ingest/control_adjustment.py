@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut, Residuals
-from tidefield.ingest.adjustment import Checks, Lens, adjust, carry_over, leave_one_out, seen_control, worst
+from tidefield.ingest.adjustment import Lens, adjust, carry_over, leave_one_out, seen_control
 from tidefield.ingest.alignment import metres
 from tidefield.ingest.ground_control import on_one_line
 from tidefield.ingest.marks import Marks, reprojection_px, triangulate_points
@@ -55,13 +55,13 @@ def adjust_to_control(
         why = (
             "Fewer than three control points can be used, or they lie on one line: the photographs were only laid onto"
         )
-        seen = _residuals(seen_control(model, marks.where(agree)))
+        seen = seen_control(model, marks.where(agree))
         return ControlResult(seen, Residuals(), _named(model, marks, agree), (f"{why} them, and cannot be checked.",))
     refused: set[str] = set()
     while True:
         agree = _settled(model, marks, agree, "held", refused)
         lens, check = _better_lens(model, marks.where(agree), progress)
-        wrong = worst(check, _POINT_FACTOR, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
+        wrong = _worst(check, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
         if wrong is None or len(refused) == _WRONG_POINTS:
             break
         refused.add(wrong)
@@ -71,8 +71,8 @@ def adjust_to_control(
         agree, check = settled, leave_one_out(model, marks.where(settled), lens, progress)
     adjusted = adjust(model, marks.where(agree), lens)
     result = ControlResult(
-        control=_residuals(seen_control(adjusted, marks.where(agree))),
-        check=_residuals(check),
+        control=seen_control(adjusted, marks.where(agree)),
+        check=check,
         left_out=_named(adjusted, marks, agree),
         notes=(*_lens_notes(model, adjusted, lens), *_unchecked(marks.where(agree), check)),
     )
@@ -97,19 +97,25 @@ def _settled(
 
 def _better_lens(
     model: pycolmap.Reconstruction, marks: Marks, progress: Callable[[int, int], object]
-) -> tuple[Lens, Checks]:
+) -> tuple[Lens, Residuals]:
     """The lens as it is, unless a freed one meets the points that are left out better."""
     held = leave_one_out(model, marks, "held", lambda done, whole: progress(done, 2 * whole))
     freed = leave_one_out(model, marks, "freed", lambda done, whole: progress(done + whole, 2 * whole))
     return ("freed", freed) if freed.rms_m < _WORTH_FREEING * held.rms_m else ("held", held)
 
 
+def _worst(check: Residuals, floor_m: float) -> str | None:
+    """The point that lies farther off than any other, if by much more than half of the others do."""
+    if len(check.names) < 4:
+        return None
+    distance = np.linalg.norm(check.error_m, axis=1)
+    last = int(np.argmax(distance))
+    typical = float(np.median(np.delete(distance, last)))
+    return check.names[last] if distance[last] > max(_POINT_FACTOR * typical, floor_m) else None
+
+
 def _places(marks: Marks) -> Float64[np.ndarray, "N 3"]:
     return np.array(list(marks.points.values()), dtype=np.float64).reshape(-1, 3)
-
-
-def _residuals(checks: Checks) -> Residuals:
-    return Residuals(checks.names, checks.error_m)
 
 
 def _pixel_m(model: pycolmap.Reconstruction) -> float:
@@ -168,6 +174,7 @@ def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstructio
     )
 
 
-def _unchecked(marks: Marks, check: Checks) -> tuple[str, ...]:
+def _unchecked(marks: Marks, check: Residuals) -> tuple[str, ...]:
     rest = sorted(set(marks.point) - set(check.names))
-    return (f"One photograph each shows {some(rest)}: used, but not checked.",) if rest else ()
+    why = "one photograph shows it, or too few points would be left"
+    return (f"Used, but not checked, is {some(rest)}: {why}.",) if rest else ()

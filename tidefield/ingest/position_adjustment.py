@@ -16,7 +16,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from tidefield.geometry.similarity import outliers
-from tidefield.ingest.adjustment import carry_over, generalise_lenses
+from tidefield.ingest.adjustment import adjustment_options, carry_over, generalise_lenses, thinned
 from tidefield.ingest.alignment import camera_centres, metres
 from tidefield.ingest.names import some
 
@@ -61,14 +61,17 @@ def adjust_to_positions(
     if len(names) < max(_FEWEST, model.num_reg_images() / 2):
         return ()
     before = _off_m(model, positions, names)
+    light = thinned(model)
     left_out: dict[Lens, Float64[np.ndarray, "N 3"]] = {}
     modes: tuple[Lens, ...] = ("held", "distortion")
     for done, lens in enumerate(modes):
+        # From here it is not far, and the same minimum is reached, to where each part of the positions leads.
+        begun = _adjusted(light, positions, names, lens)
         error = np.empty((len(names), 3))
         for fold in range(_FOLDS):
             progress(done * _FOLDS + fold, len(modes) * _FOLDS)
             own = names[fold::_FOLDS]
-            error[fold::_FOLDS] = _off_m(_adjusted(model, positions, set(names) - set(own), lens), positions, own)
+            error[fold::_FOLDS] = _off_m(_adjusted(begun, positions, set(names) - set(own), lens), positions, own)
         left_out[lens] = error
     progress(1, 1)
     best = min(modes, key=lambda lens: _median(left_out[lens]))
@@ -115,12 +118,9 @@ def _adjusted(
             prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
             priors.append(prior)
     generalise_lenses(copy, config, freed=lens == "distortion")
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = options.refine_sensor_from_rig = options.refine_focal_length = False
-    options.refine_principal_point = options.refine_extra_params = True
     trust = pycolmap.PosePriorBundleAdjustmentOptions()
     trust.alignment_ransac.random_seed = 0
-    pycolmap.create_pose_prior_bundle_adjuster(options, trust, config, priors, copy).solve()
+    pycolmap.create_pose_prior_bundle_adjuster(adjustment_options(), trust, config, priors, copy).solve()
     return copy
 
 
