@@ -146,6 +146,7 @@ def surveys(
     runs: Path,
     names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
     exhaustive: bool = True,
+    many: int = 2000,
     out: Path = Path("docs/surveys.md"),
 ) -> None:
     """Prepare surveys as they came from the camera, beside exhaustive structure from motion; write the page (hours).
@@ -155,12 +156,17 @@ def surveys(
         runs: Folder for the results, as RUNS/SURVEY.
         names: Of the surveys.
         exhaustive: Place the photographs exhaustively, too.
+        many: Prepare so many copies of the first survey's photographs, too, for the memory it takes; 0 for none.
         out: The Markdown file to write; replaced if it is there.
     """
+    from benchmarks.many import measure_many
     from benchmarks.records import run_measured
     from benchmarks.surveys import measure_surveys, write_page
 
-    measure_surveys(photographs, runs, names, exhaustive, run_measured, partial(print, flush=True))
+    say = partial(print, flush=True)
+    measure_surveys(photographs, runs, names, exhaustive, run_measured, say)
+    if many:
+        measure_many(photographs / names[0], runs, many, run_measured, say)
     write_page(runs, names, out)
     print(out)
 

@@ -54,6 +54,7 @@ def write_page(runs: Path, surveys: Sequence[str], out: Path) -> None:
             "the same library (pycolmap) runs them: every photograph matched with every other, focal length free.",
             _quality(records).markdown(),
             _time(records).markdown(),
+            *_many(read_json(runs / "many.json")),
         ]
     )
     with completed_file(out, overwrite=True) as partial:
@@ -99,6 +100,16 @@ def _quality(records: dict[str, dict[str, Any]]) -> Table:
     row("photographs disagree in colour by, % (before)", lambda r: _colour(r, "before"))
     row("photographs disagree in colour by, % (after)", lambda r: _colour(r, "after"))
     return Table("What came out", columns, rows)
+
+
+def _many(record: dict[str, Any] | None) -> list[str]:
+    if record is None:
+        return []
+    rows = [[f"{stage}, s", f"{seconds:.0f}"] for stage, seconds in record["steps_times"].items()]
+    rows.append(["peak memory, GB", f"{record['peak_memory_bytes'] / 1e9:.2f}"])
+    return [
+        Table(f"{record['photographs']} small photographs, copies of one survey far apart", ["", ""], rows).markdown()
+    ]
 
 
 def _mean(record: dict[str, Any], name: str) -> str | None:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from tidefield.config import SWIFT, EncoderConfig
 from tidefield.data.batches import Batch
 from tidefield.model.network import Network, TileRendering
-from tidefield.train.losses import DEPTH_SCALE, GLIMPSE_WEIGHT, photometric, sparse_depth
+from tidefield.train.losses import DEPTH_SCALE, GLIMPSE_WEIGHT, photometric, sparse_depth, structural
 
 SIDE, TILES = 8, 2
 NETWORK = Network(replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False)))
@@ -121,3 +122,29 @@ def test_the_depth_term_is_nothing_without_points_and_at_the_points():
     flat = replace(rendering, expected=tuple(torch.full_like(e, 0.2) for e in rendering.expected))
     met = replace(batch, inverse_depth=0.2 * (batch.depth_weight > 0))
     assert sparse_depth(flat, met, NETWORK, SIDE).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_the_structural_term_is_the_ssim_that_evaluation_measures():
+    rendering, batch = made()
+    pictures = [x.unflatten(1, (SIDE, SIDE)).permute(0, 3, 1, 2) for x in (rendering.colour, batch.colours)]
+    _, similarity = structural_similarity_index_measure(
+        *pictures, sigma=1.5, kernel_size=11, data_range=1.0, return_full_image=True
+    )
+    assert structural(rendering, batch, SIDE).item() == pytest.approx(1 - similarity.mean().item(), rel=1e-5)
+
+
+def test_the_structural_term_is_nothing_for_the_truth_and_leaves_out_what_has_no_weight():
+    rendering, batch = made()
+    assert structural(replace(rendering, colour=batch.colours), batch, SIDE).item() == pytest.approx(0, abs=1e-6)
+    weight = torch.ones(TILES, SIDE**2)
+    weight[1] = 0
+    one = replace(batch, weight=weight)
+    alone = replace(batch, colours=torch.cat([batch.colours[:1], rendering.colour[1:]]))
+    assert structural(rendering, one, SIDE).item() == pytest.approx(
+        2 * structural(rendering, alone, SIDE).item(), rel=1e-4
+    )
+    colour = rendering.colour.clone().requires_grad_()
+    structural(replace(rendering, colour=colour), one, SIDE).backward()
+    assert colour.grad is not None
+    assert colour.grad.isfinite().all()
+    assert (colour.grad[1] == 0).all()

@@ -92,6 +92,8 @@ class TrainConfig:
     unseen_weight: float = 1.0
     """In the loss, of pixels that fewer than two other training photographs see: little can be learned from what
     cannot be known, and its large errors drown the rest."""
+    structure_weight: float = 0.0
+    """In the loss, of 1 - SSIM of the tiles: squared errors alone leave what cannot be foretold blurred."""
     depth_weight: float = 0.0
     """In the loss, of the sparse points' depths (where a surface misses them by 1%, this much is added)."""
     neighbours: Literal["seen", "direction"] = "seen"

@@ -24,7 +24,7 @@ from tidefield.model.renderer import Renderer, start_intervals
 from tidefield.model.views import Encoded, Views
 from tidefield.train.checkpoint import Progress, load_training, save_checkpoint
 from tidefield.train.display import Display
-from tidefield.train.losses import photometric, psnr, sparse_depth
+from tidefield.train.losses import photometric, psnr, sparse_depth, structural
 
 log = logging.getLogger(__name__)
 
@@ -118,8 +118,11 @@ class Trainer:
         opaque = self.scene.background_rgb is None
         rendering = network(tiles, views, start_intervals(network, tiles, priors), opaque, self.generator)
         loss, error = photometric(rendering, batch, network, side)
-        if self.config.train.depth_weight:
-            loss = loss + self.config.train.depth_weight * sparse_depth(rendering, batch, network, side)
+        train = self.config.train
+        if train.structure_weight:
+            loss = loss + train.structure_weight * structural(rendering, batch, side)
+        if train.depth_weight:
+            loss = loss + train.depth_weight * sparse_depth(rendering, batch, network, side)
         return loss, error
 
     def _rate(self, share: float) -> float:

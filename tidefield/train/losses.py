@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from tidefield.data.batches import Batch
 from tidefield.model.network import Network, TileRendering
@@ -36,6 +37,16 @@ def photometric(
         mean = F.avg_pool2d(weighted_truth, stride).permute(0, 2, 3, 1) / total.clamp(min=1e-6)
         loss = loss + GLIMPSE_WEIGHT * _mean_square(seen - mean, total)
     return loss, error
+
+
+def structural(rendering: TileRendering, batch: Batch, side_px: int) -> Float[Tensor, ""]:
+    """1 - SSIM of the tiles' colours, as evaluation measures it, weighted as the batch says."""
+    found, truth, weight = (_picture(x, side_px) for x in (rendering.colour, batch.colours, batch.weight[..., None]))
+    _, similarity = structural_similarity_index_measure(
+        found, truth, sigma=1.5, kernel_size=11, data_range=1.0, return_full_image=True
+    )
+    assert isinstance(similarity, Tensor)
+    return ((1 - similarity) * weight).mean() / weight.mean().clamp(min=0.1)
 
 
 def sparse_depth(rendering: TileRendering, batch: Batch, network: Network, side_px: int) -> Float[Tensor, ""]:

@@ -1,0 +1,60 @@
+"""A survey of thousands of photographs, made of a small one: does memory stay flat?
+
+The photographs are reduced and copied; every copy of the survey lies kilometres from the others, so that the real
+stages choose pairs, match, place and report as for one huge survey.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from benchmarks.records import Runner, read_json, stamp, tidefield, write_json
+
+WIDTH = 400
+APART_DEG = 0.05
+
+
+def measure_many(source: Path, runs: Path, count: int, run: Runner, say: Callable[[str], object]) -> dict[str, Any]:
+    """Prepare `count` photographs; what it took is kept in RUNS/many.json, and is not measured again."""
+    kept = read_json(runs / "many.json")
+    if kept is not None:
+        return kept
+    with tempfile.TemporaryDirectory() as folder:
+        say(f"{count} photographs from {source}")
+        _copies(source, Path(folder) / "card", count)
+        took = run(tidefield("prepare", Path(folder) / "card", Path(folder) / "scene"), {})
+        report = read_json(Path(folder) / "scene" / "report.json")
+    steps = report["processing_statistics"]["steps_times"]
+    record = {"photographs": count, "steps_times": steps, **asdict(took), **stamp()}
+    write_json(runs / "many.json", record)
+    return record
+
+
+def _copies(source: Path, folder: Path, count: int) -> None:
+    """Reduced photographs, and gps.csv with the copies' places side by side."""
+    from tidefield.ingest.photographs import read_survey
+
+    folder.mkdir(parents=True)
+    photographs = [photograph for photograph in read_survey(source).photographs if photograph.position is not None]
+    lines = ["image_name,lat,lon,gps_height"]
+    for k in range(count):
+        copy, number = divmod(k, len(photographs))
+        photograph = photographs[number]
+        place = photograph.position
+        assert place is not None, "those without a position were left out"
+        name = f"{copy:03d}_{Path(photograph.name).name}"
+        with Image.open(photograph.path) as picture:
+            height = round(picture.height * WIDTH / picture.width)
+            exif = picture.getexif()
+            del exif[0x8825]  # GPS: gps.csv says where the copies are
+            picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(folder / name, quality=92, exif=exif)
+        row, column = divmod(copy, 20)
+        latitude, longitude = place.latitude_deg + APART_DEG * row, place.longitude_deg + APART_DEG * column
+        lines.append(f"{name},{latitude:.8f},{longitude:.8f},{place.height_m:.2f}")
+    (folder / "gps.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
