@@ -131,7 +131,15 @@ SWIFT = Config(
         views=5,
         fold=True,
     ),
-    train=TrainConfig(tile_px=32, tiles=4, crop_px=96, learning_rate=3e-3, unseen_weight=0.02, depth_weight=1e-4),
+    train=TrainConfig(
+        tile_px=32,
+        tiles=4,
+        crop_px=96,
+        learning_rate=3e-3,
+        unseen_weight=0.02,
+        structure_weight=1e-2,
+        depth_weight=1e-4,
+    ),
 )
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 
