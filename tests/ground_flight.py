@@ -14,7 +14,7 @@ WIDTH, HEIGHT, FOCAL = 400, 300, 320.0
 ABOVE = 40.0
 TEXEL_M, SIDE = 0.1, 1400
 FRAME = LocalFrame.at("EPSG:4326", (-2.75, 54.0, 100.0), "the ellipsoid of WGS 84")
-FOCAL_MM, EQUIVALENT_MM = 8.0, 28.8  # 320 px are 28.8 mm on the 36 mm of a full frame's width
+FOCAL_MM, EQUIVALENT_MM = 8.0, 27.69  # 320 px of a diagonal of 500, on the 43.27 mm of a full frame's
 
 
 @dataclass(frozen=True)

@@ -70,12 +70,14 @@ def place_photographs(
 
 def tangent_map(lens: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     """Tangent of the angle between each pixel's ray and the optical axis."""
-    columns, rows = (max(2, -(-x // STEP_PX)) for x in (lens.width, lens.height))
-    u = (np.arange(columns) + 0.5) * lens.width / columns
-    v = (np.arange(rows) + 0.5) * lens.height / rows
+    # From the first pixel's centre to the last's, so that nothing is extrapolated.
+    columns, rows = (max(2, 1 + -(-x // STEP_PX)) for x in (lens.width, lens.height))
+    u, v = np.linspace(0.5, lens.width - 0.5, columns), np.linspace(0.5, lens.height - 0.5, rows)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     coarse = np.linalg.norm(np.asarray(lens.cam_from_img(uv)), axis=1).reshape(rows, columns).astype(np.float32)
-    return cv2.resize(coarse, (lens.width, lens.height), interpolation=cv2.INTER_LINEAR)
+    column = np.linspace(0, columns - 1, lens.width, dtype=np.float32)
+    row = np.linspace(0, rows - 1, lens.height, dtype=np.float32)
+    return cv2.remap(coarse, *np.meshgrid(column, row), cv2.INTER_LINEAR)
 
 
 def _save(pixels: np.ndarray, source: Path, target: Path) -> None:
