@@ -7,7 +7,17 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tidefield"
-RANK = {"geometry": 0, "data": 1, "ingest": 2, "model": 2, "train": 3, "baselines": 3, "products": 3, "commands": 4, "cli": 5}
+RANK = {
+    "geometry": 0,
+    "data": 1,
+    "ingest": 2,
+    "model": 2,
+    "train": 3,
+    "baselines": 3,
+    "products": 3,
+    "commands": 4,
+    "cli": 5,
+}
 FOR_ALL = {"config", "device", "errors", "files", "meter", "options"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -76,6 +76,16 @@ def test_the_falloff_brightens_the_corners(photographs, tmp_path: Path):
     np.testing.assert_allclose(ours[0, 0], np.minimum(before[0, 0] * np.exp(0.5 * (tangent**2).sum()), 255), atol=2)
 
 
+def test_tiffs_stay_tiffs(tmp_path: Path):
+    for k in range(3):
+        camera_files.photograph(tmp_path / "card" / f"{k}.tif", SIZE)
+    photographs = read_survey(tmp_path / "card").photographs
+    place_photographs(photographs, tmp_path / "images", evening([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
+    with Image.open(tmp_path / "images" / "0.tif") as picture:
+        assert picture.format == "TIFF"
+        np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
+
+
 def test_what_an_earlier_run_left_goes(photographs, tmp_path: Path):
     (tmp_path / "images" / "old").mkdir(parents=True)
     (tmp_path / "images" / "old" / "gone.jpg").write_bytes(b"x")

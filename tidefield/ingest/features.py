@@ -49,7 +49,7 @@ def first_camera(photograph: Photograph) -> pycolmap.Camera:
     if lens and lens.principal_px:
         camera.principal_point_x, camera.principal_point_y = lens.principal_px
     if lens and lens.distortion:
-        camera.params = np.concatenate([camera.params[:4], _without_k3(lens, width, height)])
+        camera.params = [*camera.params[:4].tolist(), *_without_k3(lens, width, height).tolist()]
     camera.has_prior_focal_length = lens is not None
     return camera
 

@@ -86,7 +86,7 @@ def _residuals(model: pycolmap.Reconstruction, prepared: Prepared) -> tuple[repo
         )
         for kind, title, errors, told in kinds:
             stated = located.frame.from_crs(np.array([control.points[n] for n in errors.names]).reshape(-1, 3))
-            known = np.isfinite(errors.error_m).all(axis=1)
+            known = np.asarray(np.isfinite(errors.error_m).all(axis=1))
             found.append(report.Residuals(kind, title, errors.names, errors.error_m, stated, known, told))
     return tuple(item for item in found if item.names)
 

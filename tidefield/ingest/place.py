@@ -85,6 +85,9 @@ def _save(pixels: np.ndarray, source: Path, target: Path) -> None:
     with Image.open(source) as original:
         exif = original.getexif()
     exif[ExifTags.Base.Orientation] = 1
-    more = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+    picture = Image.fromarray(pixels)
     with completed_file(target, overwrite=True) as partial:
-        Image.fromarray(pixels).save(partial, exif=exif, **more)
+        if target.suffix.lower() in (".jpg", ".jpeg"):
+            picture.save(partial, exif=exif, quality=JPEG_QUALITY, subsampling=0)
+        else:
+            picture.save(partial, exif=exif)

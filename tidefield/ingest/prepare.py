@@ -202,7 +202,8 @@ class _Making:
 
         def job(resume: bool) -> Facts:
             model = pycolmap.Reconstruction(self.located)
-            lenses = {model.image(n).name: model.image(n).camera for n in model.reg_image_ids()}
+            images = [model.image(number) for number in model.reg_image_ids()]
+            lenses = {image.name: model.camera(image.camera_id) for image in images}
             cameras = [lenses[photograph.name] for photograph in photographs]
             with Meter(self.console, "Placing photographs") as meter:
                 place_photographs(photographs, folder, None, cameras, meter)
@@ -272,6 +273,6 @@ def _evening_to_json(evening: Evening) -> Facts:
 
 
 def _evening_from_json(values: Facts) -> Evening:
-    arrays = {name: np.array(values[name], dtype=np.float64) for name in ("gain", "falloff")}
-    numbers = {name: math.nan if values[name] is None else values[name] for name in ("before", "gains_alone", "after")}
-    return Evening(**arrays, **numbers, helps=values["helps"], sees_falloff=values["sees_falloff"])
+    gain, falloff = (np.array(values[name], dtype=np.float64) for name in ("gain", "falloff"))
+    errors = (math.nan if values[name] is None else values[name] for name in ("before", "gains_alone", "after"))
+    return Evening(gain, falloff, *errors, helps=values["helps"], sees_falloff=values["sees_falloff"])
