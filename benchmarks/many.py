@@ -38,7 +38,7 @@ def measure_many(source: Path, runs: Path, count: int, run: Runner, say: Callabl
 
 def _copies(source: Path, folder: Path, count: int) -> None:
     """Reduced photographs, and gps.csv with the copies' places side by side."""
-    from tidefield.ingest.photographs import read_survey
+    from tidefield.ingest.reading.photographs import read_survey
 
     folder.mkdir(parents=True)
     photographs = [photograph for photograph in read_survey(source).photographs if photograph.position is not None]

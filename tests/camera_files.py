@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.photographs import read_survey
 from tidefield.ingest.survey import Photograph, Survey
 
 SHARED = Path(__file__).parents[1] / ".." / "shared" / "data" / "photographs"

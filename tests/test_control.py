@@ -8,8 +8,8 @@ from PIL.ExifTags import Base
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.control import read_control
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.control import read_control
+from tidefield.ingest.reading.photographs import read_survey
 from tidefield.ingest.survey import Control, Mark
 
 UTM = "EPSG:32615"

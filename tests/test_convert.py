@@ -23,8 +23,9 @@ from scenes_on_disk import (
     write_transforms,
 )
 
+from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene, read_posed
-from tidefield.data.readers.posed import Observations, Reference
+from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SceneError
 from tidefield.ingest import convert
@@ -123,25 +124,19 @@ def test_scenes_of_other_layouts_are_imported_and_told_what_is_lost(
 
 def test_a_georeferenced_project_hands_on_where_it_is(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
-    given: list[Reference] = []
-
-    def note(folder: Path, reference: Reference) -> None:
-        (folder / "georeference.json").write_text("{}")
-        given.append(reference)
-
-    made = import_project(tmp_path / "project", tmp_path / "a", georeference=note)
-    assert (given, made.reference) == ([], None)
+    assert import_project(tmp_path / "project", tmp_path / "a").georeference is None
     (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
-    made = import_project(tmp_path / "project", tmp_path / "b", georeference=note)
-    assert given == [made.reference] == [Reference(4.5, -3.0, 2.0)]
-    assert sorted(os.listdir(tmp_path / "b")) == [
-        "georeference.json",
-        "images",
-        "sparse",
-        "sparse_pc.ply",
-        "transforms.json",
-    ]
-    assert '"orientation_override": "none"' in (tmp_path / "b" / "transforms.json").read_text()
+    import_project(tmp_path / "project", tmp_path / "b")
+    import_project(tmp_path / "b", tmp_path / "c")
+    for name in "bc":
+        located = read_georeference(tmp_path / name)
+        assert located is not None
+        assert located.frame is not None
+        assert located.source == "project"
+        np.testing.assert_allclose(located.frame.to_geographic(np.zeros((1, 3))), [[-3.0, 4.5, 2.0]], atol=1e-9)
+        assert located.frame.crs == "EPSG:32630"
+        assert '"orientation_override": "none"' in (tmp_path / name / "transforms.json").read_text()
+    assert not (tmp_path / "a" / "georeference.json").exists()
 
 
 def test_photographs_are_copied_or_linked_untouched(tmp_path: Path) -> None:
@@ -214,13 +209,10 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
 
 def test_an_import_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_project(tmp_path / "project")
-    (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
 
     def stumble(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        import_project(tmp_path / "project", tmp_path / "scene", georeference=stumble)
     with pytest.raises(KeyboardInterrupt):
         import_project(tmp_path / "project", tmp_path / "scene", progress=stumble)
     assert os.listdir(tmp_path) == ["project"]

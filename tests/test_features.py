@@ -9,7 +9,7 @@ import textured_wall as wall
 from PIL import Image
 from test_pairs import photograph
 
-from tidefield.ingest.features import FeatureOptions, extract, first_camera, lens_groups, opened
+from tidefield.ingest.motion.features import FeatureOptions, extract, first_camera, lens_groups, opened
 from tidefield.ingest.survey import LensPrior, Photograph
 
 OPTIONS = FeatureOptions(side_px=400, count=200)

@@ -9,8 +9,8 @@ import pytest
 from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.alignment import camera_centres, find_down
-from tidefield.ingest.georeference import georeference
+from tidefield.ingest.earth.alignment import camera_centres, find_down
+from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.survey import Survey
 
 

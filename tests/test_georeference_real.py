@@ -11,8 +11,8 @@ import pycolmap
 import pytest
 
 from tidefield.data.georeference import Georeference
-from tidefield.ingest.georeference import georeference
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.earth.georeference import georeference
+from tidefield.ingest.reading.photographs import read_survey
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 POINTS = 3000  # of 12,000, to be quick

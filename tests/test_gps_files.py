@@ -9,9 +9,9 @@ from camera_files import BRIGHTON, exif, named, photograph, survey_folder
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.gps_files import read_gps_file
-from tidefield.ingest.names import Names
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.gps_files import read_gps_file
+from tidefield.ingest.reading.names import Names
+from tidefield.ingest.reading.photographs import read_survey
 
 NAMES = Names(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
 

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, fly
 
-from tidefield.ingest.lens_choice import TERMS, Trial, best_of, choose_lens, told
+from tidefield.ingest.motion.lens_choice import TERMS, Trial, best_of, choose_lens, told
 
 
 def quiet(done: int, whole: int) -> None:

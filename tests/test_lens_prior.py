@@ -8,7 +8,7 @@ import pytest
 from camera_files import exif, one, real_survey, xmp
 from PIL.ExifTags import Base
 
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.photographs import read_survey
 
 
 def test_a_phantom_3_says_where_it_was_and_how_long_its_lens_is():

@@ -7,8 +7,8 @@ import pycolmap
 import torch
 from torch import Tensor
 
-from tidefield.ingest.features import opened
-from tidefield.ingest.matching import FARTHEST_RAD, RATIO, match, matched
+from tidefield.ingest.motion.features import opened
+from tidefield.ingest.motion.matching import FARTHEST_RAD, RATIO, match, matched
 
 
 def unit(count: int, seed: int) -> Tensor:

@@ -6,7 +6,7 @@ import pytest
 from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, survey_folder, xmp
 from PIL.ExifTags import GPS, Base
 
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.photographs import read_survey
 
 
 def test_a_canon_without_gps_takes_its_positions_from_the_table_beside():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tidefield.ingest.pairs import BEST, FEW, GLANCE, IN_SEQUENCE, MOST, NEARBY, candidates, glances, promising
+from tidefield.ingest.motion.pairs import BEST, FEW, GLANCE, IN_SEQUENCE, MOST, NEARBY, candidates, glances, promising
 from tidefield.ingest.survey import Photograph, Position
 
 

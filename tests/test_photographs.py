@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.reading.photographs import read_survey
 
 
 def test_three_real_surveys_are_read_whole_and_without_remarks():

@@ -11,9 +11,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
 from tidefield.errors import SurveyError
-from tidefield.ingest import pictures
-from tidefield.ingest.photographs import _read
-from tidefield.ingest.pictures import thumbnail, upright, upright_size, upright_uv
+from tidefield.ingest.reading import pictures
+from tidefield.ingest.reading.photographs import _read
+from tidefield.ingest.reading.pictures import thumbnail, upright, upright_size, upright_uv
 from tidefield.ingest.survey import Photograph
 
 

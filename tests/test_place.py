@@ -10,9 +10,9 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 from tidefield.ingest.colour import Evening
-from tidefield.ingest.photographs import read_survey
-from tidefield.ingest.pictures import upright
 from tidefield.ingest.place import place_photographs, tangent_map
+from tidefield.ingest.reading.photographs import read_survey
+from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import Photograph
 
 SIZE = (64, 48)

@@ -16,11 +16,11 @@ from rich.console import Console
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError, SurveyError
-from tidefield.ingest.alignment import camera_centres
-from tidefield.ingest.features import FeatureOptions
+from tidefield.ingest.earth.alignment import camera_centres
 from tidefield.ingest.findings import findings
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.motion.features import FeatureOptions
 from tidefield.ingest.prepare import Prepared, Wishes, prepare
+from tidefield.ingest.reading.photographs import read_survey
 from tidefield.ingest.report import write_report
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
@@ -113,7 +113,7 @@ def test_nothing_is_done_twice_and_a_changed_option_redoes_only_what_depends_on_
 
 
 def test_a_stage_that_was_broken_off_goes_on(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    import tidefield.ingest.features as features
+    import tidefield.ingest.motion.features as features
 
     original, asked = features._features, []
 

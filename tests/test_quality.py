@@ -11,11 +11,11 @@ from camera_files import BRIGHTON, exif, photograph, real_survey, survey_folder,
 from PIL import Image
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.measures import sharpness
-from tidefield.ingest.off_survey import off_survey
-from tidefield.ingest.photographs import read_survey
-from tidefield.ingest.pictures import upright
-from tidefield.ingest.quality import Verdict, judge, keep
+from tidefield.ingest.quality.measures import sharpness
+from tidefield.ingest.quality.off_survey import off_survey
+from tidefield.ingest.quality.verdicts import Verdict, judge, keep
+from tidefield.ingest.reading.photographs import read_survey
+from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import Control, Mark, Survey
 
 SIZE = (400, 300)

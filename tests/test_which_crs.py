@@ -3,8 +3,8 @@
 import pytest
 
 from tidefield.errors import SurveyError
+from tidefield.ingest.reading.which_crs import refuse_elsewhere
 from tidefield.ingest.survey import Control
-from tidefield.ingest.which_crs import refuse_elsewhere
 
 HERE = -2.752, 54.512
 

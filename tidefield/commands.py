@@ -20,11 +20,11 @@ from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
 from tidefield.ingest import convert
-from tidefield.ingest.features import FeatureOptions
 from tidefield.ingest.findings import findings
-from tidefield.ingest.photographs import read_survey
+from tidefield.ingest.motion.features import FeatureOptions
 from tidefield.ingest.prepare import Wishes
 from tidefield.ingest.prepare import prepare as prepare_scene
+from tidefield.ingest.reading.photographs import read_survey
 from tidefield.ingest.report import write_report
 from tidefield.meter import Meter
 from tidefield.model.network import Network
@@ -90,9 +90,11 @@ def import_project(options: Import, console: Console) -> None:
             options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=meter
         )
     seen = f", seen {made.observations:,} times" if made.observations else ""
+    frame = made.georeference and made.georeference.frame
+    where = f"; in metres about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f} ({frame.crs})" if frame else ""
     console.print(
         f"{options.scene}: {made.photographs} photographs, {made.held_out} of them held out; {made.cameras} "
-        f"camera{'s' * (made.cameras > 1)}; {made.points:,} sparse points{seen}",
+        f"camera{'s' * (made.cameras > 1)}; {made.points:,} sparse points{seen}{where}",
         highlight=False,
         soft_wrap=True,
     )

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,7 +19,7 @@ from tidefield.geometry.similarity import Similarity
 FILE_NAME = "georeference.json"
 _VERSION = 1
 
-Source = Literal["ground control", "GPS", "none"]
+Source = Literal["ground control", "GPS", "project", "none"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Georeference:
     Attributes:
         frame: None if nothing says where the scene is; the world then has its vertical from the photographs, and an
             origin and a scale of its own.
-        source: what the frame rests on.
+        source: what the frame rests on; "project" is what somebody else's project states.
         world_from_model: the similarity between the model as it was reconstructed and the world. With ground control
             the model was adjusted further, in the world.
         gps: of the cameras. Those that were left out are in it, for the report; the properties of `gps_used` are
@@ -156,7 +156,7 @@ def read_georeference(folder: Path) -> Georeference | None:
 
 
 def _from_json(values: dict[str, Any]) -> Georeference:
-    if values["source"] not in ("ground control", "GPS", "none"):
+    if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
     similarity = values["world_from_model"]
     residuals = {kind: _residuals_from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}

@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from tidefield.data.georeference import Georeference, Residuals, read_georeference
 from tidefield.data.images import Progress
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
 from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, refuse_existing
+from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import Lens
+from tidefield.geometry.similarity import Similarity
 from tidefield.ingest.export import write_transforms
 
 _GREY = 128
@@ -37,7 +40,7 @@ class Imported:
         photographs: how many; `held_out` of them.
         cameras: different lenses.
         points: sparse points, with `observations` in photographs.
-        reference: where on Earth the world is, where the project said so.
+        georeference: where on Earth the world is, where the project said so.
     """
 
     photographs: int
@@ -45,7 +48,7 @@ class Imported:
     cameras: int
     points: int
     observations: int
-    reference: Reference | None
+    georeference: Georeference | None
 
 
 def import_project(
@@ -54,17 +57,16 @@ def import_project(
     *,
     link: bool = False,
     allow_missing: bool = False,
-    georeference: Callable[[Path, Reference], None] | None = None,
     progress: Progress | None = None,
 ) -> Imported:
     """Make a Scene of anything that `load_scene` reads: photographs and poses stay as they are, float64 and undecoded.
 
     Args:
         source: the project or scene.
-        out: the new folder, with images/, sparse/0/ and transforms.json; it appears when it is complete.
+        out: the new folder, with images/, sparse/0/, transforms.json and, where the project says where on Earth it is,
+            georeference.json; it appears when it is complete.
         link: give the photographs a second name (a hard link) instead of copying them.
         allow_missing: go on without photographs that are named but not there.
-        georeference: called with the unfinished folder and where the world is, if the project says that.
         progress: called with (placed, of how many) photographs.
 
     Raises:
@@ -73,6 +75,7 @@ def import_project(
     """
     refuse_existing(out, replaceable=False)
     posed = _as_on_disk(read_posed(source, allow_missing), source)
+    located = read_georeference(source) or _as_stated(posed.reference)
     _tell_what_is_lost(posed, source)
     model = to_colmap(posed)
     with completed_folder(out) as folder:
@@ -80,16 +83,32 @@ def import_project(
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
-        write_transforms(folder, model, z_is_up=posed.reference is not None)
-        if georeference is not None and posed.reference is not None:
-            georeference(folder, posed.reference)
+        write_transforms(folder, model, z_is_up=located is not None)
+        if located is not None:
+            located.write(folder)
     return Imported(
         photographs=len(posed.names),
         held_out=len(every_eighth(len(posed.names))[1]),
         cameras=model.num_cameras(),
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
-        reference=posed.reference,
+        georeference=located,
+    )
+
+
+def _as_stated(reference: Reference | None) -> Georeference | None:
+    """What a project says of its world, which is in metres east, north and up already."""
+    if reference is None:
+        return None
+    return Georeference(
+        frame=LocalFrame.at(WGS84, (reference.longitude_deg, reference.latitude_deg, reference.height_m)),
+        source="project",
+        world_from_model=Similarity(1.0, np.eye(3), np.zeros(3)),
+        gps=Residuals(),
+        control=Residuals(),
+        check=Residuals(),
+        left_out=(),
+        notes=("The origin is what the imported project states; how good it is, the project knows.",),
     )
 
 

@@ -15,12 +15,12 @@ import pycolmap
 from tidefield import __version__
 from tidefield.data.georeference import Georeference
 from tidefield.ingest import report
-from tidefield.ingest.alignment import camera_centres
 from tidefield.ingest.colour import Evening
-from tidefield.ingest.features import opened
-from tidefield.ingest.lens_choice import told
-from tidefield.ingest.pictures import thumbnail
+from tidefield.ingest.earth.alignment import camera_centres
+from tidefield.ingest.motion.features import opened
+from tidefield.ingest.motion.lens_choice import told
 from tidefield.ingest.prepare import Prepared
+from tidefield.ingest.reading.pictures import thumbnail
 from tidefield.ingest.survey import Photograph
 
 THUMBNAIL_PX = 200

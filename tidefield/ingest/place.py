@@ -19,7 +19,7 @@ from PIL import ExifTags, Image
 
 from tidefield.files import completed_file
 from tidefield.ingest.colour import Evening, evened
-from tidefield.ingest.pictures import upright
+from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import Photograph
 
 STEP_PX = 8

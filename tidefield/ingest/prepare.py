@@ -21,16 +21,16 @@ from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.ingest.colour import Evening, estimate_evening
+from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.export import write_transforms
-from tidefield.ingest.features import FeatureOptions, extract, opened
-from tidefield.ingest.georeference import georeference
-from tidefield.ingest.lens_choice import Trial, choose_lens
-from tidefield.ingest.mapping import reconstruct, registered_names
-from tidefield.ingest.matching import match
-from tidefield.ingest.measures import Measures
-from tidefield.ingest.pairs import GLANCE, candidates, glances, promising
+from tidefield.ingest.motion.features import FeatureOptions, extract, opened
+from tidefield.ingest.motion.lens_choice import Trial, choose_lens
+from tidefield.ingest.motion.mapping import reconstruct, registered_names
+from tidefield.ingest.motion.matching import match
+from tidefield.ingest.motion.pairs import GLANCE, candidates, glances, promising
 from tidefield.ingest.place import place_photographs
-from tidefield.ingest.quality import Verdict, judge, keep
+from tidefield.ingest.quality.measures import Measures
+from tidefield.ingest.quality.verdicts import Verdict, judge, keep
 from tidefield.ingest.stages import Facts, Stages
 from tidefield.ingest.survey import Photograph, Survey
 from tidefield.meter import Meter

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from tidefield.ingest.adjustment import adjustment_options, thinned
-from tidefield.ingest.alignment import camera_centres, find_down, fit_positions
-from tidefield.ingest.gps import given_positions
+from tidefield.ingest.earth.adjustment import adjustment_options, thinned
+from tidefield.ingest.earth.alignment import camera_centres, find_down, fit_positions
+from tidefield.ingest.earth.gps import given_positions
 from tidefield.ingest.survey import Photograph
 
 TERMS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}

@@ -16,9 +16,9 @@ import pycolmap
 from jaxtyping import Float64
 
 from tidefield.geometry.similarity import outliers
-from tidefield.ingest.adjustment import adjustment_options, carry_over, generalise_lenses, thinned
-from tidefield.ingest.alignment import camera_centres, metres
-from tidefield.ingest.names import some
+from tidefield.ingest.earth.adjustment import adjustment_options, carry_over, generalise_lenses, thinned
+from tidefield.ingest.earth.alignment import camera_centres, metres
+from tidefield.ingest.reading.names import some
 
 DIFFERENTIAL_M = 0.3
 """Positions that state a standard deviation of less are from a differential receiver."""

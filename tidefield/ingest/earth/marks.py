@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.ingest.names import some
+from tidefield.ingest.reading.names import some
 from tidefield.ingest.survey import Control, Photograph
 
 

@@ -17,12 +17,12 @@ from jaxtyping import Float64, Int8
 from scipy.spatial import KDTree
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.duplicates import duplicates
-from tidefield.ingest.measures import SIDE_PX, Measures, measure
-from tidefield.ingest.off_survey import off_survey
-from tidefield.ingest.photographs import FEWEST
-from tidefield.ingest.pictures import thumbnail
-from tidefield.ingest.positions import metres_around
+from tidefield.ingest.quality.duplicates import duplicates
+from tidefield.ingest.quality.measures import SIDE_PX, Measures, measure
+from tidefield.ingest.quality.off_survey import off_survey
+from tidefield.ingest.reading.photographs import FEWEST
+from tidefield.ingest.reading.pictures import thumbnail
+from tidefield.ingest.reading.positions import metres_around
 from tidefield.ingest.survey import Photograph, Survey
 
 NEIGHBOURS = 6

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from tidefield.data.georeference import LeftOut
 from tidefield.geometry.geodesy import WGS84, LocalFrame
-from tidefield.ingest.positions import impossible
+from tidefield.ingest.reading.positions import impossible
 from tidefield.ingest.survey import Photograph, Position
 
 _DATUMS = {

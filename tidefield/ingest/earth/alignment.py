@@ -14,7 +14,7 @@ from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
-from tidefield.ingest.gps import GivenPositions
+from tidefield.ingest.earth.gps import GivenPositions
 from tidefield.ingest.survey import Photograph
 
 _NOMINAL_M = 3.0

@@ -15,7 +15,7 @@ from pathlib import Path
 import pycolmap
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.features import opened
+from tidefield.ingest.motion.features import opened
 from tidefield.ingest.stages import interruptible
 
 log = logging.getLogger(__name__)

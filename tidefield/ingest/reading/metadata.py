@@ -11,8 +11,8 @@ from typing import Literal
 
 from PIL import ExifTags, Image, PngImagePlugin
 
+from tidefield.ingest.reading.xmp import read_xmp
 from tidefield.ingest.survey import Position
-from tidefield.ingest.xmp import read_xmp
 
 _XMP_TAG = 700
 # https://www.easymanua.ls/dji/mavic-3m/manual?p=89: 0 no position, 16 single point, 32 to 49 float, 50 fixed.

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from tidefield.ingest.names import some
+from tidefield.ingest.reading.names import some
 from tidefield.ingest.survey import Photograph, Position
 
 _EARTH_M = 6_371_000.0

@@ -13,13 +13,13 @@ from pathlib import Path
 from PIL import ExifTags
 
 from tidefield.errors import SurveyError
-from tidefield.ingest import metadata as tags
-from tidefield.ingest.control import CONTROL_FILES, read_control
-from tidefield.ingest.gps_files import GPS_FILES, read_gps_file
-from tidefield.ingest.lens_prior import lens_prior
-from tidefield.ingest.names import Names, find_file, folded, some
-from tidefield.ingest.pictures import opened, refuse_truncated, stored_size, upright_size
-from tidefield.ingest.positions import drop_astray, drop_impossible
+from tidefield.ingest.reading import metadata as tags
+from tidefield.ingest.reading.control import CONTROL_FILES, read_control
+from tidefield.ingest.reading.gps_files import GPS_FILES, read_gps_file
+from tidefield.ingest.reading.lens_prior import lens_prior
+from tidefield.ingest.reading.names import Names, find_file, folded, some
+from tidefield.ingest.reading.pictures import opened, refuse_truncated, stored_size, upright_size
+from tidefield.ingest.reading.positions import drop_astray, drop_impossible
 from tidefield.ingest.survey import Photograph, Survey
 
 FEWEST = 3

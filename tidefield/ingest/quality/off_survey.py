@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from tidefield.ingest.positions import metres_around
+from tidefield.ingest.reading.positions import metres_around
 from tidefield.ingest.survey import Photograph
 
 APART = 6.0

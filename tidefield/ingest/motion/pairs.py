@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from tidefield.ingest.matching import matched
+from tidefield.ingest.motion.matching import matched
 from tidefield.ingest.survey import Photograph
 
 Pair = tuple[int, int]

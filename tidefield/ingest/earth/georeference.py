@@ -13,14 +13,14 @@ from jaxtyping import Float64
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
-from tidefield.ingest.alignment import Down, PositionFit, camera_centres, find_down, fit_positions
-from tidefield.ingest.control_adjustment import adjust_to_control
-from tidefield.ingest.gps import GivenPositions, given_positions
-from tidefield.ingest.ground_control import fit_control
-from tidefield.ingest.marks import place_marks
-from tidefield.ingest.position_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
+from tidefield.ingest.earth.alignment import Down, PositionFit, camera_centres, find_down, fit_positions
+from tidefield.ingest.earth.control_adjustment import adjust_to_control
+from tidefield.ingest.earth.gps import GivenPositions, given_positions
+from tidefield.ingest.earth.ground_control import fit_control
+from tidefield.ingest.earth.marks import place_marks
+from tidefield.ingest.earth.position_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
+from tidefield.ingest.reading.which_crs import refuse_elsewhere
 from tidefield.ingest.survey import Control, Photograph, Survey
-from tidefield.ingest.which_crs import refuse_elsewhere
 
 
 def georeference(

@@ -10,11 +10,11 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut, Residuals
-from tidefield.ingest.adjustment import Lens, adjust, carry_over, leave_one_out, seen_control
-from tidefield.ingest.alignment import metres
-from tidefield.ingest.ground_control import on_one_line
-from tidefield.ingest.marks import Marks, reprojection_px, triangulate_points
-from tidefield.ingest.names import some
+from tidefield.ingest.earth.adjustment import Lens, adjust, carry_over, leave_one_out, reliable, seen_control
+from tidefield.ingest.earth.alignment import metres
+from tidefield.ingest.earth.ground_control import on_one_line
+from tidefield.ingest.earth.marks import Marks, reprojection_px, triangulate_points
+from tidefield.ingest.reading.names import some
 
 _MARK_TOLERANCE = 0.005
 """Of an image's width. A mark farther than this from where an adjusted model shows its point is wrong, or, where others
@@ -58,18 +58,19 @@ def adjust_to_control(
         seen = seen_control(model, marks.where(agree))
         return ControlResult(seen, Residuals(), _named(model, marks, agree), (f"{why} them, and cannot be checked.",))
     refused: set[str] = set()
+    sound = reliable(model)
     while True:
-        agree = _settled(model, marks, agree, "held", refused)
-        lens, check = _better_lens(model, marks.where(agree), progress)
+        agree = _settled(sound, marks, agree, "held", refused)
+        lens, check = _better_lens(sound, marks.where(agree), progress)
         wrong = _worst(check, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
         if wrong is None or len(refused) == _WRONG_POINTS:
             break
         refused.add(wrong)
         agree = agree & ~marks.of(wrong)
-    settled = _settled(model, marks, agree, lens, refused)
+    settled = _settled(sound, marks, agree, lens, refused)
     if (settled != agree).any():
-        agree, check = settled, leave_one_out(model, marks.where(settled), lens, progress)
-    adjusted = adjust(model, marks.where(agree), lens)
+        agree, check = settled, leave_one_out(sound, marks.where(settled), lens, progress)
+    adjusted = adjust(sound, marks.where(agree), lens)
     result = ControlResult(
         control=seen_control(adjusted, marks.where(agree)),
         check=check,
@@ -89,10 +90,16 @@ def _settled(
         adjusted = adjust(model, marks.where(agree), lens)
         share = reprojection_px(adjusted, marks, marks.surveyed_world) / marks.width_px
         settled = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
+        settled &= ~marks.of(*_outvoted(marks, settled))
         if (settled == agree).all() or on_one_line(_places(marks.where(settled))):
             break
         agree = settled
     return agree
+
+
+def _outvoted(marks: Marks, agree: Bool[np.ndarray, " M"]) -> list[str]:
+    """Points most of whose marks disagree: then so does the point, and what agrees does so by chance."""
+    return [name for name in marks.points if 2 * np.count_nonzero(agree & marks.of(name)) < marks.of(name).sum()]
 
 
 def _better_lens(

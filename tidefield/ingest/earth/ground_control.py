@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64
 
 from tidefield.errors import SurveyError
 from tidefield.geometry.similarity import ON_ONE_LINE, Similarity, hypotheses, refine_similarity
-from tidefield.ingest.alignment import Down, PositionFit
-from tidefield.ingest.marks import Marks, reprojection_px, triangulate_points
+from tidefield.ingest.earth.alignment import Down, PositionFit
+from tidefield.ingest.earth.marks import Marks, reprojection_px, triangulate_points
 
 PLAINLY_WRONG = 0.02
 """Of an image's width: a mark this far from where an unadjusted model has its point, which bends by less, is wrong."""

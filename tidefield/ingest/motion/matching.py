@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tidefield.ingest.features import opened
+from tidefield.ingest.motion.features import opened
 
 RATIO, FARTHEST_RAD = 0.8, 0.7
 """A match is nearer than `RATIO` times the second nearest and than `FARTHEST_RAD`, as angles: COLMAP's values."""

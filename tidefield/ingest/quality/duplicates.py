@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int8
 
-from tidefield.ingest.measures import agreement
-from tidefield.ingest.positions import metres_around
+from tidefield.ingest.quality.measures import agreement
+from tidefield.ingest.reading.positions import metres_around
 from tidefield.ingest.survey import Photograph
 
 SHIFT = 0.03

@@ -15,8 +15,8 @@ import numpy as np
 
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import parse_crs
-from tidefield.ingest.crs import read_crs, to_wgs84
-from tidefield.ingest.names import Names, read_text
+from tidefield.ingest.reading.crs import read_crs, to_wgs84
+from tidefield.ingest.reading.names import Names, read_text
 from tidefield.ingest.survey import Position
 
 GPS_FILES = ("geo.txt", "gps.csv")

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from PIL import ExifTags
 
-from tidefield.ingest.metadata import Metadata, camera
-from tidefield.ingest.pictures import upright_rotation, upright_uv
+from tidefield.ingest.reading.metadata import Metadata, camera
+from tidefield.ingest.reading.pictures import upright_rotation, upright_uv
 from tidefield.ingest.survey import LensPrior
 
 # Of 35 mm film's frame of 36 x 24 mm. CIPA's guideline DCG-001 defines the equivalent by the angle over the diagonal,

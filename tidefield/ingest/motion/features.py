@@ -15,7 +15,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from tidefield.ingest.pictures import upright
+from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import LensPrior, Photograph
 
 Progress = Callable[[int, int], object]

@@ -16,12 +16,12 @@ import numpy as np
 
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import parse_crs
-from tidefield.ingest.crs import read_crs
-from tidefield.ingest.gps_files import split_name
-from tidefield.ingest.names import Names, read_text, some
-from tidefield.ingest.pictures import upright_size, upright_uv
+from tidefield.ingest.reading.crs import read_crs
+from tidefield.ingest.reading.gps_files import split_name
+from tidefield.ingest.reading.names import Names, read_text, some
+from tidefield.ingest.reading.pictures import upright_size, upright_uv
+from tidefield.ingest.reading.which_crs import refuse_elsewhere
 from tidefield.ingest.survey import Control, Mark, Photograph
-from tidefield.ingest.which_crs import refuse_elsewhere
 
 CONTROL_FILES = ("gcp_list.txt",)
 """Found beside the photographs by themselves."""

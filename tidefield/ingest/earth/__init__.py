@@ -1,0 +1,1 @@
+"""A model laid onto the Earth, by GPS or by ground control."""

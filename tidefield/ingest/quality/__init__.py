@@ -1,0 +1,1 @@
+"""Which photographs do a survey more harm than good."""
