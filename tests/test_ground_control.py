@@ -8,6 +8,7 @@ import pytest
 from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
 
 from tidefield.errors import SurveyError
+from tidefield.ingest.earth.adjustment import reliable
 from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.survey import Control, Survey
 
@@ -140,6 +141,37 @@ def test_a_point_that_is_half_a_metre_off_is_told_from_the_others_by_leaving_it_
     points = survey.control.points | {"G5": (east + 0.5, north, up + 0.9)}
     _, found = located(flight, replace(survey, control=replace(survey.control, points=points)))
     assert [(item.kind, item.name) for item in found.left_out] == [("control point", "G5")]
+
+
+def test_a_point_one_of_whose_three_marks_agrees_by_chance_is_left_out_whole(flight):
+    survey = only_marks(with_control(flight), "G6", 3)
+    assert survey.control is not None
+    one, *others = [mark for mark in survey.control.marks if mark.point == "G6"]
+    moved = {
+        mark: replace(mark, uv_px=(mark.uv_px[0] + 90, mark.uv_px[1] + 40 - 80 * i)) for i, mark in enumerate(others)
+    }
+    _, found = located(flight, with_marks(survey, lambda mark: moved.get(mark, mark)))
+    assert {item.name for item in found.left_out} == {f"G6 in {mark.photograph}" for mark in (one, *others)}
+    assert "G6" not in found.control.names
+
+
+def test_matches_that_fit_far_worse_than_most_are_not_adjusted_to(flight):
+    model = pycolmap.Reconstruction(flight.model)
+    wrong = {}
+    for number in sorted(model.point3D_ids())[::15]:
+        element = model.points3D[number].track.elements[0]
+        wrong[number] = element.image_id
+        model.images[element.image_id].points2D[element.point2D_idx].xy += (5.0, -3.0)
+    sound = reliable(model)
+    assert len(wrong) > 15
+    for number, image in wrong.items():
+        assert not sound.exists_point3D(number) or image not in seen_by(sound, number)
+    assert sound.compute_num_observations() > 0.85 * model.compute_num_observations()
+    assert model.num_points3D() == flight.model.num_points3D()
+
+
+def seen_by(model: pycolmap.Reconstruction, number: int) -> set[int]:
+    return {element.image_id for element in model.points3D[number].track.elements}
 
 
 def test_points_that_one_photograph_shows_are_used_and_said_not_to_be_checked(flight):
