@@ -145,7 +145,7 @@ def surveys(
     photographs: Path,
     runs: Path,
     names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
-    exhaustive: bool = True,
+    pairs: int | None = None,
     many: int = 2000,
     out: Path = Path("docs/surveys.md"),
 ) -> None:
@@ -155,7 +155,7 @@ def surveys(
         photographs: Folder with the surveys' folders.
         runs: Folder for the results, as RUNS/SURVEY.
         names: Of the surveys.
-        exhaustive: Place the photographs exhaustively, too.
+        pairs: Of the exhaustive run, match only so many pairs, and reckon the time of all; 0 leaves it out.
         many: Prepare so many copies of the first survey's photographs, too, for the memory it takes; 0 for none.
         out: The Markdown file to write; replaced if it is there.
     """
@@ -164,7 +164,7 @@ def surveys(
     from benchmarks.surveys import measure_surveys, write_page
 
     say = partial(print, flush=True)
-    measure_surveys(photographs, runs, names, exhaustive, run_measured, say)
+    measure_surveys(photographs, runs, names, pairs, run_measured, say)
     if many:
         measure_many(photographs / names[0], runs, many, run_measured, say)
     write_page(runs, names, out)
