@@ -21,6 +21,7 @@ from tidefield.ingest.motion.features import opened
 from tidefield.ingest.motion.lens_choice import told
 from tidefield.ingest.prepare import Prepared
 from tidefield.ingest.reading.pictures import thumbnail
+from tidefield.ingest.report.page import MOST_THUMBNAILS
 from tidefield.ingest.survey import Photograph
 
 THUMBNAIL_PX = 200
@@ -98,7 +99,8 @@ def _unfit(prepared: Prepared) -> list[report.LeftOut]:
     for verdict in unfit:
         measures = {} if verdict.measures is None else vars(verdict.measures)
         finite = {name: value for name, value in measures.items() if math.isfinite(value)}
-        picture = None if verdict.measures is None else thumbnail(by_name[verdict.name], THUMBNAIL_PX)
+        shown = verdict.measures is not None and len(told) < MOST_THUMBNAILS
+        picture = thumbnail(by_name[verdict.name], THUMBNAIL_PX) if shown else None
         told.append(report.LeftOut(verdict.name, "quality", str(verdict.left_out), finite, picture))
     return told
 
@@ -113,7 +115,8 @@ def _unplaced(prepared: Prepared, scene: Path) -> list[report.LeftOut]:
     told = []
     for photograph in used:
         reason = _why(photograph, features[photograph.name], matches.get(photograph.name, []), elsewhere)
-        told.append(report.LeftOut(photograph.name, "poses", reason, {}, thumbnail(photograph, THUMBNAIL_PX)))
+        picture = thumbnail(photograph, THUMBNAIL_PX) if len(told) < MOST_THUMBNAILS else None
+        told.append(report.LeftOut(photograph.name, "poses", reason, {}, picture))
     return told
 
 
