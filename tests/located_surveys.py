@@ -44,19 +44,21 @@ def fly(
     position_m: float = 0.0,
     camera: pycolmap.Camera | None = None,
     seed: int = 0,
+    tilt_deg: float = 3.0,
 ) -> Flight:
     """Lines 25 m apart, there and back along the east, 75 m above the ground, a photograph every 15 m.
 
     Args:
         position_m: standard deviation of the receiver, in each direction.
         camera: that took the photographs; without distortion if not given.
+        tilt_deg: standard deviation of the camera's, sideways and forwards.
     """
     generator = np.random.default_rng(seed)
     x, y = (np.arange(each) - (each - 1) / 2) * 15.0, (np.arange(lines) - (lines - 1) / 2) * 25.0
     rows = [np.c_[x if i % 2 == 0 else x[::-1], np.full(each, y[i])] for i in range(lines)]
     centres = np.c_[np.concatenate(rows), 75 + generator.normal(0, 1.5, lines * each)]
     yaw = np.where(np.arange(len(centres)) // each % 2 == 0, 0.0, 180.0)
-    tilts = generator.normal(0, 3.0, (len(centres), 2))
+    tilts = generator.normal(0, tilt_deg, (len(centres), 2))
     # Camera axes in the world: x east, y south, z down, then turned.
     rotations = Rotation.from_euler("ZYX", np.c_[yaw, tilts], degrees=True).as_matrix() @ np.diag([1.0, -1, -1])
     half = np.array([each * 7.5 + 45, lines * 12.5 + 35])

@@ -3,9 +3,10 @@
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import FOCAL, HEIGHT, WIDTH, fly
+from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
 
-from tidefield.ingest.motion.lens_choice import TERMS, Trial, best_of, choose_lens, told
+from tidefield.ingest.earth.adjustment import adjustment_options
+from tidefield.ingest.motion.lens_choice import SPREAD_DEG, TERMS, Choice, Trial, best_of, choose_lens, told
 
 
 def quiet(done: int, whole: int) -> None:
@@ -28,7 +29,9 @@ def camera(k1: float, k2: float, p1: float = 0.0, p2: float = 0.0) -> pycolmap.C
 def test_the_terms_that_a_lens_has_are_found(own: pycolmap.Camera, lens: str):
     flight = fly(camera=own, noise_px=0.2)
     model = pycolmap.Reconstruction(flight.model)
-    trials = choose_lens(model, flight.survey.photographs, False, quiet)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    trials = choice.trials
+    assert not choice.freed
     assert [trial.lens for trial in trials if trial is not trials[-1]] == [name for name in TERMS if name != lens]
     assert trials[-1].lens == lens
     (found,) = model.cameras.values()
@@ -41,7 +44,7 @@ def test_the_terms_that_a_lens_has_are_found(own: pycolmap.Camera, lens: str):
 
 def test_without_enough_positions_matches_alone_decide():
     flight = fly(camera=camera(-0.25, 0.2), noise_px=0.2)
-    trials = choose_lens(pycolmap.Reconstruction(flight.model), flight.survey.photographs[:3], False, quiet)
+    trials = choose_lens(pycolmap.Reconstruction(flight.model), flight.survey.photographs[:3], True, quiet).trials
     assert trials[-1].lens == "RADIAL"
     assert all(trial.off_m is None for trial in trials)
 
@@ -51,8 +54,10 @@ def test_an_unknown_focal_length_is_refined():
     model = pycolmap.Reconstruction(flight.model)
     (own,) = model.cameras.values()
     own.params = [1.1 * FOCAL, *own.params[1:]]
-    choose_lens(model, flight.survey.photographs, True, quiet)
+    choice = choose_lens(model, flight.survey.photographs, False, quiet)
     (found,) = model.cameras.values()
+    assert choice.freed
+    assert "heights may be wrong" in told(choice)[0]
     assert found.focal_length_x != pytest.approx(1.1 * FOCAL, rel=1e-3)
     assert model.compute_mean_reprojection_error() < 0.45
 
@@ -68,13 +73,45 @@ def test_an_unknown_focal_length_is_refined():
     ],
 )
 def test_a_richer_lens_must_be_worth_it_and_not_bend_the_model(errors, offs, lens):
-    trials = [Trial(*values) for values in zip(TERMS, errors, offs, strict=True)]
+    trials = [Trial(*values, FOCAL) for values in zip(TERMS, errors, offs, strict=True)]
     assert best_of(trials).lens == lens
 
 
 def test_the_surveyor_is_told_where_positions_spoke_against_a_richer_lens():
-    simple, radial, full = Trial("SIMPLE_RADIAL", 0.46, 0.59), Trial("RADIAL", 0.43, 0.65), Trial("OPENCV", 0.42, 0.67)
-    (sentence,) = told((radial, full, simple))
+    simple, radial, full = (
+        Trial(*values, FOCAL)
+        for values in (("SIMPLE_RADIAL", 0.46, 0.59), ("RADIAL", 0.43, 0.65), ("OPENCV", 0.42, 0.67))
+    )
+    (sentence,) = told(Choice((radial, full, simple), known=True, freed=False, spread_deg=3.0))
     assert "0.42 px instead of 0.46" in sentence
     assert "0.67 m instead of 0.59" in sentence
-    assert told((simple, radial, full)) == ()
+    assert told(Choice((simple, radial, full), known=True, freed=False, spread_deg=3.0)) == ()
+
+
+def test_a_wrong_focal_length_is_corrected_where_the_photographs_look_in_different_directions():
+    flight = fly(lines=4, each=6, tilt_deg=25.0, noise_px=0.2)
+    model = adjusted_with(flight, 1.04 * FOCAL)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    assert choice.spread_deg > SPREAD_DEG
+    assert choice.freed
+    assert model.cameras[1].focal_length_x == pytest.approx(FOCAL, rel=0.005)
+    assert f"refined from {1.04 * FOCAL:.1f} to" in told(choice)[0]
+
+
+def test_photographs_straight_down_keep_the_focal_length_that_is_stated():
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    model = adjusted_with(flight, 1.04 * FOCAL)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    assert choice.spread_deg < SPREAD_DEG
+    assert not choice.freed
+    assert model.cameras[1].focal_length_x == pytest.approx(1.04 * FOCAL)
+
+
+def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
+    """As structure from motion leaves it that was told a wrong focal length."""
+    model = pycolmap.Reconstruction(flight.model)
+    model.cameras[1].params = [focal_px, *model.cameras[1].params[1:]]
+    options = adjustment_options()
+    options.refine_principal_point = False
+    pycolmap.bundle_adjustment(model, options)
+    return model

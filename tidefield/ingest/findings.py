@@ -50,7 +50,7 @@ def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> rep
             "pycolmap": pycolmap.__version__,
             "Python": platform.python_version(),
         },
-        remarks=(*located.notes, *told(prepared.lenses), *prepared.survey.remarks),
+        remarks=(*located.notes, *told(prepared.lens), *prepared.survey.remarks),
     )
 
 

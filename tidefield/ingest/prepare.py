@@ -24,7 +24,7 @@ from tidefield.ingest.colour import Evening, estimate_evening
 from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.export import write_transforms
 from tidefield.ingest.motion.features import FeatureOptions, extract, opened
-from tidefield.ingest.motion.lens_choice import Trial, choose_lens
+from tidefield.ingest.motion.lens_choice import Choice, Trial, choose_lens
 from tidefield.ingest.motion.mapping import reconstruct, registered_names
 from tidefield.ingest.motion.matching import match
 from tidefield.ingest.motion.pairs import GLANCE, candidates, glances, promising
@@ -67,7 +67,7 @@ class Prepared:
         verdicts: on every photograph's quality.
         used: names of the photographs that were not left out for it.
         models: names of the photographs of every model, the largest first.
-        lenses: the lens models that were tried, the one of the largest model last.
+        lens: how that of the largest model was chosen.
         georeference: where the largest lies.
         evening: of its photographs in the order of their names; None if it was not to be tried.
         seconds: of each stage.
@@ -77,7 +77,7 @@ class Prepared:
     verdicts: tuple[Verdict, ...]
     used: frozenset[str]
     models: list[list[str]]
-    lenses: tuple[Trial, ...]
+    lens: Choice
     georeference: Georeference
     evening: Evening | None
     seconds: dict[str, float]
@@ -96,12 +96,12 @@ def prepare(survey: Survey, scene: Path, wishes: Wishes, device: torch.device, c
     good = keep(survey, verdicts, wishes.keep_all)
     making.features(good.photographs)
     making.matches(making.pairs(good.photographs))
-    models, lenses = making.poses()
+    models, lens = making.poses()
     located = making.georeference(good)
     registered = [photograph for photograph in good.photographs if photograph.name in set(models[0])]
     evening = making.images(registered, located)
     used = frozenset(photograph.name for photograph in good.photographs)
-    return Prepared(survey, verdicts, used, models, lenses, located, evening, making.stages.seconds)
+    return Prepared(survey, verdicts, used, models, lens, located, evening, making.stages.seconds)
 
 
 class _Making:
@@ -161,22 +161,23 @@ class _Making:
 
         self.stages.run("matches", {}, [self.database], job)
 
-    def poses(self) -> tuple[list[list[str]], tuple[Trial, ...]]:
+    def poses(self) -> tuple[list[list[str]], Choice]:
         """Structure from motion; returns the photographs of every model, the largest first, and how its lens fits."""
 
         def job(resume: bool) -> Facts:
             with Meter(self.console, "Placing photographs") as meter:
                 models = reconstruct(self.database, self.work / "models", meter)
-            unknown = any(photograph.lens is None for photograph in self.survey.photographs)
+            known = all(photograph.lens is not None for photograph in self.survey.photographs)
             with Meter(self.console, "Choosing a lens") as meter:
-                trials = choose_lens(models.best, self.survey.photographs, unknown, meter)
+                choice = choose_lens(models.best, self.survey.photographs, known, meter)
             self.model.mkdir(exist_ok=True)
             models.best.write_binary(self.model)
             names = [registered_names(models.best), *map(list, models.others)]
-            return {"models": names, "lenses": [asdict(trial) for trial in trials]}
+            return {"models": names, "lens": asdict(choice)}
 
         facts = self.stages.run("poses", {}, [self.model], job)
-        return facts["models"], tuple(Trial(**trial) for trial in facts["lenses"])
+        trials = tuple(Trial(**trial) for trial in facts["lens"]["trials"])
+        return facts["models"], Choice(**{**facts["lens"], "trials": trials})
 
     def georeference(self, good: Survey) -> Georeference:
         """Lay the largest model onto the Earth."""

@@ -1,8 +1,12 @@
-"""How many terms of distortion a survey can bear.
+"""How many terms of distortion a survey can bear, and whether it can tell its focal length.
 
 Every further term fits the matches better. But photographs straight down over flat ground do not tell distortion from
 bent ground, and the error that a term takes off the matches may go into a bowl-shaped model. Where positions are known
 they tell: a richer lens is taken only if the cameras fit their positions as well with it as without.
+
+Photographs whose optical axes are parallel do not tell the focal length, whatever the relief: a world stretched along
+the axes looks through a longer lens just as it did. It is refined, where something else states it, only if the
+photographs look in different directions.
 """
 
 from __future__ import annotations
@@ -26,6 +30,8 @@ BENDS = 1.03
 """... and may not bring the distance from the positions above this share."""
 FEWEST = 6
 """Positions that can tell whether a model is bent."""
+SPREAD_DEG = 10.0
+"""RMS angle of the optical axes from their mean that tells the focal length."""
 
 
 @dataclass(frozen=True)
@@ -37,62 +43,122 @@ class Trial:
         error_px: mean reprojection error.
         off_m: RMS distance of the cameras from their positions, after the best similarity; None if positions cannot
             tell.
+        focal_px: of the first camera.
     """
 
     lens: str
     error_px: float
     off_m: float | None
+    focal_px: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the lens of a model was chosen.
+
+    Attributes:
+        trials: what was tried; the last is the one that was chosen.
+        known: whether something else than the matches states the focal length.
+        freed: whether it was refined.
+        spread_deg: RMS angle of the optical axes from their mean.
+    """
+
+    trials: tuple[Trial, ...]
+    known: bool
+    freed: bool
+    spread_deg: float
 
 
 def choose_lens(
     model: pycolmap.Reconstruction,
     photographs: Sequence[Photograph],
-    focal: bool,
+    known: bool,
     progress: Callable[[int, int], object],
-) -> tuple[Trial, ...]:
+) -> Choice:
     """Adjust a model, in place, with the richest lens model that does not bend it.
 
     Args:
         photographs: of the survey.
-        focal: refine the focal length, too.
-
-    Returns:
-        What was tried, the simplest lens first; the last is the one that was chosen.
+        known: whether the model's focal length is stated by something else than the matches.
     """
-    light, trials = thinned(model), []
-    for lens in TERMS:
+    light, trials, spread = thinned(model), [], axes_spread_deg(model)
+    tells = known and spread >= SPREAD_DEG
+    steps = len(TERMS) + 1 + tells
+
+    def attempt(lens: str, focal: bool) -> Trial:
         copy = pycolmap.Reconstruction(light)
         _adjust(copy, lens, focal)
-        trials.append(Trial(lens, copy.compute_mean_reprojection_error(), _off_m(copy, photographs)))
-        progress(len(trials), len(TERMS) + 1)
-    best = best_of(trials)
-    _adjust(model, best.lens, focal)
-    progress(1, 1)
-    return (*(trial for trial in trials if trial is not best), best)
+        trials.append(_trial(copy, lens, photographs))
+        progress(len(trials), steps)
+        return trials[-1]
+
+    best = best_of([attempt(lens, not known) for lens in TERMS])
+    freed = not known
+    if tells:
+        with_focal = attempt(best.lens, True)
+        freed = _better(with_focal, best)
+        best = with_focal if freed else best
+    _adjust(model, best.lens, freed)
+    progress(steps, steps)
+    return Choice((*(trial for trial in trials if trial is not best), best), known, freed, spread)
+
+
+def axes_spread_deg(model: pycolmap.Reconstruction) -> float:
+    """RMS angle of the optical axes from their mean."""
+    axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
+    mean = axes.mean(axis=0)
+    cosine = np.clip(axes @ mean / max(float(np.linalg.norm(mean)), 1e-9), -1, 1)
+    return float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
 
 
 def best_of(trials: Sequence[Trial]) -> Trial:
     """The richest of lenses, given the simplest first, that improves the matches and does not bend the model."""
     best = trials[0]
     for trial in trials[1:]:
-        bends = trial.off_m is not None and best.off_m is not None and trial.off_m > BENDS * best.off_m
-        if trial.error_px < WORTH * best.error_px and not bends:
-            best = trial
+        best = trial if _better(trial, best) else best
     return best
 
 
-def told(trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Why the lens has no more terms, as a sentence for the surveyor, where positions spoke against them."""
+def _better(richer: Trial, plainer: Trial) -> bool:
+    bends = richer.off_m is not None and plainer.off_m is not None and richer.off_m > BENDS * plainer.off_m
+    return richer.error_px < WORTH * plainer.error_px and not bends
+
+
+def told(choice: Choice) -> tuple[str, ...]:
+    """What a surveyor should know of it, as sentences."""
+    return (*_told_of_focal(choice), *_told_of_terms(choice.trials))
+
+
+def _told_of_focal(choice: Choice) -> list[str]:
+    axes = f"the directions of the photographs differ by {choice.spread_deg:.0f} degrees"
+    if choice.known and choice.freed:
+        stated = choice.trials[0].focal_px
+        return [f"The focal length was refined from {stated:.1f} to {choice.trials[-1].focal_px:.1f} px: {axes}."]
+    if not choice.known and choice.spread_deg < SPREAD_DEG:
+        return [
+            f"Nothing states the focal length, and matches alone tell it badly ({axes}): unless ground control or "
+            "differential GPS correct it, heights may be wrong by tens of percent. Photographs with EXIF would help."
+        ]
+    return []
+
+
+def _told_of_terms(trials: Sequence[Trial]) -> list[str]:
+    """Why the lens has no more terms, where positions spoke against them."""
     *others, best = trials
     richer = [t for t in others if TERMS[t.lens] > TERMS[best.lens] and t.error_px < WORTH * best.error_px]
     if not richer or best.off_m is None:
-        return ()
+        return []
     other = min(richer, key=lambda trial: trial.error_px)
-    return (
+    return [
         f"The lens has {TERMS[best.lens]} term(s) of distortion. With {TERMS[other.lens]} the matches would fit better "
         f"({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras worse with their positions "
-        f"({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be bent.",
-    )
+        f"({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be bent."
+    ]
+
+
+def _trial(model: pycolmap.Reconstruction, lens: str, photographs: Sequence[Photograph]) -> Trial:
+    camera = model.cameras[min(model.cameras)]
+    return Trial(lens, model.compute_mean_reprojection_error(), _off_m(model, photographs), camera.mean_focal_length())
 
 
 def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
