@@ -1,5 +1,7 @@
 """A lens gets the terms of distortion that it has, and none that would bend the model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -7,6 +9,7 @@ from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
 
 from tidefield.ingest.earth.adjustment import adjustment_options
 from tidefield.ingest.motion.lens_choice import SPREAD_DEG, TERMS, Choice, Trial, best_of, choose_lens, told
+from tidefield.ingest.survey import LensPrior
 
 
 def quiet(done: int, whole: int) -> None:
@@ -115,3 +118,26 @@ def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
     options.refine_principal_point = False
     pycolmap.bundle_adjustment(model, options)
     return model
+
+
+@pytest.mark.parametrize(("true", "design", "used"), [(1.0, 1.04, 1.0), (1.04, 1.0, 1.0), (1.04, 1.035, 1.04)])
+def test_of_two_stated_focal_lengths_the_one_is_held_whose_flight_height_is_the_drones(true, design, used):
+    """The stated calibration is `true` times the real focal length; the drone's own height is right."""
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    lens = LensPrior(true * FOCAL, None, None, "DJI dewarp data", True, design * FOCAL)
+    heights = [
+        place[2] - float(np.median([p.xyz[2] for p in flight.model.points3D.values()]))
+        for place in flight.centres_world
+    ]
+    photographs = [
+        replace(p, lens=lens, relative_altitude_m=h) for p, h in zip(flight.survey.photographs, heights, strict=True)
+    ]
+    model = adjusted_with(flight, true * FOCAL)
+    choice = choose_lens(model, photographs, True, quiet)
+    assert model.cameras[1].focal_length_x == pytest.approx(used * FOCAL)
+    if design == 1.035:
+        assert choice.heights is None
+    else:
+        assert ("the design one was used" if true > design else "the calibrated one was used") in told(choice)[0]
+        assert choice.heights is not None
+        assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)

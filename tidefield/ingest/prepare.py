@@ -24,7 +24,7 @@ from tidefield.ingest.colour import Evening, estimate_evening
 from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.export import write_transforms
 from tidefield.ingest.motion.features import FeatureOptions, extract, opened
-from tidefield.ingest.motion.lens_choice import Choice, Trial, choose_lens
+from tidefield.ingest.motion.lens_choice import Choice, Heights, Trial, choose_lens
 from tidefield.ingest.motion.mapping import reconstruct, registered_names
 from tidefield.ingest.motion.matching import match
 from tidefield.ingest.motion.pairs import GLANCE, candidates, glances, promising
@@ -176,8 +176,10 @@ class _Making:
             return {"models": names, "lens": asdict(choice)}
 
         facts = self.stages.run("poses", {}, [self.model], job)
-        trials = tuple(Trial(**trial) for trial in facts["lens"]["trials"])
-        return facts["models"], Choice(**{**facts["lens"], "trials": trials})
+        lens = facts["lens"]
+        trials = tuple(Trial(**trial) for trial in lens["trials"])
+        heights = lens["heights"] and Heights(**lens["heights"])
+        return facts["models"], Choice(**{**lens, "trials": trials, "heights": heights})
 
     def georeference(self, good: Survey) -> Georeference:
         """Lay the largest model onto the Earth."""

@@ -39,6 +39,7 @@ class LensPrior:
         distortion: OpenCV's (k1, k2, p1, p2, k3), if the maker calibrated it.
         source: such as "DJI dewarp data", "EXIF 35 mm equivalent", "EXIF focal plane resolution".
         trusted: whether a maker calibrated it; EXIF's focal length is nominal, good to some percent.
+        design_focal_px: focal length of the lens's design, where the maker states it besides.
     """
 
     focal_px: float
@@ -46,6 +47,7 @@ class LensPrior:
     distortion: tuple[float, float, float, float, float] | None
     source: str
     trusted: bool
+    design_focal_px: float | None = None
 
 
 @dataclass(frozen=True)

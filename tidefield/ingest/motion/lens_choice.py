@@ -7,10 +7,14 @@ they tell: a richer lens is taken only if the cameras fit their positions as wel
 Photographs whose optical axes are parallel do not tell the focal length, whatever the relief: a world stretched along
 the axes looks through a longer lens just as it did. It is refined, where something else states it, only if the
 photographs look in different directions.
+
+Where the maker states two focal lengths, of this lens and of its design, the one is held with which the flight height
+agrees better with what the drone says: height follows the focal length, and other evidence there is none.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +22,7 @@ import numpy as np
 import pycolmap
 
 from tidefield.ingest.earth.adjustment import adjustment_options, thinned
-from tidefield.ingest.earth.alignment import camera_centres, find_down, fit_positions
+from tidefield.ingest.earth.alignment import PositionFit, camera_centres, find_down, fit_positions
 from tidefield.ingest.earth.gps import given_positions
 from tidefield.ingest.survey import Photograph
 
@@ -30,6 +34,10 @@ BENDS = 1.03
 """... and may not bring the distance from the positions above this share."""
 FEWEST = 6
 """Positions that can tell whether a model is bent."""
+DIFFERENT = 0.01
+"""Two focal lengths that differ by less are one."""
+LOWEST_M = 10.0
+"""Below this, the height above take-off says little."""
 SPREAD_DEG = 10.0
 """RMS angle of the optical axes from their mean that tells the focal length."""
 
@@ -53,6 +61,25 @@ class Trial:
 
 
 @dataclass(frozen=True)
+class Heights:
+    """Flight heights above the ground over those above take-off, with each of the stated focal lengths.
+
+    Attributes:
+        calibrated_px, design_px: the focal lengths.
+        calibrated_share, design_share: median heights above the ground as shares of the drone's own.
+    """
+
+    calibrated_px: float
+    design_px: float
+    calibrated_share: float
+    design_share: float
+
+    @property
+    def prefers_design(self) -> bool:
+        return abs(math.log(self.design_share)) < abs(math.log(self.calibrated_share))
+
+
+@dataclass(frozen=True)
 class Choice:
     """How the lens of a model was chosen.
 
@@ -61,12 +88,14 @@ class Choice:
         known: whether something else than the matches states the focal length.
         freed: whether it was refined.
         spread_deg: RMS angle of the optical axes from their mean.
+        heights: what the drone's height says of two stated focal lengths; None where there are not two.
     """
 
     trials: tuple[Trial, ...]
     known: bool
     freed: bool
     spread_deg: float
+    heights: Heights | None = None
 
 
 def choose_lens(
@@ -99,8 +128,36 @@ def choose_lens(
         freed = _better(with_focal, best)
         best = with_focal if freed else best
     _adjust(model, best.lens, freed)
+    heights = None if freed else _heights(model, photographs)
+    if heights is not None and heights.prefers_design:
+        (camera,) = model.cameras.values()
+        for index in camera.focal_length_idxs():
+            camera.params[index] = heights.design_px
+        _adjust(model, best.lens, focal=False)
     progress(steps, steps)
-    return Choice((*(trial for trial in trials if trial is not best), best), known, freed, spread)
+    return Choice((*(trial for trial in trials if trial is not best), best), known, freed, spread, heights)
+
+
+def _heights(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> Heights | None:
+    """None where the maker does not state two different focal lengths of the one lens, or heights are not known."""
+    stated = {(p.lens.focal_px, p.lens.design_focal_px) for p in photographs if p.lens and p.lens.design_focal_px}
+    if len(stated) != 1 or len(model.cameras) != 1:
+        return None
+    ((calibrated, design),) = stated
+    fit, names = _fit(model, photographs)
+    if design is None or abs(math.log(design / calibrated)) < DIFFERENT or fit is None:
+        return None
+    above_start = {p.name: p.relative_altitude_m for p in photographs}
+    shares = []
+    for image in (model.image(number) for number in model.reg_image_ids()):
+        if image.name in names and above_start[image.name] > LOWEST_M:
+            seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+            ground, centre = fit.world_from_model(np.array(seen)), fit.world_from_model(image.projection_center()[None])
+            shares.append((centre[0, 2] - np.median(ground[:, 2])) / above_start[image.name])
+    if len(shares) < FEWEST:
+        return None
+    share = float(np.median(shares))
+    return Heights(calibrated, design, share, share * design / calibrated)
 
 
 def axes_spread_deg(model: pycolmap.Reconstruction) -> float:
@@ -126,7 +183,7 @@ def _better(richer: Trial, plainer: Trial) -> bool:
 
 def told(choice: Choice) -> tuple[str, ...]:
     """What a surveyor should know of it, as sentences."""
-    return (*_told_of_focal(choice), *_told_of_terms(choice.trials))
+    return (*_told_of_focal(choice), *_told_of_heights(choice.heights), *_told_of_terms(choice.trials))
 
 
 def _told_of_focal(choice: Choice) -> list[str]:
@@ -140,6 +197,21 @@ def _told_of_focal(choice: Choice) -> list[str]:
             "differential GPS correct it, heights may be wrong by tens of percent. Photographs with EXIF would help."
         ]
     return []
+
+
+def _told_of_heights(heights: Heights | None) -> list[str]:
+    if heights is None:
+        return []
+    used, other = ("design", "calibrated") if heights.prefers_design else ("calibrated", "design")
+    values = {
+        "calibrated": (heights.calibrated_px, heights.calibrated_share),
+        "design": (heights.design_px, heights.design_share),
+    }
+    return [
+        f"The maker states two focal lengths. With the {used} one ({values[used][0]:.1f} px) the flight height is "
+        f"{values[used][1]:.1%} of the drone's own, with the {other} one ({values[other][0]:.1f} px) "
+        f"{values[other][1]:.1%}: the {used} one was used. The drone's height is above take-off, not above the ground."
+    ]
 
 
 def _told_of_terms(trials: Sequence[Trial]) -> list[str]:
@@ -175,14 +247,23 @@ def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
 
 
 def _off_m(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> float | None:
+    fit, names = _fit(model, photographs)
+    if fit is None:
+        return None
+    centres = camera_centres(model)
+    places = np.array([centres[name] for name in names])
+    error = (fit.world_from_model(places) - fit.given_world)[fit.used]
+    return float(np.sqrt((error**2).sum(1).mean()))
+
+
+def _fit(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph]
+) -> tuple[PositionFit | None, tuple[str, ...]]:
+    """The model laid onto its cameras' positions, in thought, and whose positions these are; None if they are few."""
     centres = camera_centres(model)
     own = [photograph for photograph in photographs if photograph.name in centres]
     positions = given_positions(own)
     if len(positions.names) < FEWEST:
-        return None
+        return None, positions.names
     places = np.array([centres[name] for name in positions.names])
-    fit = fit_positions(places, positions, positions.frame(), find_down(model, own))
-    if fit is None:
-        return None
-    error = (fit.world_from_model(places) - fit.given_world)[fit.used]
-    return float(np.sqrt((error**2).sum(1).mean()))
+    return fit_positions(places, positions, positions.frame(), find_down(model, own)), positions.names

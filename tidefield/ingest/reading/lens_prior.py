@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from PIL import ExifTags
@@ -57,6 +58,9 @@ def lens_prior(metadata: Metadata, width: int, height: int, orientation: int) ->
     smallest, largest = (side * max(width, height) for side in _FOCAL_IN_WIDTHS)
     if prior is None or not smallest < prior.focal_px < largest:
         return None
+    design = _dji_design(metadata, width, height)
+    if prior.trusted and design is not None:
+        prior = replace(prior, design_focal_px=design.focal_px)
     return _stood_up(prior, width, height, orientation)
 
 
@@ -193,4 +197,4 @@ def _stood_up(prior: LensPrior, width: int, height: int, orientation: int) -> Le
         # The tangential part is r^2 q + 2 x (q . x) with q = (p2, p1), which turns as a vector does.
         p2, p1 = (float(part) for part in upright_rotation(orientation) @ (p2, p1))
         distortion = k1, k2, p1, p2, k3
-    return LensPrior(prior.focal_px, principal_px, distortion, prior.source, prior.trusted)
+    return replace(prior, principal_px=principal_px, distortion=distortion)
