@@ -4,15 +4,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import textured_wall as wall
 from PIL import Image
 from test_pairs import photograph
 
-from tidefield.ingest.motion.features import FeatureOptions, extract, first_camera, lens_groups, opened
+from tidefield.errors import DeviceError
+from tidefield.ingest.motion.features import FeatureOptions, choose_device, extract, first_camera, lens_groups, opened
 from tidefield.ingest.survey import LensPrior, Photograph
 
-OPTIONS = FeatureOptions(side_px=400, count=200)
+OPTIONS, CPU = FeatureOptions(side_px=400, count=200), pycolmap.Device.cpu
 
 
 @pytest.fixture
@@ -30,8 +32,8 @@ def wall_photographs(tmp_path: Path) -> list[Photograph]:
 
 def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs: list[Photograph], tmp_path: Path):
     calls: list[tuple[int, int]] = []
-    total = extract(wall_photographs, tmp_path / "a.db", OPTIONS, lambda done, whole: calls.append((done, whole)))
-    halved = extract(wall_photographs, tmp_path / "b.db", replace(OPTIONS, side_px=120), lambda done, whole: None)
+    total = extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: calls.append((done, whole)))
+    halved = extract(wall_photographs, tmp_path / "b.db", replace(OPTIONS, side_px=120), CPU, lambda done, whole: None)
     assert calls[-1] == (3, 3)
     assert total > halved > 0
     for name in ("a.db", "b.db"):
@@ -47,8 +49,8 @@ def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs
 
 def test_what_is_in_the_database_is_kept_and_the_rest_is_added(wall_photographs: list[Photograph], tmp_path: Path):
     calls: list[tuple[int, int]] = []
-    extract(wall_photographs[:2], tmp_path / "a.db", OPTIONS, lambda done, whole: None)
-    extract(wall_photographs, tmp_path / "a.db", OPTIONS, lambda done, whole: calls.append((done, whole)))
+    extract(wall_photographs[:2], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
+    extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: calls.append((done, whole)))
     assert calls == [(3, 3)]
     with opened(tmp_path / "a.db") as db:
         assert db.num_images() == 3
@@ -85,3 +87,10 @@ def test_the_makers_calibration_acts_as_its_five_terms_do():
     true = (xy * radial[:, None] + tangential) * 400 + [210, 140]
     found = np.asarray(camera.img_from_cam(np.column_stack([xy, np.ones(len(xy))])))
     assert np.abs(found - true).max() < 0.35
+
+
+def test_a_device_that_pycolmap_does_not_have_is_an_error():
+    assert choose_device("auto") == pycolmap.Device.auto
+    assert choose_device("cpu") == pycolmap.Device.cpu
+    with pytest.raises(DeviceError, match="expected one of auto, cpu"):
+        choose_device("mps")

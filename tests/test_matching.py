@@ -1,50 +1,12 @@
-"""Matches are mutual and stand out; the geometry that they agree on is kept once."""
+"""Pairs of photographs are matched and verified once."""
 
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-import torch
-from torch import Tensor
 
 from tidefield.ingest.motion.features import opened
-from tidefield.ingest.motion.matching import FARTHEST_RAD, RATIO, match, matched
-
-
-def unit(count: int, seed: int) -> Tensor:
-    values = torch.rand(count, 128, generator=torch.Generator().manual_seed(seed))
-    return torch.nn.functional.normalize(values**4, dim=1)
-
-
-def brute_force(ours: Tensor, theirs: Tensor) -> list[int]:
-    angle = (ours @ theirs.T).clamp(-1, 1).acos()
-    result = []
-    for i, row in enumerate(angle):
-        first, second = row.sort().values[:2].tolist()
-        j = int(row.argmin())
-        stands_out = first < RATIO * second and first < FARTHEST_RAD
-        result.append(j if stands_out and int(angle[:, j].argmin()) == i else -1)
-    return result
-
-
-def test_matching_is_what_brute_force_finds():
-    ours, strangers = unit(60, 0), unit(30, 1)
-    noisy = torch.nn.functional.normalize(ours[10:50] + 0.03 * unit(40, 2), dim=1)
-    theirs = torch.cat([strangers, noisy, ours[:1], ours[:1]])  # the last two are alike: nothing stands out
-    found = matched(ours, theirs)
-    assert found.tolist() == brute_force(ours, theirs)
-    assert found[0] == -1
-    assert (found[10:50] == torch.arange(30, 70)).float().mean() > 0.9
-
-
-def test_batches_of_pairs_match_as_single_pairs_do():
-    first, second = torch.stack([unit(20, 0), unit(20, 1)]), torch.stack([unit(25, 0), unit(25, 1)])
-    together = matched(first, second)
-    assert torch.equal(together, torch.stack([matched(a, b) for a, b in zip(first, second, strict=True)]))
-
-
-def test_zeros_match_nothing():
-    assert (matched(torch.zeros(4, 128), unit(6, 0)) == -1).all()
+from tidefield.ingest.motion.matching import match
 
 
 def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
@@ -68,12 +30,12 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
             db.write_descriptors(image.image_id, described)
         names = sorted(image.name for image in db.read_all_images())
     pairs, calls = [(names[0], names[1]), (names[1], names[2])], []
-    agree, inliers = match(path, pairs, torch.device("cpu"), lambda done, whole: calls.append((done, whole)))
+    agree, inliers = match(path, pairs, pycolmap.Device.cpu, lambda done, whole: calls.append((done, whole)))
     assert agree == 2
     assert inliers > 200
     assert calls[-1] == (2, 2)
     again = match(
-        path, [*pairs, (names[0], names[3])], torch.device("cpu"), lambda done, whole: calls.append((done, whole))
+        path, [*pairs, (names[0], names[3])], pycolmap.Device.cpu, lambda done, whole: calls.append((done, whole))
     )
     assert again[0] == 3
     assert calls[-1] == (3, 3)

@@ -5,8 +5,23 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from tidefield.ingest.motion.pairs import BEST, FEW, GLANCE, IN_SEQUENCE, MOST, NEARBY, candidates, glances, promising
+from tidefield.ingest.motion.pairs import (
+    BEST,
+    FARTHEST_RAD,
+    FEW,
+    GLANCE,
+    IN_SEQUENCE,
+    MOST,
+    NEARBY,
+    RATIO,
+    candidates,
+    glances,
+    matched,
+    promising,
+)
 from tidefield.ingest.survey import Photograph, Position
 
 
@@ -110,3 +125,39 @@ def test_photographs_with_few_features_are_filled_with_what_matches_nothing():
     assert table[0, :3].norm(dim=1).allclose(table.new_ones(3))
     assert (table[0, 3:] == 0).all()
     assert promising([(0, 1)], table, lambda done, whole: None) == [(0, 1)]
+
+
+def unit(count: int, seed: int) -> Tensor:
+    values = torch.rand(count, 128, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(values**4, dim=1)
+
+
+def brute_force(ours: Tensor, theirs: Tensor) -> list[int]:
+    angle = (ours @ theirs.T).clamp(-1, 1).acos()
+    result = []
+    for i, row in enumerate(angle):
+        first, second = row.sort().values[:2].tolist()
+        j = int(row.argmin())
+        stands_out = first < RATIO * second and first < FARTHEST_RAD
+        result.append(j if stands_out and int(angle[:, j].argmin()) == i else -1)
+    return result
+
+
+def test_matching_is_what_brute_force_finds():
+    ours, strangers = unit(60, 0), unit(30, 1)
+    noisy = torch.nn.functional.normalize(ours[10:50] + 0.03 * unit(40, 2), dim=1)
+    theirs = torch.cat([strangers, noisy, ours[:1], ours[:1]])  # the last two are alike: nothing stands out
+    found = matched(ours, theirs)
+    assert found.tolist() == brute_force(ours, theirs)
+    assert found[0] == -1
+    assert (found[10:50] == torch.arange(30, 70)).float().mean() > 0.9
+
+
+def test_batches_of_pairs_match_as_single_pairs_do():
+    first, second = torch.stack([unit(20, 0), unit(20, 1)]), torch.stack([unit(25, 0), unit(25, 1)])
+    together = matched(first, second)
+    assert torch.equal(together, torch.stack([matched(a, b) for a, b in zip(first, second, strict=True)]))
+
+
+def test_zeros_match_nothing():
+    assert (matched(torch.zeros(4, 128), unit(6, 0)) == -1).all()

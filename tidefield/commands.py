@@ -22,6 +22,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.ingest import convert
 from tidefield.ingest.findings import findings
 from tidefield.ingest.motion.features import FeatureOptions
+from tidefield.ingest.motion.features import choose_device as choose_pycolmap_device
 from tidefield.ingest.prepare import Wishes
 from tidefield.ingest.prepare import prepare as prepare_scene
 from tidefield.ingest.reading.photographs import read_survey
@@ -67,7 +68,7 @@ def prepare(options: Prepare, console: Console) -> None:
         features=FeatureOptions(options.feature_width, options.features),
         redo=options.redo,
     )
-    prepared = prepare_scene(survey, options.scene, wishes, choose_device(options.device), console)
+    prepared = prepare_scene(survey, options.scene, wishes, choose_pycolmap_device(options.device), console)
     asked = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "talk", "redo")}
     report = write_report(findings(prepared, options.scene, asked), options.scene)
     lost = len(survey.photographs) - len(prepared.models[0])

@@ -138,7 +138,7 @@ class Prepare:
     """Longer side in pixels to which larger photographs are reduced to find features."""
     redo: Stage | None = None
     """Do this stage again, and all that follow."""
-    device: Device = "auto"
+    device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
     talk: OmitArgPrefixes[Talk] = Talk()
 
 

@@ -17,7 +17,7 @@ from tidefield.data.georeference import Georeference
 from tidefield.ingest import report
 from tidefield.ingest.colour import Evening
 from tidefield.ingest.earth.alignment import camera_centres
-from tidefield.ingest.motion.features import opened
+from tidefield.ingest.motion.features import opened, real_name
 from tidefield.ingest.motion.lens_choice import told
 from tidefield.ingest.prepare import Prepared
 from tidefield.ingest.reading.pictures import thumbnail
@@ -141,7 +141,7 @@ def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
     """Features of every photograph, and how many agree with each other photograph that any agree with."""
     matches: dict[str, list[int]] = {}
     with opened(database) as db:
-        names = {image.image_id: image.name for image in db.read_all_images()}
+        names = {image.image_id: real_name(image.name) for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in names.items()}
         for pair, inliers in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
             if inliers:

@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 import pycolmap
-import torch
 from rich.console import Console
 
 from tidefield.data.georeference import Georeference, read_georeference
@@ -23,7 +22,7 @@ from tidefield.errors import RunError
 from tidefield.ingest.colour import Evening, estimate_evening
 from tidefield.ingest.earth.georeference import georeference
 from tidefield.ingest.export import write_transforms
-from tidefield.ingest.motion.features import FeatureOptions, extract, opened
+from tidefield.ingest.motion.features import FeatureOptions, extract, opened, real_name
 from tidefield.ingest.motion.lens_choice import Choice, Heights, Trial, choose_lens
 from tidefield.ingest.motion.mapping import reconstruct, registered_names
 from tidefield.ingest.motion.matching import match
@@ -83,7 +82,7 @@ class Prepared:
     seconds: dict[str, float]
 
 
-def prepare(survey: Survey, scene: Path, wishes: Wishes, device: torch.device, console: Console) -> Prepared:
+def prepare(survey: Survey, scene: Path, wishes: Wishes, device: pycolmap.Device, console: Console) -> Prepared:
     """Make a scene of a survey, or go on with one.
 
     Raises:
@@ -107,7 +106,7 @@ def prepare(survey: Survey, scene: Path, wishes: Wishes, device: torch.device, c
 class _Making:
     """A scene in the making: its stages, in their order."""
 
-    def __init__(self, survey: Survey, scene: Path, wishes: Wishes, device: torch.device, console: Console) -> None:
+    def __init__(self, survey: Survey, scene: Path, wishes: Wishes, device: pycolmap.Device, console: Console) -> None:
         self.survey, self.scene, self.wishes, self.device, self.console = survey, scene, wishes, device, console
         self.work = scene / "prepare"
         self.stages = Stages(self.work, _fingerprint(survey), wishes.redo)
@@ -129,7 +128,7 @@ class _Making:
             if not resume:
                 self.database.unlink(missing_ok=True)
             with Meter(self.console, "Finding features") as meter:
-                return {"features": extract(photographs, self.database, self.wishes.features, meter)}
+                return {"features": extract(photographs, self.database, self.wishes.features, self.device, meter)}
 
         options = [[photograph.name for photograph in photographs], asdict(self.wishes.features)]
         self.stages.run("features", options, [self.database], job)
@@ -139,7 +138,7 @@ class _Making:
 
         def job(resume: bool) -> Facts:
             with opened(self.database) as db:
-                images = {image.name: image.image_id for image in db.read_all_images()}
+                images = {real_name(image.name): image.image_id for image in db.read_all_images()}
                 largest = [np.array(db.read_descriptors(images[p.name]).data[:GLANCE]) for p in photographs]
             with Meter(self.console, "Choosing pairs") as meter:
                 chosen = promising(candidates(photographs), glances(largest), meter)

@@ -3,18 +3,23 @@ Zisserman, 2012)."""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from urllib.parse import quote, unquote
 
 import cv2
 import numpy as np
 import pycolmap
-import torch
 from numpy.typing import NDArray
 
+from tidefield.errors import DeviceError
 from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import LensPrior, Photograph
 
@@ -22,6 +27,11 @@ Progress = Callable[[int, int], object]
 
 DEFAULT_FOCAL = 1.2
 """Focal length in widths of the photograph where nothing is known of the lens: COLMAP's guess."""
+
+
+def cores() -> int:
+    """That this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,16 @@ def _without_k3(lens: LensPrior, width: int, height: int) -> NDArray[np.float64]
     return np.array([k1, k2, p1, p2])
 
 
+def stored_name(name: str) -> str:
+    """A photograph's name in the database: pycolmap's lists of pairs have spaces between names."""
+    return quote(name)
+
+
+def real_name(stored: str) -> str:
+    """The photograph's own name again."""
+    return unquote(stored)
+
+
 @contextmanager
 def opened(database: Path) -> Iterator[pycolmap.Database]:
     handle = pycolmap.Database.open(database)
@@ -76,7 +96,29 @@ def opened(database: Path) -> Iterator[pycolmap.Database]:
         handle.close()
 
 
-def extract(photographs: Sequence[Photograph], database: Path, options: FeatureOptions, progress: Progress) -> int:
+def choose_device(name: str) -> pycolmap.Device:
+    """Where pycolmap computes: `auto` is CUDA where it has that, else the CPU.
+
+    Raises:
+        DeviceError: for a device that pycolmap does not have.
+    """
+    kind = name.partition(":")[0]
+    there = ["auto", "cpu", *(["cuda"] if pycolmap.has_cuda else [])]
+    if kind not in there:
+        raise DeviceError(
+            f"pycolmap does not compute on {name!r} here: expected one of {', '.join(there)}; for CUDA, install "
+            "pycolmap-cuda12 instead of pycolmap"
+        )
+    return getattr(pycolmap.Device, kind)
+
+
+def extract(
+    photographs: Sequence[Photograph],
+    database: Path,
+    options: FeatureOptions,
+    device: pycolmap.Device,
+    progress: Progress,
+) -> int:
     """Write cameras, photographs and their features to a database; those that are in it already are kept.
 
     Returns:
@@ -86,40 +128,50 @@ def extract(photographs: Sequence[Photograph], database: Path, options: FeatureO
         cameras = _cameras(db, photographs)
         todo = []
         for photograph, camera in zip(photographs, cameras, strict=True):
-            image = db.read_image_with_name(photograph.name)
+            image = db.read_image_with_name(stored_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
                 todo.append((photograph, camera))
         done = len(photographs) - len(todo)
-        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-            for photograph, camera, (keypoints, descriptors) in _in_order(pool, todo, options):
+        # Processes, because pycolmap keeps the interpreter's lock while it looks for features; new ones, because a fork
+        # of one that has threads may hang. A GPU works on one photograph at a time.
+        on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
+        workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            for photograph, camera, (keypoints, descriptors) in _in_order(pool, todo, options, device):
                 _write(db, photograph, camera, keypoints, descriptors)
                 done += 1
                 progress(done, len(photographs))
         return db.num_keypoints()
 
 
-def _in_order(pool: ThreadPoolExecutor, todo: Sequence[tuple[Photograph, int]], options: FeatureOptions) -> Iterator:
-    """Features of photographs as they are ready, a few at a time: memory does not grow with their number."""
-    window = 2 * (torch.get_num_threads() + 1)
-    for start in range(0, len(todo), window):
-        part = todo[start : start + window]
-        features = pool.map(lambda item: _features(item[0], options), part)
-        for (photograph, camera), found in zip(part, features, strict=True):
-            yield photograph, camera, found
+def _in_order(
+    pool: Executor, todo: Sequence[tuple[Photograph, int]], options: FeatureOptions, device: pycolmap.Device
+) -> Iterator:
+    """Features of photographs as they are ready, a few ahead: memory does not grow with their number."""
+    ahead = 2 * cores() + 1
+    running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
+    for k, (photograph, camera) in enumerate(todo):
+        found = running.popleft().result()
+        if k + ahead < len(todo):
+            running.append(pool.submit(_features, todo[k + ahead][0], options, device))
+        yield photograph, camera, found
 
 
-def _features(photograph: Photograph, options: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _features(
+    photograph: Photograph, options: FeatureOptions, device: pycolmap.Device
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Keypoints (K x 4: u, v, scale, orientation; upright pixels at full size) and descriptors (K x 128)."""
     grey = cv2.cvtColor(upright(photograph), cv2.COLOR_RGB2GRAY)
     shrunk = min(1.0, options.side_px / max(grey.shape))
     if shrunk < 1:
         size = (round(grey.shape[1] * shrunk), round(grey.shape[0] * shrunk))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # this may be a process of its own
     sift = pycolmap.FeatureExtractionOptions()
-    sift.use_gpu, sift.num_threads = False, 1
+    sift.num_threads = 1
     sift.sift.max_num_features = options.count
     sift.sift.first_octave = 0
-    extractor = pycolmap.FeatureExtractor.create(sift, device=pycolmap.Device.cpu)
+    extractor = pycolmap.FeatureExtractor.create(sift, device=device)
     found, descriptors = extractor.extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
     keypoints[:, :3] *= photograph.width / grey.shape[1]
@@ -147,7 +199,7 @@ def _write(
     db: pycolmap.Database, photograph: Photograph, camera: int, keypoints: NDArray, descriptors: NDArray
 ) -> None:
     with pycolmap.DatabaseTransaction(db):
-        image = pycolmap.Image(name=photograph.name, camera_id=camera)
+        image = pycolmap.Image(name=stored_name(photograph.name), camera_id=camera)
         image.image_id = db.write_image(image)
         frame = pycolmap.Frame(rig_id=camera)
         frame.add_data_id(image.data_id)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pycolmap
 
 from tidefield.errors import SurveyError
-from tidefield.ingest.motion.features import opened
+from tidefield.ingest.motion.features import opened, real_name
 from tidefield.ingest.stages import interruptible
 
 log = logging.getLogger(__name__)
@@ -66,6 +66,9 @@ def reconstruct(database: Path, folder: Path, progress: Callable[[int, int], obj
             database, folder, folder, options, next_image_callback=one_more, cancellation_token=token
         )
     )
+    for model in found.values():
+        for image in model.images.values():
+            image.name = real_name(image.name)
     models = sorted(found.values(), key=lambda model: -model.num_reg_images())
     if not models:
         raise SurveyError(

@@ -7,15 +7,16 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from tidefield.ingest.motion.matching import matched
 from tidefield.ingest.survey import Photograph
 
 Pair = tuple[int, int]
 
+RATIO, FARTHEST_RAD = 0.8, 0.7
+"""A match is nearer than `RATIO` times the second nearest and than `FARTHEST_RAD`, as angles: COLMAP's values."""
 NEARBY = 24
 """Photographs around each that may overlap it, where positions are known."""
 FAR = 4.0
@@ -60,6 +61,23 @@ def candidates(photographs: Sequence[Photograph]) -> list[Pair]:
     for ahead in range(1, IN_SEQUENCE + 1):
         pairs |= {_pair(a, b) for a, b in zip(order, order[ahead:], strict=False)}
     return sorted(pairs)
+
+
+def matched(ours: Float[Tensor, "... K D"], theirs: Float[Tensor, "... L D"]) -> Int[Tensor, "... K"]:
+    """For each of our descriptors the index of its match among theirs, or -1.
+
+    A match is a pair of mutual nearest neighbours that stands out from the second nearest.
+
+    Args:
+        ours, theirs: descriptors of unit length (zeros match nothing).
+    """
+    cosine = ours @ theirs.transpose(-1, -2)
+    best, index = cosine.topk(min(2, theirs.shape[-2]), dim=-1)
+    angle = best.float().clamp(-1, 1).acos()
+    back = cosine.argmax(dim=-2)
+    mutual = back.gather(-1, index[..., 0]) == torch.arange(ours.shape[-2], device=ours.device)
+    good = mutual & (angle[..., 0] < RATIO * angle[..., -1]) & (angle[..., 0] < FARTHEST_RAD)
+    return torch.where(good, index[..., 0], -1)
 
 
 def promising(
