@@ -90,3 +90,20 @@ def test_a_long_job_can_be_interrupted():
     with pytest.raises(KeyboardInterrupt):
         interruptible(job)
     assert interruptible(lambda token: 3) == 3
+
+
+def test_a_folder_that_cannot_be_written_to_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "mkdir", refuse)
+        with pytest.raises(RunError, match=r"scene cannot be written \(Permission denied\)"):
+            Stages(tmp_path / "scene" / "prepare", "photographs")
+    stages = Stages(tmp_path / "scene" / "prepare", "photographs")
+
+    def fills_the_disk(resume: bool) -> Facts:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(RunError, match=r"scene cannot be written \(No space left on device\)"):
+        stages.run("one", 0, [], fills_the_disk)

@@ -29,6 +29,19 @@ def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
 
 
 @contextmanager
+def writing_to(path: Path) -> Iterator[None]:
+    """Tells a user who writes to a place that cannot be written to, or is full, what to do.
+
+    Raises:
+        RunError: instead of the system's own errors.
+    """
+    try:
+        yield
+    except OSError as error:
+        _tell(path, error)
+
+
+@contextmanager
 def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary name beside `path` to write to; it takes the final name when the block ends, and goes when it fails.
 

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import pycolmap
 
 from tidefield.errors import RunError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, writing_to
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +34,14 @@ class Stages:
         folder: where `stages.json` and the stages' files live; made if it is not there.
         source: what the first stage depends on (any JSON).
         redo: name of a stage to do again with all that follow, even if nothing has changed.
+
+    Raises:
+        RunError: the folder cannot be written to.
     """
 
     def __init__(self, folder: Path, source: object, redo: str | None = None) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing_to(folder.parent):
+            folder.mkdir(parents=True, exist_ok=True)
         self._file, self._folder = folder / "stages.json", folder
         self._records: dict[str, Facts] = self._read()
         self._key, self._redo, self._redoing = _digest(source), redo, False
@@ -68,7 +72,8 @@ class Stages:
         self._write()
         start = time.monotonic()
         try:
-            facts = job(same)
+            with writing_to(self._folder.parent):
+                facts = job(same)
         finally:
             self._records[name]["seconds"] = before + time.monotonic() - start
             self._write()
