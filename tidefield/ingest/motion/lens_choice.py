@@ -242,7 +242,12 @@ def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
         camera.params = [*([mean, mean] if lens == "OPENCV" else [mean]), *centre, *terms]
     options = adjustment_options()
     options.refine_focal_length, options.refine_principal_point = focal, False
-    pycolmap.bundle_adjustment(model, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not `bundle_adjustment`, which is the same but prints whatever the log level.
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 
 
