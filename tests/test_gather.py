@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.baselines.gather import fill_unseen, read_photograph
+from tidefield.baselines.gather import read_photograph
+from tidefield.model.fill import fill_unseen
 from tidefield.model.gather import gather, joined, maps_from_images, weighted_rows
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig, FieldConfig, NetworkConfig, StageConfig
 from tidefield.data.prior import surface_prior
 from tidefield.data.scene import Scene
+from tidefield.data.surface import in_frame
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, TileRendering, Tiles
 from tidefield.model.renderer import Renderer, start_intervals
@@ -172,6 +173,28 @@ def test_an_untrained_network_renders_the_wall_from_its_neighbours():
     truth = at.photographs[TARGET].float() / 255
     error = (rendering.colour - truth)[4:-4, 8:-8].square().mean()
     assert -10 * error.log10() > 25
+
+
+def test_what_no_neighbour_sees_is_continued_from_beside_it():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 3.0  # the others are all to the left
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose))
+    own = network(SWIFT.network).eval()
+    view = Renderer(own, at, SWIFT, CPU)(at.cameras[TARGET])
+    uv = torch.stack(torch.meshgrid(torch.arange(48) + 0.5, torch.arange(36) + 0.5, indexing="xy"), -1).reshape(
+        1, -1, 2
+    )
+    camera = at.cameras[TARGET]
+    points = camera.position_world + camera.directions_world(uv)[0] * wall.DEPTH
+    others = at.cameras[[i for i in range(len(at.cameras)) if i != TARGET]]
+    seen = in_frame(others, *others.project(points)).any(0).reshape(36, 48)
+    assert 0.2 < seen.float().mean() < 0.8
+    edge = int(seen[18].nonzero().max())
+    beside = view.colour[:, edge - 6 : edge - 1].mean((0, 1))
+    assert (view.colour[:, edge + 3 :].mean((0, 1)) - beside).abs().max() < 0.15
+    assert (view.depth[:, edge + 3 :] - wall.DEPTH).abs().max() < 0.2
+    assert not Renderer(network(PAPER.network).eval(), at, PAPER, CPU).fills
 
 
 @pytest.mark.parametrize("name", ["swift", "field alone"])

@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tidefield.baselines.gather import fill_unseen, read_photograph
+from tidefield.baselines.gather import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.fill import fill_unseen
 from tidefield.model.rendering import Render, Rendering
 
 VIEWS = 4

@@ -1,16 +1,21 @@
-"""A trained network as a `Render`: one camera in, its view out, tile by tile."""
+"""A trained network as a `Render`: one camera in, its view out, tile by tile.
+
+Ground that none of a tile's neighbours sees is unknown to a network that only reads neighbours. Its colours are
+continued from beside it, unless the preset is to do as printed, a field knows the scene, or it may be empty there.
+"""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tidefield.config import Config
 from tidefield.data.batches import choose_neighbours, even, tile_surface
 from tidefield.data.prior import read_prior, surface_prior
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid, project
+from tidefield.model.fill import fill_unseen
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, Tiles
 from tidefield.model.rendering import Rendering
@@ -21,6 +26,8 @@ VALUES_AT_ONCE = 5_000_000
 """Values gathered at once by a stage: enough to keep a few cores busy, few enough for their cache ..."""
 GPU_FACTOR = 16
 """... and so many times as many keep a GPU busy."""
+BORDER_PX = 4
+"""What lies so near to a neighbour's border is not read well: some of the samples around it lie beyond."""
 BLOCK_TILES = 16
 """Tiles along the sides of the blocks that a view is made in, so that tiles that follow one another see the same."""
 
@@ -42,6 +49,8 @@ class Renderer:
         gathered = max((TILE_PX // s.stride) ** 2 * s.samples * views * s.feature_channels for s in stages)
         room = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, room // gathered)
+        net = network.config
+        self.fills = bool(net.views) and not net.as_printed and net.field is None and scene.background_rgb is None
         means = [even(scene, i).mean((0, 1)) for i in scene.train]
         self.fallback = torch.stack(means).mean(0)
 
@@ -51,7 +60,7 @@ class Renderer:
         scene = self.scene
         prior = surface_prior(camera, scene.points, scene.cameras)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
-        picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 5)
+        picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
         for top in range(0, rows, BLOCK_TILES):
             for left in range(0, columns, BLOCK_TILES):
                 size = (min(BLOCK_TILES, columns - left), min(BLOCK_TILES, rows - top))
@@ -59,16 +68,19 @@ class Renderer:
                 height, width = block.shape[:2]
                 at = (top * TILE_PX, left * TILE_PX)
                 picture[at[0] : at[0] + height, at[1] : at[1] + width] = block
-        colour, opacity, depth = picture[: camera.height, : camera.width].split([3, 1, 1], dim=-1)
+        colour, opacity, depth, seen = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
         white = scene.background_rgb
         behind = self.fallback * camera.gain[0] if white is None else torch.tensor(white)
-        colour = (colour * camera.gain[0] + (1 - opacity) * behind).clamp(0, 1)
+        colour = colour * camera.gain[0] + (1 - opacity) * behind
+        if self.fills:
+            colour = fill_unseen(colour, seen[..., 0] > 0)
+        colour = colour.clamp(0, 1)
         return Rendering(colour=colour, depth=depth[..., 0].clone(), opacity=opacity[..., 0].clamp(0, 1))
 
     def _block(
         self, camera: Cameras, prior: Float[Tensor, "3 h w"], corner: tuple[int, int], size: tuple[int, int]
-    ) -> Float[Tensor, "H W 5"]:
-        """Colour, opacity and depth of a block of tiles; corner and size in tiles."""
+    ) -> Float[Tensor, "H W 6"]:
+        """Colour, opacity, depth of a block of tiles, and whether a neighbour sees it; corner and size in tiles."""
         (left, top), (columns, rows) = corner, size
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
@@ -79,8 +91,33 @@ class Renderer:
         for some in torch.arange(len(corners)).split(self.tiles_at_once):
             chosen = None if neighbours is None else neighbours[some]
             parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
-        stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 5)
-        return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 5)
+        found = torch.cat(parts)
+        seen = torch.ones_like(found[..., 0])
+        if self.fills and neighbours is not None:
+            shown, z = self._shown(camera, prior, corners, neighbours, found[..., 4])
+            found[..., 4], seen = torch.where(shown, found[..., 4], z), shown.to(found)
+        stacked = torch.cat([found, seen[..., None]], dim=-1).reshape(rows, columns, TILE_PX, TILE_PX, 6)
+        return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
+
+    def _shown(
+        self,
+        camera: Cameras,
+        prior: Float[Tensor, "3 h w"],
+        corners: Float[Tensor, "T 2"],
+        neighbours: Int[Tensor, "T N"],
+        depth: Float[Tensor, "T R"],
+    ) -> tuple[Bool[Tensor, "T R"], Float[Tensor, "T R"]]:
+        """Whether the surface lies well in a neighbour's frame, and its depth: that of the sparse points if there are
+        some, else what the network sees."""
+        uv = (corners[:, None] + pixel_grid(TILE_PX, TILE_PX)).reshape(1, -1, 2)
+        expected = read_prior(prior[None], uv)[0].reshape(depth.shape)
+        z = torch.where(expected.isnan(), depth, 1 / expected)
+        directions = camera.directions_world(uv).reshape(*depth.shape, 3)
+        points = camera.position_world[:, None] + directions * z[..., None]
+        each = self.scene.cameras[neighbours.reshape(-1)]
+        uv_there, z_there = project(each, points.repeat_interleave(neighbours.shape[1], 0))
+        shown = (z_there > 0) & (uv_there > BORDER_PX).all(-1) & (uv_there < each.size_px[:, None] - BORDER_PX).all(-1)
+        return shown.reshape(*neighbours.shape, -1).any(1), z
 
     def _tiles(
         self,
