@@ -14,6 +14,7 @@ from tidefield.config import Config
 from tidefield.data.batches import choose_neighbours, even, tile_surface
 from tidefield.data.prior import read_prior, surface_prior
 from tidefield.data.scene import Scene
+from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, pixel_grid, project
 from tidefield.model.fill import fill_unseen
 from tidefield.model.intervals import Intervals
@@ -26,8 +27,6 @@ VALUES_AT_ONCE = 5_000_000
 """Values gathered at once by a stage: enough to keep a few cores busy, few enough for their cache ..."""
 GPU_FACTOR = 16
 """... and so many times as many keep a GPU busy."""
-BORDER_PX = 4
-"""What lies so near to a neighbour's border is not read well: some of the samples around it lie beyond."""
 BLOCK_TILES = 16
 """Tiles along the sides of the blocks that a view is made in, so that tiles that follow one another see the same."""
 
@@ -107,17 +106,19 @@ class Renderer:
         neighbours: Int[Tensor, "T N"],
         depth: Float[Tensor, "T R"],
     ) -> tuple[Bool[Tensor, "T R"], Float[Tensor, "T R"]]:
-        """Whether the surface lies well in a neighbour's frame, and its depth: that of the sparse points if there are
-        some, else what the network sees."""
+        """Whether the surface may lie in a neighbour's frame, and its likeliest depth: by the sparse points around a pixel
+        if there are some, else by what the network sees."""
         uv = (corners[:, None] + pixel_grid(TILE_PX, TILE_PX)).reshape(1, -1, 2)
-        expected = read_prior(prior[None], uv)[0].reshape(depth.shape)
-        z = torch.where(expected.isnan(), depth, 1 / expected)
         directions = camera.directions_world(uv).reshape(*depth.shape, 3)
-        points = camera.position_world[:, None] + directions * z[..., None]
         each = self.scene.cameras[neighbours.reshape(-1)]
-        uv_there, z_there = project(each, points.repeat_interleave(neighbours.shape[1], 0))
-        shown = (z_there > 0) & (uv_there > BORDER_PX).all(-1) & (uv_there < each.size_px[:, None] - BORDER_PX).all(-1)
-        return shown.reshape(*neighbours.shape, -1).any(1), z
+        inverse = [known.reshape(depth.shape) for known in read_prior(prior[None], uv)]
+        z = torch.where(inverse[0].isnan(), depth, 1 / inverse[0])
+        seen = torch.zeros_like(depth, dtype=torch.bool)
+        for at in (z, *(torch.where(inverse[0].isnan(), depth, 1 / end) for end in inverse[1:])):
+            points = camera.position_world[:, None] + directions * at[..., None]
+            shown = in_frame(each, *project(each, points.repeat_interleave(neighbours.shape[1], 0)))
+            seen |= shown.reshape(*neighbours.shape, -1).any(1)
+        return seen, z
 
     def _tiles(
         self,
