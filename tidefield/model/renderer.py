@@ -106,8 +106,8 @@ class Renderer:
         neighbours: Int[Tensor, "T N"],
         depth: Float[Tensor, "T R"],
     ) -> tuple[Bool[Tensor, "T R"], Float[Tensor, "T R"]]:
-        """Whether the surface may lie in a neighbour's frame, and its likeliest depth: by the sparse points around a pixel
-        if there are some, else by what the network sees."""
+        """Whether the surface may lie in a neighbour's frame, and its likeliest depth: by the sparse points around a
+        pixel if there are some, else by what the network sees."""
         uv = (corners[:, None] + pixel_grid(TILE_PX, TILE_PX)).reshape(1, -1, 2)
         directions = camera.directions_world(uv).reshape(*depth.shape, 3)
         each = self.scene.cameras[neighbours.reshape(-1)]
