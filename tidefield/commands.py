@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 METHODS = {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth}
 DEFAULT_MINUTES = 10.0
-DEMO_FRAMES = 96
+DEMO_FRAMES = 72
 DEMO_PICTURE = "river_mouths_0033.png"
 """Of the held-out photographs of the built-in scene, the one with a creek, its banks and plants."""
 
