@@ -52,7 +52,7 @@ def _copies(source: Path, folder: Path, count: int) -> None:
         with Image.open(photograph.path) as picture:
             height = round(picture.height * WIDTH / picture.width)
             exif = picture.getexif()
-            del exif[0x8825]  # GPS: gps.csv says where the copies are
+            exif.pop(0x8825, None)  # GPS: gps.csv says where the copies are
             picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(folder / name, quality=92, exif=exif)
         row, column = divmod(copy, 20)
         latitude, longitude = place.latitude_deg + APART_DEG * row, place.longitude_deg + APART_DEG * column

@@ -17,8 +17,6 @@ from benchmarks.table import NOTHING, Table
 from tidefield.errors import SurveyError
 from tidefield.files import completed_file
 
-SURVEYS = ("brighton_beach", "turin_lot", "swindale")
-
 
 def measure_surveys(
     photographs: Path, runs: Path, surveys: Sequence[str], pairs: int | None, run: Runner, say: Callable[[str], object]

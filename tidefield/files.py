@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn
 
 from tidefield.errors import RunError
 
@@ -38,7 +37,13 @@ def writing_to(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        _tell(path, error)
+        if error.errno not in _USERS_TO_MEND:
+            raise
+        reason = error.strerror or os.strerror(error.errno)
+        raise RunError(
+            f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
+            "another place"
+        ) from error
 
 
 @contextmanager
@@ -53,14 +58,13 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     # The suffix stays, because writers choose their format by it.
     partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        with partial.open("rb+") as file:
-            # Without this a power cut may leave the final name with nothing behind it.
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        _tell(path, error)
+        with writing_to(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield partial
+            with partial.open("rb+") as file:
+                # Without this a power cut may leave the final name with nothing behind it.
+                os.fsync(file.fileno())
+            os.replace(partial, path)
     finally:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has its final name
             partial.unlink()
@@ -76,22 +80,10 @@ def completed_folder(path: Path) -> Iterator[Path]:
     refuse_existing(path, replaceable=False)
     partial = path.with_name(f".{path.name}-{secrets.token_hex(4)}.partial")
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        refuse_existing(path, replaceable=False)  # a folder that was made meanwhile would be replaced if it is empty
-        partial.rename(path)
-    except OSError as error:
-        _tell(path, error)
+        with writing_to(path):
+            partial.mkdir(parents=True)
+            yield partial
+            refuse_existing(path, replaceable=False)  # one that was made meanwhile would be replaced if it is empty
+            partial.rename(path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def _tell(path: Path, error: OSError) -> NoReturn:
-    """Raises: RunError for what a user can mend, `error` itself for the rest."""
-    if error.errno not in _USERS_TO_MEND:
-        raise error
-    reason = error.strerror or os.strerror(error.errno)
-    raise RunError(
-        f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
-        "another place"
-    ) from error

@@ -111,14 +111,14 @@ class Renderer:
         uv = (corners[:, None] + pixel_grid(TILE_PX, TILE_PX)).reshape(1, -1, 2)
         directions = camera.directions_world(uv).reshape(*depth.shape, 3)
         each = self.scene.cameras[neighbours.reshape(-1)]
-        inverse = [known.reshape(depth.shape) for known in read_prior(prior[None], uv)]
-        z = torch.where(inverse[0].isnan(), depth, 1 / inverse[0])
+        inverse = torch.stack([known.reshape(depth.shape) for known in read_prior(prior[None], uv)])
+        likeliest_and_ends = torch.where(inverse[0].isnan(), depth, 1 / inverse)
         seen = torch.zeros_like(depth, dtype=torch.bool)
-        for at in (z, *(torch.where(inverse[0].isnan(), depth, 1 / end) for end in inverse[1:])):
+        for at in likeliest_and_ends:
             points = camera.position_world[:, None] + directions * at[..., None]
             shown = in_frame(each, *project(each, points.repeat_interleave(neighbours.shape[1], 0)))
             seen |= shown.reshape(*neighbours.shape, -1).any(1)
-        return seen, z
+        return seen, likeliest_and_ends[0]
 
     def _tiles(
         self,

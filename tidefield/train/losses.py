@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from tidefield.data.batches import Batch
 from tidefield.model.network import Network, TileRendering
+from tidefield.train.metrics import similarity
 
 GLIMPSE_WEIGHT = 0.5
 """Of the coarse stages' own colours, without which nothing would teach them where the surface is."""
@@ -42,11 +42,7 @@ def photometric(
 def structural(rendering: TileRendering, batch: Batch, side_px: int) -> Float[Tensor, ""]:
     """1 - SSIM of the tiles' colours, as evaluation measures it, weighted as the batch says."""
     found, truth, weight = (_picture(x, side_px) for x in (rendering.colour, batch.colours, batch.weight[..., None]))
-    _, similarity = structural_similarity_index_measure(
-        found, truth, sigma=1.5, kernel_size=11, data_range=1.0, return_full_image=True
-    )
-    assert isinstance(similarity, Tensor)
-    return ((1 - similarity) * weight).mean() / weight.mean().clamp(min=0.1)
+    return ((1 - similarity(found, truth)) * weight).mean() / weight.mean().clamp(min=0.1)
 
 
 def sparse_depth(rendering: TileRendering, batch: Batch, network: Network, side_px: int) -> Float[Tensor, ""]:

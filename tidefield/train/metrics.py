@@ -72,10 +72,10 @@ def _score_image(
             scores.reasons[metric + suffix] = "two training photographs see none of this photograph's pixels"
     if not masks:
         return
-    similarity, difference = ssim_map(image, truth), flip_map(image, truth)
+    alike, difference = ssim_map(image, truth), flip_map(image, truth)
     for suffix, mask in masks.items():
         scores.values["psnr" + suffix] = psnr(image, truth, mask)
-        scores.values["ssim" + suffix] = float(similarity[mask].mean())
+        scores.values["ssim" + suffix] = float(alike[mask].mean())
         scores.values["flip" + suffix] = float(difference[mask].mean())
     for metric in BACKBONES:
         network = networks[metric]
@@ -97,14 +97,21 @@ def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> float:
 
 
 def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
-    """Eq. 13 around each pixel, mean over the channels: 11x11 Gaussian, sigma 1.5, data range 1, reflected borders."""
+    """Eq. 13 around each pixel, mean over the channels."""
+    first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))
+    return similarity(first, second)[0].mean(0).float()
+
+
+def similarity(first: Float[Tensor, "T C H W"], second: Float[Tensor, "T C H W"]) -> Float[Tensor, "T C H W"]:
+    """Eq. 13 around each value: 11x11 Gaussian, sigma 1.5, data range 1, reflected borders; differentiable."""
     prepare_torchvision()
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))
-    result = structural_similarity_index_measure(first, second, sigma=1.5, data_range=1.0, return_full_image=True)
+    result = structural_similarity_index_measure(
+        first, second, sigma=1.5, kernel_size=11, data_range=1.0, return_full_image=True
+    )
     assert isinstance(result, tuple)
-    return result[1][0].mean(0).float()
+    return result[1]
 
 
 def flip_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:

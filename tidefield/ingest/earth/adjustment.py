@@ -44,9 +44,7 @@ def adjust(model: pycolmap.Reconstruction, marks: Marks, lens: Lens) -> pycolmap
         lens: "held" as it is; "freed" adjusts focal length, principal point and distortion too, of OpenCV's model.
     """
     copy = pycolmap.Reconstruction(model)
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in copy.reg_image_ids():
-        config.add_image(number)
+    config = all_images(copy)
     generalise_lenses(copy, config, freed=lens == "freed")
     for name, surveyed in marks.points.items():
         config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
@@ -66,9 +64,7 @@ def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction
     for number, point in model.points3D.items():
         if adjusted.exists_point3D(number):
             point.xyz = adjusted.points3D[number].xyz
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in model.reg_image_ids():
-        config.add_image(number)
+    config = all_images(model)
     for number in model.cameras:
         config.set_constant_cam_intrinsics(number)
     options = adjustment_options()
@@ -80,13 +76,11 @@ def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction
 def reliable(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """A copy without the observations that fit far worse than most, once the model is adjusted to its matches alone.
 
-    Mismatches that structure from motion lets pass are few, but the sum of squares counts them most: without them the
-    control points of a real survey that are left out in turn are met a tenth better, and four times sooner.
+    Mismatches that structure from motion lets pass are few, but the sum of squares counts them most: they pull the
+    model off its control points, and slow every adjustment.
     """
     free, copy = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in free.reg_image_ids():
-        config.add_image(number)
+    config = all_images(free)
     generalise_lenses(free, config, freed=True)
     pycolmap.create_default_bundle_adjuster(adjustment_options(), config, free).solve()
     free.update_point_3d_errors()
@@ -155,6 +149,14 @@ def adjustment_options() -> pycolmap.BundleAdjustmentOptions:
     solver.max_num_iterations, solver.function_tolerance = _STEPS, _TOLERANCE
     options.ceres.solver_options = solver
     return options
+
+
+def all_images(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    """That a model is to be adjusted with all its photographs."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    return config
 
 
 def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, freed: bool) -> None:

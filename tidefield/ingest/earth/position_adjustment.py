@@ -16,7 +16,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from tidefield.geometry.similarity import outliers
-from tidefield.ingest.earth.adjustment import adjustment_options, carry_over, generalise_lenses, thinned
+from tidefield.ingest.earth.adjustment import adjustment_options, all_images, carry_over, generalise_lenses, thinned
 from tidefield.ingest.earth.alignment import camera_centres, metres
 from tidefield.ingest.reading.names import some
 
@@ -106,10 +106,9 @@ def _adjusted(
     model: pycolmap.Reconstruction, positions: Differential, names: Collection[str], lens: Lens
 ) -> pycolmap.Reconstruction:
     copy = pycolmap.Reconstruction(model)
-    config = pycolmap.BundleAdjustmentConfig()
+    config = all_images(copy)
     priors = []
     for number in sorted(copy.reg_image_ids()):
-        config.add_image(number)
         image = copy.image(number)
         if image.name in names:
             prior = pycolmap.PosePrior()

@@ -136,7 +136,7 @@ def extract(
         # of one that has threads may hang. A GPU works on one photograph at a time.
         on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
         workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn"), _quieten) as pool:
             for photograph, camera, (keypoints, descriptors) in _in_order(pool, todo, options, device):
                 _write(db, photograph, camera, keypoints, descriptors)
                 done += 1
@@ -157,6 +157,11 @@ def _in_order(
         yield photograph, camera, found
 
 
+def _quieten() -> None:
+    """What pycolmap logs in a process of its own would come between the lines of progress."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+
+
 def _features(
     photograph: Photograph, options: FeatureOptions, device: pycolmap.Device
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -166,7 +171,6 @@ def _features(
     if shrunk < 1:
         size = (round(grey.shape[1] * shrunk), round(grey.shape[0] * shrunk))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # this may be a process of its own
     sift = pycolmap.FeatureExtractionOptions()
     sift.num_threads = 1
     sift.sift.max_num_features = options.count

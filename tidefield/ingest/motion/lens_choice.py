@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from tidefield.ingest.earth.adjustment import adjustment_options, thinned
+from tidefield.ingest.earth.adjustment import adjustment_options, all_images, thinned
 from tidefield.ingest.earth.alignment import PositionFit, camera_centres, find_down, fit_positions
 from tidefield.ingest.earth.gps import given_positions
 from tidefield.ingest.survey import Photograph
@@ -242,9 +242,7 @@ def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
         camera.params = [*([mean, mean] if lens == "OPENCV" else [mean]), *centre, *terms]
     options = adjustment_options()
     options.refine_focal_length, options.refine_principal_point = focal, False
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in model.reg_image_ids():
-        config.add_image(number)
+    config = all_images(model)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Not `bundle_adjustment`, which is the same but prints whatever the log level.
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
