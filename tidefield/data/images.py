@@ -27,6 +27,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from tidefield.cores import cores
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens, rectify
 
@@ -211,7 +212,7 @@ def _decoded(
     """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha if there is any."""
     largest = max(file.lens.width * file.lens.height for file in files)
     # A photograph in the works takes some 12 bytes per pixel; together they stay around a gigabyte.
-    workers = max(1, min(os.cpu_count() or 1, 8, 1_000_000_000 // (12 * largest)))
+    workers = max(1, min(cores(), 8, 1_000_000_000 // (12 * largest)))
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[np.ndarray]] = deque()
         try:

@@ -60,7 +60,7 @@ def write_transforms(
     top["applied_transform"] = np.column_stack([np.eye(3), 0.0 - origin]).tolist()
     xyz_world, rgb = _points(model)
     if len(xyz_world):
-        _write_cloud(folder / CLOUD_FILE, xyz_world - origin, rgb, overwrite)
+        write_cloud(folder / CLOUD_FILE, xyz_world - origin, rgb, overwrite)
         top["ply_file_path"] = CLOUD_FILE
     top |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
     top["frames"] = [
@@ -100,7 +100,7 @@ def _points(model: pycolmap.Reconstruction) -> tuple[Float64[np.ndarray, "P 3"],
     return xyz.reshape(-1, 3), rgb.reshape(-1, 3)
 
 
-def _write_cloud(path: Path, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], overwrite: bool) -> None:
+def write_cloud(path: Path, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], overwrite: bool) -> None:
     """A binary PLY file, as open3d and thereby nerfstudio reads it."""
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
     header += [f"property float {axis}" for axis in "xyz"]

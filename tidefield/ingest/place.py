@@ -5,7 +5,6 @@ A file that needs no change is copied byte for byte.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ import pycolmap
 from jaxtyping import Float32
 from PIL import ExifTags, Image
 
+from tidefield.cores import cores
 from tidefield.files import completed_file
 from tidefield.ingest.colour import Evening, evened
 from tidefield.ingest.reading.pictures import upright
@@ -63,7 +63,7 @@ def place_photographs(
             pixels = evened(upright(photograph), evening.gain[number], evening.falloff[number], tangent)
         _save(pixels, photograph.path, target)
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(place, range(len(photographs))), start=1):
             progress(done, len(photographs))
 

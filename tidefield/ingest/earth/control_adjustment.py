@@ -184,4 +184,4 @@ def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstructio
 def _unchecked(marks: Marks, check: Residuals) -> tuple[str, ...]:
     rest = sorted(set(marks.point) - set(check.names))
     why = "one photograph shows it, or too few points would be left"
-    return (f"Used, but not checked, is {some(rest)}: {why}.",) if rest else ()
+    return (f"Used, but not checked: {some(rest)}; {why}.",) if rest else ()

@@ -3,8 +3,6 @@ Zisserman, 2012)."""
 
 from __future__ import annotations
 
-import os
-import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -19,6 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from tidefield.cores import cores
 from tidefield.errors import DeviceError
 from tidefield.ingest.reading.pictures import upright
 from tidefield.ingest.survey import LensPrior, Photograph
@@ -27,11 +26,6 @@ Progress = Callable[[int, int], object]
 
 DEFAULT_FOCAL = 1.2
 """Focal length in widths of the photograph where nothing is known of the lens: COLMAP's guess."""
-
-
-def cores() -> int:
-    """That this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

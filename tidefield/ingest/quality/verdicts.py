@@ -6,7 +6,6 @@ Every limit is stated here and again in the reason, with what was measured. Noth
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int8
 from scipy.spatial import KDTree
 
+from tidefield.cores import cores
 from tidefield.errors import SurveyError
 from tidefield.ingest.quality.duplicates import duplicates
 from tidefield.ingest.quality.measures import SIDE_PX, Measures, measure
@@ -135,7 +135,7 @@ def _measure(
             return f"undecodable: {error}"
 
     measured, outlines, reasons = [], [], []
-    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+    pool = ThreadPoolExecutor(min(8, cores()))
     try:
         for done, found in enumerate(pool.map(look, photographs), start=1):
             measures, outline = (None, None) if isinstance(found, str) else found

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from PIL import ExifTags
 
+from tidefield.cores import cores
 from tidefield.errors import SurveyError
 from tidefield.ingest.reading import metadata as tags
 from tidefield.ingest.reading.control import CONTROL_FILES, read_control
@@ -58,7 +59,7 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
     remarks = []
     if undeveloped:
         remarks.append(f"{len(undeveloped)} camera raw files are not read ({some(undeveloped)}): develop them first.")
-    with ThreadPoolExecutor(min(8, 2 * (os.cpu_count() or 1))) as pool, warnings.catch_warnings():
+    with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
         # Pillow's, of tags that it cannot read; they name no file, and what is not read is unknown.
         warnings.simplefilter("ignore", UserWarning)
         read = list(pool.map(_read, paths, names))
