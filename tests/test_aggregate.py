@@ -188,3 +188,12 @@ def test_gradients_of_the_box_are_finite_where_nothing_sees():
     for name, parameter in own.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
+
+
+def test_views_that_count_alike_are_averaged_whatever_their_directions():
+    own = randomise(Aggregate(C, H, folded=False, alike=True).double())
+    features, colours, cosine, valid = inputs()
+    evidence = own(features, colours, cosine, valid)
+    for t, p in [(0, 0), (1, 4), (1, 5)]:
+        expected = colours[t, valid[t, :, p], p].mean(0) + 0.5 * (not valid[t, :, p].any())
+        torch.testing.assert_close(evidence.mean_colour[t, p], expected)

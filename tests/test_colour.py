@@ -147,3 +147,12 @@ def test_views_straight_behind_the_target_stay_finite():
     same = direction[:, None].expand_as(gathered.directions)
     straight = replace(gathered, directions=same, cosine=torch.full_like(gathered.cosine, 1 + 1e-7))
     assert own(evidence, straight, direction).isfinite().all()
+
+
+def test_alone_the_neighbours_share_everything_that_one_of_them_sees():
+    own, (evidence, gathered, direction) = randomise(ColourBlend(H, 3, alone=True).double()), scene()
+    share, seen = shares(own, evidence, gathered, direction).sum(1), gathered.valid.any(1)
+    torch.testing.assert_close(share[seen], torch.ones_like(share[seen]))
+    assert (share[~seen] == 0).all()
+    own(evidence, gathered, direction).sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in own.parameters())

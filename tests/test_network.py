@@ -339,3 +339,10 @@ def test_colours_come_from_the_photographs_at_full_resolution_whatever_the_featu
     towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
     colours = views.read(4, points, towards, detail=True).colours
     assert (colours - wall.texture(points[:, None, :, :2])).abs().max() < 0.08
+
+
+def test_densities_come_from_each_sample_alone_without_the_ray_transformer():
+    own = network(replace(SMALL_PAPER, without=("ray transformer",)), stir=0.05)
+    assert not [name for name, _ in own.named_parameters() if "transformer" in name]
+    result = own(*looking(own, scene()), opaque=True)
+    assert finite_forward_and_backward(own, result) >= {"encoder", "stages", "colour"}

@@ -53,6 +53,9 @@ class FieldConfig:
     finest: int = 2048
 
 
+Part = Literal["direction weights", "ray transformer", "target colour"]
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """The network of the paper's Figure 2."""
@@ -73,6 +76,9 @@ class NetworkConfig:
     """The paper's boxes and nothing else. Otherwise what we add to them takes part: a look around the sparse points'
     surface first, density where features agree, sharpened photographs, views by angle before anything is learned."""
     field: FieldConfig | None = None
+    without: tuple[Part, ...] = ()
+    """Parts of the paper that are left out, to see what they bring: views count alike instead of by direction (eq. 6),
+    densities come from each sample alone, colours from the neighbours alone."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +107,46 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class NerfConfig:
+    """Classical NeRF, the baseline."""
+
+    method: Literal["nerf"] = "nerf"
+    coarse: int = 64
+    """Samples of the coarse pass; the fine one reads them again."""
+    fine: int = 128
+    """Further samples of the fine pass."""
+    depth: int = 8
+    width: int = 256
+    position_octaves: int = 10
+    direction_octaves: int = 4
+    rays: int = 1024
+    """Rays of a step."""
+    learning_rate: float = 5e-4
+    """At the beginning; a tenth at the end."""
+    density_noise: float = 1.0
+    """Standard deviation of what is added to densities of scenes without background, while training."""
+
+
+@dataclass(frozen=True)
+class NerfstudioConfig:
+    """One of nerfstudio's methods, the baselines, with nerfstudio's defaults."""
+
+    method: Literal["nerfacto", "splatfacto"]
+    version: str
+    """Of nerfstudio."""
+
+
+@dataclass(frozen=True)
 class Config:
     """All that a run needs to be repeated, besides its scene and its seed."""
 
     preset: str
     network: NetworkConfig
     train: TrainConfig
+    method: Literal["tidefield"] = "tidefield"
+
+
+AnyConfig = Config | NerfConfig | NerfstudioConfig
 
 
 PAPER = Config(
@@ -144,17 +184,20 @@ SWIFT = Config(
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 
 
-def config_to_json(config: Config) -> dict[str, Any]:
+def config_to_json(config: AnyConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def config_from_json(data: Any) -> Config:
-    """The Config of a JSON object.
+def config_from_json(data: Any) -> AnyConfig:
+    """The configuration of a JSON object.
 
     Raises:
         RunError: when a field is missing, unknown or of another type.
     """
-    return _build(Config, data, "config")
+    method = data.get("method") if isinstance(data, dict) else None
+    kinds = typing.get_args(AnyConfig)
+    kind = next((k for k in kinds if method in typing.get_args(typing.get_type_hints(k)["method"])), Config)
+    return _build(kind, data, "config")
 
 
 def _build(kind: Any, data: Any, where: str) -> Any:

@@ -78,10 +78,12 @@ class Aggregate(nn.Module):
         folded: the part of the first layer that acts on F_i has been applied to the feature maps already (it commutes
             with bilinear interpolation), so channels == hidden and F_i enters as it is.
         as_printed: without the disagreement.
+        alike: views count alike in the first pooling, whatever their directions.
     """
 
-    def __init__(self, channels: int, hidden: int, folded: bool, as_printed: bool = False) -> None:
+    def __init__(self, channels: int, hidden: int, folded: bool, as_printed: bool = False, alike: bool = False) -> None:
         super().__init__()
+        self.alike = alike
         assert not folded or channels == hidden, "a folded first layer hands on its outputs"
         # exp keeps s positive; 20 separates views 20 degrees apart by a factor of 3.
         self.log_sharpness = nn.Parameter(torch.tensor(math.log(20.0)))
@@ -99,7 +101,9 @@ class Aggregate(nn.Module):
         cosine: Float[Tensor, "T N P"],
         valid: Bool[Tensor, "T N P"],
     ) -> Evidence:
-        weight = direction_weights(cosine, valid, self.log_sharpness.exp())
+        sharpness = self.log_sharpness.exp()
+        # With a sharpness of 0 all directions are the same, and the views share equally.
+        weight = direction_weights(cosine, valid, 0 * sharpness if self.alike else sharpness)
         mean, variance = weighted_moments(features, weight)
         # A linear layer of [F_i, mu, v] is a sum of linear layers; the shared part is computed once for all views.
         shared = self.shared(torch.cat([mean, variance], dim=-1))

@@ -21,14 +21,15 @@ class ColourBlend(nn.Module):
     Args:
         hidden: H.
         degree: J.
+        alone: the neighbours' colours alone; the target's share is nothing where a neighbour sees the sample.
         as_printed: nothing else. Otherwise the angle also enters on a logarithmic scale, blending begins by inverse
             angle, as in unstructured lumigraph rendering (Buehler et al., 2001), and the target begins with a small
             share and is a difference to the neighbours' mean colour.
     """
 
-    def __init__(self, hidden: int, degree: int, as_printed: bool = False) -> None:
+    def __init__(self, hidden: int, degree: int, as_printed: bool = False, alone: bool = False) -> None:
         super().__init__()
-        self.degree = degree
+        self.degree, self.alone = degree, alone
         self.view = nn.Linear(hidden, hidden)
         # d - d_i (3 numbers), d.d_i, w_n,i and, if not as printed, the logarithm of the angle.
         self.direction = nn.Linear(5 if as_printed else 6, hidden, bias=False)
@@ -53,10 +54,11 @@ class ColourBlend(nn.Module):
         if gathered is None:
             return target
         logits = self._view_logits(evidence, gathered, direction)
-        own = head[..., 0]
-        if self.angle is not None:
+        own, seen = head[..., 0], gathered.valid.any(1)
+        if self.alone:
+            own = own.masked_fill(seen, -torch.inf)
+        elif self.angle is not None:
             # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
-            seen = gathered.valid.any(1)
             own = own + torch.where(seen, logits.masked_fill(~gathered.valid, -1e4).logsumexp(1), 0.0)
         share = torch.softmax(torch.cat([logits, own[:, None]], dim=1), dim=1)
         return (share[:, :-1, :, None] * gathered.colours).sum(1) + share[:, -1, :, None] * target

@@ -95,7 +95,8 @@ class Network(nn.Module):
         self.stages = nn.ModuleList(
             Stage(config, stage, field_channels, first=k == 0) for k, stage in enumerate(config.stages)
         )
-        self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree, config.as_printed)
+        alone = "target colour" in config.without
+        self.colour = ColourBlend(config.stages[-1].hidden, config.harmonics_degree, config.as_printed, alone)
 
     def forward(
         self,

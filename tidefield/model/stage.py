@@ -70,8 +70,10 @@ class Stage(nn.Module):
         super().__init__()
         self.hidden = hidden = config.hidden
         if network.views:
-            self.aggregate = Aggregate(config.feature_channels, hidden, network.fold, network.as_printed)
-            self.transformer = RayTransformer(hidden, network.heads)
+            alike = "direction weights" in network.without
+            self.aggregate = Aggregate(config.feature_channels, hidden, network.fold, network.as_printed, alike)
+            if "ray transformer" not in network.without:
+                self.transformer = RayTransformer(hidden, network.heads)
         if field_channels:
             self.from_field = nn.Sequential(nn.Linear(field_channels, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
         self.density = nn.Linear(hidden, 1)
