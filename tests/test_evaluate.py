@@ -156,5 +156,5 @@ def test_the_table_says_what_is_missing_and_why(scene, tmp_path):
 
 
 def test_pictures_of_photographs_that_differ_in_their_suffix_only_do_not_collide():
-    names = [str(path) for path in module._picture_names(["a.JPG", "a.png", "strip/b.jpg"])]
+    names = [str(path) for path in module.picture_names(["a.JPG", "a.png", "strip/b.jpg"])]
     assert names == ["a.JPG.png", "a.png.png", "strip/b.png"]

@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tidefield import __version__
-from tidefield.config import Config, config_from_json, config_to_json
+from tidefield.config import AnyConfig, config_from_json, config_to_json
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 
@@ -40,7 +40,7 @@ class Run:
     scene: Path
     width: int | None
     seed: int
-    config: Config
+    config: AnyConfig
     version: str = __version__
 
 

@@ -10,7 +10,7 @@ from tidefield.meter import Meter
 from tidefield.train.losses import psnr
 
 if TYPE_CHECKING:
-    from tidefield.train.loop import Budget, Trainer
+    from tidefield.train.loop import Budget, Learner
 
 
 class Display:
@@ -26,9 +26,13 @@ class Display:
     def __exit__(self, *error: object) -> None:
         self._meter.__exit__(*error)
 
-    def update(self, trainer: Trainer, budget: Budget, mean_square: float) -> None:
+    def update(self, trainer: Learner, budget: Budget, mean_square: float) -> None:
         """Show the state after a step."""
         progress = trainer.progress
         rays = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9)
-        line = f"step {progress.step}  loss {mean_square:.5f}  PSNR {psnr(mean_square):.2f} dB  {rays:,.0f} rays/s"
-        self._meter(budget.share(progress), 1, line)
+        loss = f"loss {mean_square:.5f}  PSNR {psnr(mean_square):.2f} dB  {rays:,.0f} rays/s"
+        self.show(budget.share(progress), f"step {progress.step}  {loss}")
+
+    def show(self, share: float, line: str) -> None:
+        """Show how much of the budget is used, and a line beside it."""
+        self._meter(share, 1, line)

@@ -84,7 +84,7 @@ def evaluate(
         raise RunError(f"{path} is there already: expected a folder without one; choose another, or add --overwrite")
     if not scene.test:
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
-    files = _picture_names([scene.names[i] for i in scene.test])
+    files = picture_names([scene.names[i] for i in scene.test])
     photographs: dict[str, dict[str, Any]] = {}
     memory: dict[str, int | None] = {}
     networks: dict[str, Lpips | str] = {}
@@ -172,7 +172,7 @@ def _mean(photographs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {**mean, "reasons": reasons, "seen_share": fmean(photograph["seen_share"] for photograph in photographs)}
 
 
-def _picture_names(names: Sequence[str]) -> list[Path]:
+def picture_names(names: Sequence[str]) -> list[Path]:
     """File names for pictures of photographs: NAME.png, or NAME.JPG.png where two differ only in their suffix."""
     stems = [PurePosixPath(name).with_suffix("") for name in names]
     return [Path(f"{stem if stems.count(stem) == 1 else name}.png") for stem, name in zip(stems, names, strict=True)]

@@ -71,7 +71,7 @@ def side_by_side(panels: Sequence[Panel]) -> Image.Image:
     sheet = Image.new("RGB", (width, height + strips * STRIP_PX), PAPER)
     x = 0
     for panel, image in zip(panels, images, strict=True):
-        sheet.paste(_strip(image.width, panel.label), (x, 0))
+        sheet.paste(strip(image.width, panel.label), (x, 0))
         sheet.paste(image, (x, STRIP_PX))
         if panel.scale:
             sheet.paste(_scale_bar(image.width, panel.scale), (x, STRIP_PX + height))
@@ -79,23 +79,23 @@ def side_by_side(panels: Sequence[Panel]) -> Image.Image:
     return sheet
 
 
-def _strip(width: int, left: str, right: str = "") -> Image.Image:
+def strip(width: int, left: str, right: str = "") -> Image.Image:
     """A strip of paper with text at its ends."""
-    strip = Image.new("RGB", (width, STRIP_PX), PAPER)
-    draw = ImageDraw.Draw(strip)
+    band = Image.new("RGB", (width, STRIP_PX), PAPER)
+    draw = ImageDraw.Draw(band)
     font = ImageFont.load_default(14)
     draw.text((6, STRIP_PX // 2), left, INK, font, anchor="lm")
     draw.text((width - 6, STRIP_PX // 2), right, INK, font, anchor="rm")
-    return strip
+    return band
 
 
 def _scale_bar(width: int, scale: Scale) -> Image.Image:
     """The colour map between its two values."""
     low, high = (f"{value:.3g}{scale.unit}" for value in (scale.low, scale.high))
-    strip = _strip(width, low, high)
+    band = strip(width, low, high)
     text = max(int(ImageFont.load_default(14).getlength(word)) for word in (low, high)) + 14
     length = width - 2 * text
     if length > 0:
         ramp = torch.linspace(scale.low, scale.high, length).expand(STRIP_PX - 12, -1)
-        strip.paste(Image.fromarray(colours(ramp, scale).numpy()), (text, 6))
-    return strip
+        band.paste(Image.fromarray(colours(ramp, scale).numpy()), (text, 6))
+    return band

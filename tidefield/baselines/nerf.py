@@ -1,0 +1,224 @@
+"""Classical NeRF (Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV
+2020), the paper's "conventional NeRF": one multi-layer perceptron for a coarse and one for a fine pass along each ray.
+
+Sizes and rates are the authors'. Where their code departs from their equations we follow the code, which made their
+figures: positions enter beside their encoding, and frequencies go without the factor pi. Exposures are evened out as
+for every other method here.
+
+Alphabet: R rays, M samples of a ray, P points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tidefield.config import NerfConfig
+from tidefield.data.scene import Scene
+from tidefield.device import mixed_precision
+from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.model.compositing import composite, weights
+from tidefield.model.intervals import sample
+from tidefield.model.rendering import Render, Rendering
+from tidefield.train.loop import Learner
+
+RAYS_AT_ONCE = 1024
+"""When rendering: the widest layer's values of so many rays are some 200 MB."""
+
+
+def encode(x: Float[Tensor, "*P 3"], octaves: int) -> Float[Tensor, "*P C"]:
+    """x, sin(2^k x), cos(2^k x) for k = 0 .. octaves - 1 (eq. 4 of NeRF, as its code has it): 3 + 6 octaves values."""
+    scaled = x[..., None, :] * 2.0 ** torch.arange(octaves, device=x.device)[:, None]
+    return torch.cat([x, scaled.sin().flatten(-2), scaled.cos().flatten(-2)], dim=-1)
+
+
+class Mlp(nn.Module):
+    """Density and colour of a position seen in a direction (NeRF's Figure 7)."""
+
+    def __init__(self, config: NerfConfig) -> None:
+        super().__init__()
+        position, direction = 3 + 6 * config.position_octaves, 3 + 6 * config.direction_octaves
+        self.config, width = config, config.width
+        self.skip = config.depth // 2 + 1
+        inputs = [position] + [width + (position if k == self.skip else 0) for k in range(1, config.depth)]
+        self.trunk = nn.ModuleList(nn.Linear(size, width) for size in inputs)
+        self.density = nn.Linear(width, 1)
+        self.feature = nn.Linear(width, width)
+        self.branch = nn.Linear(width + direction, width // 2)
+        self.colour = nn.Linear(width // 2, 3)
+
+    def forward(
+        self, xyz: Float[Tensor, "R M 3"], direction: Float[Tensor, "R 3"]
+    ) -> tuple[Float[Tensor, "R M"], Float[Tensor, "R M 3"]]:
+        """Densities before their ReLU, and colours in [0, 1]; positions in [-1, 1], directions of length 1."""
+        position = encode(xyz, self.config.position_octaves)
+        seen_from = encode(direction, self.config.direction_octaves)[:, None].expand(-1, xyz.shape[1], -1)
+        with mixed_precision(xyz.device):
+            x = position
+            for k, layer in enumerate(self.trunk):
+                x = F.relu(layer(torch.cat([position, x], dim=-1) if k == self.skip else x))
+            density = self.density(x)[..., 0]
+            colour = self.colour(F.relu(self.branch(torch.cat([self.feature(x), seen_from], dim=-1))))
+        return density.float(), colour.float().sigmoid()
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays with the z-depths between which they may meet the scene.
+
+    Attributes:
+        origin_world: where they begin.
+        direction_world: scaled so that one unit is one unit of z-depth.
+        near_far: z-depths.
+    """
+
+    origin_world: Float[Tensor, "R 3"]
+    direction_world: Float[Tensor, "R 3"]
+    near_far: Float[Tensor, "R 2"]
+
+    @staticmethod
+    def of(cameras: Cameras, which: Int[Tensor, " R"], uv_px: Float[Tensor, "R 2"]) -> Rays:
+        """Rays through pixels of some of the cameras."""
+        chosen = cameras[which]
+        return Rays(chosen.position_world, chosen.directions_world(uv_px[:, None])[:, 0], chosen.near_far)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one pass sees along rays; what lies behind the scene is not in the colour."""
+
+    colour: Float[Tensor, "R 3"]
+    depth: Float[Tensor, " R"]
+    opacity: Float[Tensor, " R"]
+    weights: Float[Tensor, "R M"]
+
+
+class Nerf(nn.Module):
+    """The coarse and the fine network. The scene's place is set once by `cover` and stored with the weights."""
+
+    centre_world: Tensor
+    radius: Tensor
+
+    def __init__(self, config: NerfConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.coarse, self.fine = Mlp(config), Mlp(config)
+        self.register_buffer("centre_world", torch.zeros(3))
+        self.register_buffer("radius", torch.ones(()))
+
+    def cover(self, cameras: Cameras) -> None:
+        """Bring all that cameras may see into [-1, 1]."""
+        corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+        ends = cameras.directions_world(corners * cameras.size_px[:, None])
+        points = cameras.position_world[:, None, None] + ends[:, :, None] * cameras.near_far[:, None, :, None]
+        points = torch.cat([points.reshape(-1, 3), cameras.position_world])
+        low, high = points.amin(0), points.amax(0)
+        self.centre_world.copy_((low + high) / 2)
+        self.radius.copy_((high - low).max() / 2)
+
+    def forward(self, rays: Rays, opaque: bool, generator: torch.Generator | None = None) -> tuple[Seen, Seen]:
+        """What the coarse and the fine pass see.
+
+        Args:
+            rays: of any cameras.
+            opaque: whether the last sample stops all light: real scenes have no holes.
+            generator: jitters samples and densities, for training.
+        """
+        config, count = self.config, len(rays.near_far)
+        even = torch.ones(1, count, config.coarse, device=rays.near_far.device)
+        place = sample(even, config.coarse, generator)[0]
+        coarse = self._pass(self.coarse, rays, place, opaque, generator)
+        known = (coarse.weights.detach() + 1e-5)[None]
+        finer = torch.cat([place, sample(known, config.fine, generator)[0]], dim=-1).sort(dim=-1).values
+        return coarse, self._pass(self.fine, rays, finer, opaque, generator)
+
+    def _pass(
+        self, mlp: Mlp, rays: Rays, place: Float[Tensor, "R M"], opaque: bool, generator: torch.Generator | None
+    ) -> Seen:
+        near, far = rays.near_far[:, :1], rays.near_far[:, 1:]
+        z = near + (far - near) * place
+        xyz = rays.origin_world[:, None] + rays.direction_world[:, None] * z[..., None]
+        length = rays.direction_world.norm(dim=-1, keepdim=True)
+        density, colour = mlp((xyz - self.centre_world) / self.radius, rays.direction_world / length)
+        if generator is not None and opaque and self.config.density_noise:
+            noise = torch.randn(density.shape, generator=generator).to(density)
+            density = density + self.config.density_noise * noise
+        last = torch.full_like(far, torch.inf) if opaque else far - z[:, -1:]
+        delta = torch.cat([z.diff(dim=-1), last], dim=-1) * length / self.radius
+        w = weights(F.relu(density), delta)
+        return Seen(composite(w, colour), (w * z).sum(-1), w.sum(-1), w)
+
+
+class NerfLearner(Learner):
+    """Trains on rays through random pixels of all training photographs."""
+
+    def __init__(self, config: NerfConfig, scene: Scene, seed: int, device: torch.device) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = Nerf(config)
+        network.cover(scene.cameras[list(scene.train)])
+        groups = [{"params": list(network.parameters()), "peak": config.learning_rate}]
+        super().__init__(network.to(device), groups, scene, seed, device, betas=(0.9, 0.999), eps=1e-8)
+        self.config, self.nerf = config, network
+
+    @property
+    def rays_per_step(self) -> int:
+        return self.config.rays
+
+    def rate(self, share: float) -> float:
+        return 0.1**share
+
+    def loss(self) -> tuple[Tensor, Tensor]:
+        """Squared errors of both passes (NeRF's eq. 6), and that of the fine one."""
+        scene, device = self.scene, self.device
+        which, uv, truth = draw_pixels(scene, self.config.rays, self.generator)
+        rays = Rays.of(self.cameras, which.to(device), uv.to(device))
+        background, truth = scene.background_rgb, truth.to(device)
+        errors = []
+        for seen in self.nerf(rays, background is None, self.generator):
+            colour = seen.colour
+            if background is not None:
+                colour = colour + (1 - seen.opacity[:, None]) * colour.new_tensor(background)
+            errors.append(F.mse_loss(colour, truth))
+        return errors[0] + errors[1], errors[1].detach()
+
+    def renderer(self) -> Render:
+        return make_render(self.nerf, self.scene, self.device)
+
+
+def draw_pixels(
+    scene: Scene, count: int, generator: torch.Generator
+) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 2"], Float[Tensor, "R 3"]]:
+    """Random pixels of random training photographs: which photographs, where, and their colours at common exposure."""
+    train = torch.tensor(scene.train)
+    which = train[torch.randint(len(train), (count,), generator=generator)]
+    pixel = (torch.rand(count, 2, generator=generator) * scene.cameras.size_px[which]).floor()
+    colour = torch.empty(count, 3)
+    for index in which.unique().tolist():
+        mine = which == index
+        u, v = pixel[mine].long().unbind(-1)
+        colour[mine] = scene.photographs[index][v, u].float() / (255 * scene.cameras.gain[index])
+    return which, pixel + 0.5, colour
+
+
+def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:
+    """A trained NeRF as a method for one scene."""
+
+    @torch.inference_mode()
+    def render(camera: Cameras) -> Rendering:
+        here, parts = camera.to(device), []
+        for uv in pixel_grid(camera.width, camera.height, device).split(RAYS_AT_ONCE):
+            rays = Rays.of(here, torch.zeros(len(uv), dtype=torch.long, device=device), uv)
+            _, seen = network(rays, scene.background_rgb is None)
+            parts.append(torch.cat([seen.colour, seen.depth[:, None], seen.opacity[:, None]], dim=-1).cpu())
+        colour, depth, opacity = torch.cat(parts).reshape(camera.height, camera.width, 5).split([3, 1, 1], dim=-1)
+        colour = colour * camera.gain[0]
+        if scene.background_rgb is not None:
+            colour = colour + (1 - opacity) * torch.tensor(scene.background_rgb)
+        return Rendering(colour.clamp(0, 1), depth[..., 0], opacity[..., 0].clamp(0, 1))
+
+    return render

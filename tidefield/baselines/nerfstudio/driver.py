@@ -1,0 +1,194 @@
+"""Trains and asks nerfstudio's methods: the other end of `worker.py`'s lines.
+
+RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio writes, RUN/job.json what it was told.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from tidefield.baselines.nerfstudio.environment import python
+from tidefield.baselines.nerfstudio.export import camera_to_json, export
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError
+from tidefield.files import completed_file
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.rendering import Render, Rendering
+from tidefield.train.checkpoint import Progress
+from tidefield.train.curve import SHARES, Curve
+from tidefield.train.loop import Budget
+
+NerfstudioMethod = Literal["nerfacto", "splatfacto"]
+JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
+WORKER = Path(__file__).with_name("worker.py")
+
+
+def train(
+    method: NerfstudioMethod,
+    scene: Scene,
+    folder: Path,
+    budget: Budget,
+    seed: int,
+    device: torch.device,
+    curve: Curve | None,
+    progress: Callable[[int, float], object],
+) -> Progress:
+    """Train with nerfstudio's defaults, but for the camera optimiser and the appearance embedding, which are off.
+
+    Args:
+        method: by nerfstudio's name.
+        scene: exported into the run's folder.
+        folder: the run's.
+        budget: steps or minutes.
+        seed: of weights and batches.
+        device: where nerfstudio computes.
+        curve: what to render and judge meanwhile, if the budget is one of minutes; training's clock stands still then.
+        progress: called with steps done and seconds of training.
+
+    Raises:
+        RunError: nerfstudio is not installed, the method does not run on the device, or nerfstudio fails.
+    """
+    require(method, device)
+    factor = export(scene, folder / DATA)
+    seconds = None if budget.minutes is None else 60 * budget.minutes
+    job = {
+        "method": method,
+        "data": str((folder / DATA).resolve()),
+        "out": str(folder.resolve()),
+        "steps": budget.steps,
+        "seconds": seconds,
+        "seed": seed,
+        "device": str(device),
+        "curve_seconds": [share * seconds for share in SHARES] if curve and seconds else [],
+        "curve_cameras": [camera_to_json(camera) for camera in curve.cameras] if curve else [],
+        "factor": factor.tolist(),
+    }
+    _write_job(folder, job)
+    last: dict[str, Any] = {}
+    with _worker("train", folder) as worker:
+        for last in worker.lines():
+            if "curve" in last and curve is not None:
+                files = [folder / name for name in last["curve"]]
+                views = zip(files, curve.cameras, strict=True)
+                curve.add(last["seconds"], [read_rendering(file, camera, factor) for file, camera in views])
+                curve.write(folder)
+            progress(last["step"], last["seconds"])
+    if not last.get("done"):
+        raise _failed(folder)
+    _write_job(folder, {**job, "checkpoint": last["checkpoint"], "trained": [last["step"], last["seconds"]]})
+    return progress_of(folder)
+
+
+def require(method: NerfstudioMethod, device: torch.device) -> None:
+    """Raises: RunError when the method cannot be trained here."""
+    if method == "splatfacto" and device.type != "cuda":
+        raise RunError(
+            f"splatfacto was asked for on {device}: expected CUDA, its only device; leave it out, or --device"
+        )
+    python()
+
+
+def progress_of(folder: Path) -> Progress:
+    """How far a run has trained.
+
+    Raises:
+        RunError: not to its end.
+    """
+    step, seconds = _read_job(folder)["trained"]
+    return Progress(step, seconds)
+
+
+@contextmanager
+def renderer(folder: Path) -> Iterator[Render]:
+    """A trained run as a method, while the block lasts.
+
+    Raises:
+        RunError: nerfstudio is not installed, or fails.
+    """
+    factor = torch.tensor(_read_job(folder)["factor"])
+    with _worker("render", folder) as worker:
+        worker.answer()  # once it has loaded
+
+        def render(camera: Cameras) -> Rendering:
+            file = folder / "rendering.npz"
+            worker.ask({**camera_to_json(camera), "file": str(file.resolve())})
+            return read_rendering(file, camera, factor)
+
+        yield render
+
+
+def read_rendering(file: Path, camera: Cameras, factor: torch.Tensor) -> Rendering:
+    """What the worker wrote, at the camera's own gain."""
+    with np.load(file, allow_pickle=False) as values:
+        colour, depth, opacity = (torch.from_numpy(values[name]) for name in ("colour", "depth", "opacity"))
+    file.unlink()
+    return Rendering((colour / factor * camera.gain[0]).clamp(0, 1), depth, opacity.clamp(0, 1))
+
+
+class _Process:
+    """The worker's lines."""
+
+    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
+        self.process, self.folder = process, folder
+
+    def lines(self) -> Iterator[dict[str, Any]]:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            yield json.loads(line)
+
+    def answer(self) -> dict[str, Any]:
+        found = next(self.lines(), None)
+        if found is None:
+            raise _failed(self.folder)
+        return found
+
+    def ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(question) + "\n")
+        self.process.stdin.flush()
+        return self.answer()
+
+
+@contextmanager
+def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process]:
+    command = [str(python()), str(WORKER), kind, str(folder / JOB_FILE)]
+    with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True)
+        try:
+            yield _Process(process, folder)
+        finally:
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None, "both are asked for"
+                pipe.close()
+            if kind == "render":
+                process.terminate()
+            process.wait()
+
+
+def _failed(folder: Path) -> RunError:
+    tail = (folder / LOG_FILE).read_text(encoding="utf-8").strip().splitlines()[-1:]
+    return RunError(
+        f"nerfstudio ended before it was done ({tail[0] if tail else 'without a word'}): expected it to train and "
+        f"render; read {folder / LOG_FILE}"
+    )
+
+
+def _read_job(folder: Path) -> dict[str, Any]:
+    path = folder / JOB_FILE
+    job = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if "trained" not in job:
+        raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
+    return job
+
+
+def _write_job(folder: Path, job: dict[str, Any]) -> None:
+    with completed_file(folder / JOB_FILE, overwrite=True) as partial:
+        partial.write_text(json.dumps(job, indent=1), encoding="utf-8")

@@ -1,0 +1,123 @@
+"""nerfstudio's own environment: its pins are old, so it lives apart."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Console
+
+from tidefield.errors import RunError
+
+VERSION = "1.1.5"
+_NEWEST_PYTHON = (3, 12)
+"""The newest that NumPy 1, which nerfstudio needs, has wheels for."""
+_NEEDED = (
+    "appdirs",
+    "av",
+    "fpsample",
+    "gdown",
+    "gsplat==1.4.0",
+    "imageio",
+    "ipython",
+    "jaxtyping",
+    "matplotlib",
+    "mediapy",
+    "msgspec",
+    "nerfacc==0.5.2",
+    "numpy<2",
+    "opencv-python-headless==4.10.0.84",
+    "pathos",
+    "pillow",
+    "plotly",
+    "protobuf",
+    "psutil",
+    "pyquaternion",
+    "pytorch-msssim",
+    "rawpy",
+    "requests",
+    "scipy",
+    "splines",
+    "tensorboard",
+    "tensorly",
+    "torch-fidelity",
+    "torchmetrics",
+    "trimesh",
+    "tyro<0.10",
+    "typeguard",
+    "viser==0.2.7",
+    "xatlas",
+)
+"""What training and rendering with nerfstudio import. All that it asks for is gigabytes more (notebooks, cloud
+clients, mesh tools), some of it without wheels for new Pythons."""
+
+
+def home() -> Path:
+    """$XDG_DATA_HOME/tidefield/nerfstudio-1.1.5."""
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "tidefield" / f"nerfstudio-{VERSION}"
+
+
+def python() -> Path:
+    """The environment's interpreter.
+
+    Raises:
+        RunError: it is not installed.
+    """
+    if not _complete().exists():
+        raise RunError(
+            f"nerfstudio {VERSION} is not installed (expected in {home()}): run `tidefield baselines install nerfacto`"
+        )
+    return _interpreter()
+
+
+def install(overwrite: bool, console: Console) -> None:
+    """Make the environment: nerfstudio with the PyTorch that we run on, so that speeds compare.
+
+    Raises:
+        RunError: it is there already, this Python is too new for it, or pip fails.
+    """
+    folder = home()
+    if _complete().exists() and not overwrite:
+        raise RunError(f"{folder} is there already: expected nothing; pass --overwrite to make it anew")
+    if sys.version_info[:2] > _NEWEST_PYTHON:
+        raise RunError(
+            f"nerfstudio {VERSION} does not install on Python {sys.version_info.major}.{sys.version_info.minor}: "
+            f"expected {'.'.join(map(str, _NEWEST_PYTHON))} or older; install Tidefield there"
+        )
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    console.print(f"Making {folder} (gigabytes; minutes) ...", highlight=False, soft_wrap=True)
+    venv.create(folder, with_pip=True)
+    torch = version("torch").partition("+")[0]
+    # torchvision's wheel may be for a PyTorch of other hardware; what is needed of it is Python.
+    for words in ([f"torch=={torch}", *_NEEDED], ["--no-deps", f"torchvision=={_vision(torch)}"]):
+        _pip(words)
+    _pip(["--no-deps", f"nerfstudio=={VERSION}"])
+    _complete().touch()
+
+
+def _pip(words: list[str]) -> None:
+    if subprocess.run([str(_interpreter()), "-m", "pip", "install", "--quiet", *words], check=False).returncode:
+        raise RunError(f"pip could not install {words[-1]} into {home()}: expected it to; read what it says above")
+
+
+def _vision(torch: str) -> str:
+    """The release of torchvision that belongs to one of torch: 0.15 came with 2.0, and so on."""
+    major, minor, patch = torch.split(".")
+    if major != "2":
+        raise RunError(f"torch {torch} is new to this version of Tidefield: expected 2.x; update Tidefield")
+    return f"0.{int(minor) + 15}.{patch}"
+
+
+def _complete() -> Path:
+    return home() / "complete"
+
+
+def _interpreter() -> Path:
+    return home() / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")

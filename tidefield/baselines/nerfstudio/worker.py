@@ -1,0 +1,205 @@
+"""Trains one of nerfstudio's methods, or renders with it: runs in nerfstudio's own environment.
+
+Imports nothing of Tidefield. `python worker.py train JOB.json` or `python worker.py render JOB.json`; the parent writes
+the job (see `tidefield.baselines.nerfstudio.driver`), and this program prints nothing to standard output but its
+answers, one JSON object a line.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def without_compiled_torchvision() -> None:
+    """Declare the operators whose Python half torchvision registers, where its compiled half does not load."""
+    try:
+        import torchvision
+    except RuntimeError:
+        for name in [name for name in sys.modules if name.startswith("torchvision")]:
+            del sys.modules[name]
+        library = torch.library.Library("torchvision", "DEF")
+        library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        globals()["_library"] = library  # the operators live as long as this does
+        import torchvision  # noqa: F401
+
+
+class Unused(torch.nn.Module):
+    """In place of the LPIPS that nerfstudio's models make for their own evaluation, which would fetch its weights from
+    the net; renderings are judged elsewhere."""
+
+    def __init__(self, **_: Any) -> None:
+        super().__init__()
+
+
+class TimeIsUp(Exception):
+    """The budget is used."""
+
+
+def answer(**values: Any) -> None:
+    print(json.dumps(values), file=ANSWERS, flush=True)
+
+
+def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
+    """The method as `ns-train METHOD` sets it up with its defaults, but for what the job changes."""
+    from nerfstudio.configs.method_configs import method_configs
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    config = method_configs[job["method"]]
+    config.data = Path(job["data"])
+    config.output_dir, config.experiment_name, config.timestamp = Path(job["out"]), "nerfstudio", "run"
+    config.vis = "tensorboard"
+    config.machine.seed = job["seed"]
+    config.machine.device_type = job["device"].split(":")[0]
+    config.machine.num_devices = 1
+    config.max_num_iterations = job["steps"] or 10**9
+    config.steps_per_save = 10**9  # we save when the budget is used, ...
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = (
+        10**9
+    )  # ... and judge
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=Path(job["data"]), downscale_factor=1)
+    model = config.pipeline.model
+    if hasattr(model, "camera_optimizer"):
+        model.camera_optimizer.mode = "off"
+    if hasattr(model, "use_appearance_embedding"):
+        model.use_appearance_embedding = False
+    if hasattr(model, "implementation") and not has_tiny_cuda_nn():
+        model.implementation = "torch"
+    if checkpoint is not None:
+        config.load_checkpoint = checkpoint
+        # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
+        numbers = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int64)]
+        torch.serialization.add_safe_globals([np.core.multiarray.scalar, np.dtype, *numbers])
+    torch.manual_seed(job["seed"])
+    np.random.seed(job["seed"])  # noqa: NPY002
+    random.seed(job["seed"])
+    trainer = config.setup(local_rank=0, world_size=1)
+    if job["device"] == "cpu":
+        trainer.device, trainer.mixed_precision = "cpu", False
+    trainer.setup()
+    return trainer
+
+
+def has_tiny_cuda_nn() -> bool:
+    try:
+        import tinycudann  # noqa: F401
+    except (ImportError, OSError):
+        return False
+    return torch.cuda.is_available()
+
+
+def train(job: dict[str, Any]) -> None:
+    """Train until the seconds or steps are used; at given times, render the cameras of the curve meanwhile."""
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+    trainer = make_trainer(job)
+    cameras = [World(trainer, camera) for camera in job["curve_cameras"]]
+    begun, paused, due, last = time.perf_counter(), 0.0, list(job["curve_seconds"]), 0
+
+    def after(step: int) -> None:
+        nonlocal paused, last
+        last = step
+        now = time.perf_counter()
+        elapsed = now - begun - paused
+        more = {}
+        if due and elapsed >= due[0]:
+            due[:] = [seconds for seconds in due if seconds > elapsed]
+            more["curve"] = [f"curve/{elapsed:09.1f}_{k}.npz" for k in range(len(cameras))]
+            for name, camera in zip(more["curve"], cameras, strict=True):
+                camera.render(Path(job["out"]) / name)
+            trainer.pipeline.train()
+            paused += time.perf_counter() - now
+        answer(step=step + 1, seconds=elapsed, **more)
+        if job["seconds"] and elapsed >= job["seconds"]:
+            raise TimeIsUp
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after))
+    try:
+        trainer.train()
+    except TimeIsUp:
+        trainer.save_checkpoint(last)
+    answer(
+        step=last + 1,
+        seconds=time.perf_counter() - begun - paused,
+        done=True,
+        rays=trainer.pipeline.datamanager.get_train_rays_per_batch(),
+        checkpoint=str(sorted(trainer.checkpoint_dir.glob("step-*.ckpt"))[-1].relative_to(job["out"])),
+    )
+
+
+class World:
+    """A camera of the exported scene in the model's own frame."""
+
+    def __init__(self, trainer: Any, camera: dict[str, Any]) -> None:
+        from nerfstudio.cameras.cameras import Cameras, CameraType
+
+        outputs = trainer.pipeline.datamanager.train_dataparser_outputs
+        self.model, self.scale = trainer.pipeline.model, float(outputs.dataparser_scale)
+        pose = torch.eye(4)
+        pose[:3] = torch.tensor(camera["T_world_camera"]) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))
+        pose = (outputs.dataparser_transform.float() @ pose)[:3]
+        pose[:, 3] *= self.scale
+        (fx, fy), (cx, cy), (width, height) = camera["focal_px"], camera["principal_px"], camera["size_px"]
+        self.camera = Cameras(
+            camera_to_worlds=pose[None],
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            width=width,
+            height=height,
+            camera_type=CameraType.PERSPECTIVE,
+        ).to(trainer.device)
+        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        self.length = np.sqrt(((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2 + 1)  # of a ray whose z-depth is 1
+
+    def render(self, path: Path) -> float:
+        """Write colour, z-depth in world units and opacity; returns the seconds that rendering took."""
+        self.model.eval()
+        if self.camera.device.type == "cuda":
+            torch.cuda.synchronize()
+        start = time.perf_counter()
+        with torch.no_grad():
+            outputs = self.model.get_outputs_for_camera(self.camera)
+        colour = outputs["rgb"].float().cpu().numpy()
+        seconds = time.perf_counter() - start
+        depth, opacity = (outputs[name][..., 0].float().cpu().numpy() for name in ("depth", "accumulation"))
+        along_ray = not hasattr(self.model, "gauss_params")  # splats give z-depth, rays the distance
+        depth = depth / self.scale / (self.length if along_ray else 1.0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, colour=colour, depth=depth.astype(np.float32), opacity=opacity)
+        return seconds
+
+
+def render(job: dict[str, Any]) -> None:
+    """Load a checkpoint, then render every camera that comes in, one JSON object a line."""
+    trainer = make_trainer(job, Path(job["out"]) / job["checkpoint"])
+    answer(ready=True)
+    for line in sys.stdin:
+        camera = json.loads(line)
+        answer(seconds=World(trainer, camera).render(Path(camera["file"])))
+
+
+def main() -> None:
+    kind, job = sys.argv[1], json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
+    without_compiled_torchvision()
+    import torchmetrics.image.lpip
+
+    torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = Unused
+    {"train": train, "render": render}[kind](job)
+
+
+if __name__ == "__main__":
+    # nerfstudio and what it uses talk on standard output; ours is for answers.
+    ANSWERS = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    main()

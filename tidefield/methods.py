@@ -1,0 +1,44 @@
+"""The methods that there are: floors that need no training, our network, classical NeRF, and nerfstudio's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from tidefield.baselines import nearest, plane_sweep, sparse_depth
+from tidefield.baselines.nerf import NerfLearner
+from tidefield.baselines.nerfstudio import driver
+from tidefield.config import Config, NerfConfig, NerfstudioConfig
+from tidefield.data.scene import Scene
+from tidefield.model.rendering import Render
+from tidefield.train.checkpoint import Progress, Run, load_network
+from tidefield.train.loop import Learner, Trainer
+
+FLOORS = {"plane-sweep": plane_sweep.make, "sparse-depth": sparse_depth.make, "nearest": nearest.make}
+
+
+def make_learner(config: Config | NerfConfig, scene: Scene, seed: int, device: torch.device) -> Learner:
+    """What trains a method that lives in this process."""
+    if isinstance(config, NerfConfig):
+        return NerfLearner(config, scene, seed, device)
+    return Trainer(config, scene, seed, device)
+
+
+@contextmanager
+def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Iterator[tuple[Render, Progress]]:
+    """A run as a method, while the block lasts, and how far it was trained.
+
+    Raises:
+        RunError: it has not been trained, or is damaged.
+    """
+    if isinstance(run.config, NerfstudioConfig):
+        with driver.renderer(folder) as render:
+            yield render, driver.progress_of(folder)
+        return
+    learner = make_learner(run.config, scene, run.seed, device)
+    progress = load_network(folder, learner.network)
+    learner.network.eval()
+    yield learner.renderer(), progress

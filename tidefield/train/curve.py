@@ -1,0 +1,67 @@
+"""Quality against time: a few held-out views, rendered at half size now and then while a method trains."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+from torch.nn import functional as F
+
+from tidefield.data.scene import Scene
+from tidefield.files import completed_file
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.rendering import Rendering, to_8_bit
+
+SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Of the budget, when the views are rendered."""
+CURVE_FILE = "curve.json"
+_VIEWS = 2
+
+
+@dataclass
+class Curve:
+    """What is rendered, and what came out.
+
+    Attributes:
+        cameras: of the first held-out photograph and of the middle one, at half size.
+        truths: the photographs, averaged over 2 x 2 pixels.
+        points: (seconds of training, mean PSNR).
+    """
+
+    cameras: tuple[Cameras, ...]
+    truths: tuple[UInt8[Tensor, "H W 3"], ...]
+    points: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, seconds: float, renderings: Sequence[Rendering]) -> None:
+        """Judge one round of renderings."""
+        errors = [
+            (to_8_bit(rendering.colour).float() - truth.float()).square().mean() / 255**2
+            for rendering, truth in zip(renderings, self.truths, strict=True)
+        ]
+        values = [-10 * torch.log10(error.clamp(min=1e-10)).item() for error in errors]
+        self.points.append((seconds, sum(values) / len(values)))
+
+    def write(self, folder: Path) -> None:
+        """RUN/curve.json."""
+        with completed_file(folder / CURVE_FILE, overwrite=True) as partial:
+            partial.write_text(json.dumps(self.points), encoding="utf-8")
+
+
+def make_curve(scene: Scene) -> Curve:
+    """For a scene that holds photographs out."""
+    test = scene.test
+    chosen = sorted({test[0], test[len(test) // 2]})[:_VIEWS]
+    cameras, truths = [], []
+    for index in chosen:
+        camera = scene.cameras[index]
+        half = camera.resized(camera.width // 2, camera.height // 2)
+        whole = scene.photographs[index].permute(2, 0, 1)[None].float()
+        small = F.interpolate(whole, size=(half.height, half.width), mode="area")
+        cameras.append(half)
+        truths.append(small[0].permute(1, 2, 0).round().to(torch.uint8))
+    return Curve(tuple(cameras), tuple(truths))
