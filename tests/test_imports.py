@@ -1,4 +1,4 @@
-"""Imports point downward: geometry <- data <- model <- train, baselines, products <- commands, cli."""
+"""Imports point downward: geometry <- data <- model <- train, products <- baselines <- commands, cli."""
 
 import ast
 from collections.abc import Iterator
@@ -13,12 +13,14 @@ RANK = {
     "ingest": 2,
     "model": 2,
     "train": 3,
-    "baselines": 3,
     "products": 3,
-    "commands": 4,
-    "cli": 5,
+    "baselines": 4,
+    "methods": 5,
+    "compare": 5,
+    "commands": 6,
+    "cli": 7,
 }
-FOR_ALL = {"config", "device", "errors", "files", "meter", "options"}
+FOR_ALL = {"config", "cores", "device", "errors", "files", "meter", "options", "variants"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

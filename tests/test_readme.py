@@ -47,6 +47,9 @@ def test_every_command_is_shown() -> None:
         "train",
         "evaluate",
         "render",
+        "compare",
+        "ablate",
+        "baselines",
         "demo",
     }
 

@@ -1,4 +1,4 @@
-"""The command line: `tidefield prepare | import | train | evaluate | render | demo`.
+"""The command line: `tidefield prepare | import | train | evaluate | render | compare | ablate | baselines | demo`.
 
 Only what is needed to answer --help is imported here; torch and the rest are imported once a command is known.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from tidefield.errors import TidefieldError
-from tidefield.options import Demo, Evaluate, Import, Prepare, Render, Talk, Train
+from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import, Prepare, Render, Talk, Train
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,7 +38,17 @@ def main() -> None:
 def _run() -> None:
     """Understand the command line and do what it says."""
     options = tyro.extras.subcommand_cli_from_dict(
-        {"prepare": Prepare, "import": Import, "train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo},
+        {
+            "prepare": Prepare,
+            "import": Import,
+            "train": Train,
+            "evaluate": Evaluate,
+            "render": Render,
+            "compare": Compare,
+            "ablate": Ablate,
+            "baselines": Baselines,
+            "demo": Demo,
+        },
         prog="tidefield",
         description="New views of tidal flats from drone photographs.",
     )
@@ -51,6 +61,9 @@ def _run() -> None:
         Train: commands.train,
         Evaluate: commands.evaluate,
         Render: commands.render,
+        Compare: commands.compare,
+        Ablate: commands.ablate,
+        Baselines: commands.baselines,
         Demo: commands.demo,
     }
     todo[type(options)](options, console)

@@ -12,7 +12,9 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 Preset = Literal["swift", "paper"]
-Method = Literal["plane-sweep", "sparse-depth"]
+Floor = Literal["plane-sweep", "sparse-depth", "nearest"]
+Trained = Literal["tidefield", "nerf", "nerfacto", "splatfacto"]
+Compared = Literal["tidefield", "paper", "nerf", "nerfacto", "splatfacto", "plane-sweep", "sparse-depth", "nearest"]
 Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Go on without photographs that the scene names but does not have.")]
@@ -41,6 +43,11 @@ class Train:
     """Folder for the result; must be new, unless --resume or --overwrite is given."""
     preset: Preset = "swift"
     """swift is the best quality for the time; paper is the network as printed."""
+    variant: str | None = None
+    """Change one part of the preset, as `tidefield ablate` does."""
+    method: Trained = "tidefield"
+    """Train a peer instead: classical NeRF, or nerfstudio's nerfacto or splatfacto, which `tidefield baselines install
+    nerfacto` installs."""
     minutes: float | None = None
     """Train for so long; 10 if neither this nor --steps is given."""
     steps: int | None = None
@@ -56,6 +63,9 @@ class Train:
     """Go on with the run that is in the folder."""
     overwrite: bool = False
     """Replace the run that is in the folder."""
+    curve: bool = False
+    """Render two held-out views at half size now and then, for a curve of quality against time; the clock stands still
+    meanwhile."""
     allow_missing: AllowMissing = False
     talk: OmitArgPrefixes[Talk] = Talk()
 
@@ -72,7 +82,7 @@ class Evaluate:
     """A run, or with --method a scene."""
     out: Annotated[Positional[Path | None], arg(metavar="[OUT]")] = None
     """Where to write; the run itself if not given."""
-    method: Method | None = None
+    method: Floor | None = None
     """Evaluate this method on a scene instead of a run."""
     width: int | None = None
     """Width of the photographs in pixels, with --method; a run knows its own."""
@@ -157,6 +167,72 @@ class Import:
     link: bool = False
     """Give the photographs a second name (hard links) instead of copying them."""
     allow_missing: AllowMissing = False
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train and evaluate methods on the same scenes, split, resolution, machine and budget; write tables and figures.
+
+    What is done is not repeated: the same command goes on after an interruption, and with more methods or scenes.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="[SCENE ...]")] = ()
+    """Scenes; with --protocol tidalflats in addition to its own, with --protocol mipnerf360 the folder of the data
+    set."""
+    methods: tuple[Compared, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
+    """Which, in the order of the tables. tidefield and paper are presets of ours; nerf is classical NeRF; nerfacto and
+    splatfacto are nerfstudio's; the others need no training."""
+    minutes: float | None = None
+    """Train each for so long; 10 if neither this nor --steps is given."""
+    steps: int | None = None
+    """Train each for so many steps instead."""
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    protocol: Literal["mipnerf360", "tidalflats"] | None = None
+    """Scenes with a name: the seven public ones of mip-NeRF 360, or five synthetic tidal flats."""
+    out: Path = Path("comparison")
+    """Folder for the runs, tables and figures."""
+    device: Device = "auto"
+    seed: int = 0
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Train and evaluate variants of a preset, each with one part left out or changed, and write one table.
+
+    What is done is not repeated: the same command goes on after an interruption, and with more variants or scenes.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
+    variants: tuple[str, ...] = ()
+    """Which; all of them if not given."""
+    preset: Preset = "swift"
+    """What they are variants of."""
+    minutes: float | None = None
+    """Train each for so long; 10 if neither this nor --steps is given."""
+    steps: int | None = None
+    """Train each for so many steps instead."""
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    out: Path = Path("ablation")
+    """Folder for the runs and the table."""
+    device: Device = "auto"
+    seed: int = 0
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Install the peers that live in environments of their own."""
+
+    action: Positional[Literal["install"]]
+    """What to do."""
+    name: Positional[Literal["nerfacto"]]
+    """nerfacto is nerfstudio, with splatfacto."""
+    overwrite: bool = False
+    """Begin anew where it is installed already."""
     talk: OmitArgPrefixes[Talk] = Talk()
 
 

@@ -1,0 +1,130 @@
+"""The paper's Figures 4 and 5 (ground truth and methods side by side, with crops), and quality against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw
+from scipy.ndimage import uniform_filter
+
+from tidefield.compare.results import Results
+from tidefield.data.scene import Scene
+from tidefield.train.evaluate import picture_names
+from tidefield.train.pictures import GAP_PX, PAPER, STRIP_PX, strip
+
+PANEL_PX = 320
+"""Width of a panel."""
+CROPS, SHARE = 2, 5
+"""How many crops of each picture, and which part of its width they show: a fifth."""
+_COLOURS = ((214, 39, 40), (31, 119, 180))
+_HARMLESS = 1e-6
+
+
+def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | None:
+    """Ground truth and every method on one held-out photograph; None where no method has been there.
+
+    The photograph is the one whose PSNR is the middle one of the first method's. Crops are where methods differ most.
+    """
+    methods = [method for method in results.methods if (name, method) in results.by]
+    if not methods:
+        return None
+    photographs = results.by[name, methods[0]].evaluation["per_photograph"]
+    ranked = sorted(photographs, key=lambda photograph: photographs[photograph]["psnr"])
+    chosen = ranked[len(ranked) // 2]
+    truth = scene.photographs[scene.index(chosen)].numpy()
+    files = dict(
+        zip((scene.names[i] for i in scene.test), picture_names([scene.names[i] for i in scene.test]), strict=True)
+    )
+    pictures = {"ground truth": truth}
+    for method in methods:
+        with Image.open(results.by[name, method].folder / "renderings" / files[chosen]) as picture:
+            pictures[method] = np.asarray(picture.convert("RGB"))
+    corners = most_different(truth, [pictures[method] for method in methods], truth.shape[1] // SHARE)
+    columns = []
+    for title, picture in pictures.items():
+        psnr = "" if title == "ground truth" else f"  {photographs_psnr(results, name, title, chosen):.2f} dB"
+        columns.append(_column(f"{title}{psnr}", picture, corners, truth.shape[1] // SHARE))
+    whole = Image.new("RGB", (sum(c.width + GAP_PX for c in columns) - GAP_PX, columns[0].height), PAPER)
+    for k, column in enumerate(columns):
+        whole.paste(column, (k * (column.width + GAP_PX), 0))
+    return whole
+
+
+def photographs_psnr(results: Results, scene: str, method: str, photograph: str) -> float:
+    return results.by[scene, method].evaluation["per_photograph"][photograph]["psnr"]
+
+
+def most_different(
+    truth: UInt8[np.ndarray, "H W 3"], renderings: list[UInt8[np.ndarray, "H W 3"]], side: int
+) -> list[tuple[int, int]]:
+    """Upper left corners (u, v) of the squares in which the methods' errors differ most; squares do not overlap."""
+    errors = [uniform_filter(((r.astype(np.float64) - truth) ** 2).mean(2), side) for r in renderings]
+    spread: Float[np.ndarray, "H W"] = np.std(errors, axis=0) + _HARMLESS
+    half, corners = side // 2, []
+    height, width = spread.shape
+    spread[:half], spread[height - half :], spread[:, :half], spread[:, width - half :] = 0, 0, 0, 0
+    for _ in range(CROPS):
+        v, u = (int(x) for x in np.unravel_index(np.argmax(spread), spread.shape))
+        corners.append((min(max(u - half, 0), width - side), min(max(v - half, 0), height - side)))
+        spread[max(v - side, 0) : v + side, max(u - side, 0) : u + side] = 0
+    return corners
+
+
+def _column(title: str, picture: np.ndarray, corners: list[tuple[int, int]], side: int) -> Image.Image:
+    """A titled picture with its crops marked, and these below it."""
+    image = Image.fromarray(picture)
+    scale = PANEL_PX / image.width
+    panel = image.resize((PANEL_PX, round(image.height * scale)), Image.Resampling.LANCZOS)
+    zoomed = (PANEL_PX - GAP_PX * (CROPS - 1)) // CROPS
+    whole = Image.new("RGB", (PANEL_PX, STRIP_PX + panel.height + GAP_PX + zoomed), PAPER)
+    draw = ImageDraw.Draw(panel)
+    for k, (u, v) in enumerate(corners):
+        box = [round(x * scale) for x in (u, v, u + side, v + side)]
+        draw.rectangle(box, outline=_COLOURS[k], width=2)
+        crop = image.crop((u, v, u + side, v + side)).resize((zoomed, zoomed), Image.Resampling.NEAREST)
+        ImageDraw.Draw(crop).rectangle((0, 0, zoomed - 1, zoomed - 1), outline=_COLOURS[k], width=3)
+        whole.paste(crop, (k * (zoomed + GAP_PX), STRIP_PX + panel.height + GAP_PX))
+    whole.paste(panel, (0, STRIP_PX))
+    whole.paste(strip(PANEL_PX, title), (0, 0))
+    return whole
+
+
+def write_curves(results: Results, path: Path) -> bool:
+    """PSNR against seconds of training, a panel for each scene; returns whether there was anything to draw.
+
+    Needs matplotlib (`pip install 'tidefield[compare]'`).
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scenes = [
+        s for s in results.scenes if any((s, m) in results.by and results.by[s, m].curve for m in results.methods)
+    ]
+    if not scenes:
+        return False
+    columns = min(3, len(scenes))
+    rows = -(-len(scenes) // columns)
+    figure = Figure(figsize=(4.2 * columns, 3.2 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    for axis, scene in zip(axes, scenes, strict=False):
+        for k, method in enumerate(results.methods):
+            result = results.by.get((scene, method))
+            if result is None:
+                continue
+            if result.curve:
+                seconds, psnr = zip(*result.curve, strict=True)
+                axis.plot(seconds, psnr, marker="o", markersize=3, color=f"C{k}", label=method)
+        axis.set_xscale("log")
+        axis.set_title(scene, fontsize=10)
+        axis.set_xlabel("seconds of training")
+        axis.set_ylabel("PSNR, dB (two views, half size)")
+        axis.grid(alpha=0.3)
+    for axis in axes[len(scenes) :]:
+        axis.set_visible(False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(labels)))
+    figure.savefig(path, dpi=150)
+    return True

@@ -1,0 +1,105 @@
+"""What a comparison leaves: tables in every form, figures, curves, and all numbers with their settings as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tidefield.compare.ablation import ablation_table
+from tidefield.compare.figures import side_by_side, write_curves
+from tidefield.compare.record import stamp, write_json
+from tidefield.compare.results import Results
+from tidefield.compare.run import Settings
+from tidefield.compare.table import Table
+from tidefield.compare.tables import all_tables, missing_metrics
+from tidefield.data.load import load_scene
+from tidefield.files import completed_file
+
+
+def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
+    """Write what there is so far into the comparison's folder, over older ones.
+
+    Returns:
+        The files.
+    """
+    tables, made = all_tables(results), stamp()
+    files = [
+        _write(out / "tables.md", _page(tables, missing_metrics(results), settings, made)),
+        _write(out / "tables.tex", "\n\n".join(table.latex() for table in tables) + "\n"),
+        _write(out / "tables.csv", "\n".join(f"{table.title}\n{table.csv()}" for table in tables)),
+    ]
+    write_json(out / "comparison.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
+    files.append(out / "comparison.json")
+    for name, path in scenes.items():
+        figure = side_by_side(results, name, load_scene(path, width=settings.width))
+        if figure is not None:
+            file = out / "figures" / f"{name}.png"
+            with completed_file(file, overwrite=True) as partial:
+                figure.save(partial)
+            files.append(file)
+    with completed_file(out / "curves.png", overwrite=True) as partial:
+        drawn = write_curves(results, partial)
+        if not drawn:
+            partial.touch()
+    if drawn:
+        files.append(out / "curves.png")
+    else:
+        (out / "curves.png").unlink()
+    return files
+
+
+def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path]:
+    """Write the table of an ablation as far as it is there, over an older one.
+
+    Returns:
+        The files.
+    """
+    table, made = ablation_table(results), stamp()
+    write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
+    return [
+        _write(out / "ablation.md", _page([table], missing_metrics(results), settings, made)),
+        _write(out / "ablation.tex", table.latex() + "\n"),
+        _write(out / "ablation.csv", table.csv()),
+        out / "ablation.json",
+    ]
+
+
+def _page(tables: list[Table], remarks: list[str], settings: Settings, made: Mapping[str, Any]) -> str:
+    machine = made["machine"]
+    budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
+    lines = [
+        "# Comparison",
+        "Means over the held-out photographs. Every method had the same photographs, split, resolution and machine, "
+        f"and {budget} of training, one after another.",
+        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
+        f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
+        f"{machine['torch']}; {made['date']}.",
+        *remarks,
+        *(table.markdown() for table in tables),
+    ]
+    return "\n\n".join(lines) + "\n"
+
+
+def _numbers(results: Results) -> list[dict[str, Any]]:
+    return [
+        {
+            "scene": scene,
+            "method": method,
+            "mean": result.evaluation["mean"],
+            "seconds_per_frame": result.evaluation["seconds_per_frame"],
+            "rays_per_second": result.evaluation["rays_per_second"],
+            "configuration": result.evaluation["configuration"],
+            "split": result.evaluation["split"],
+            "process": result.process,
+            "curve": result.curve,
+        }
+        for (scene, method), result in results.by.items()
+    ]
+
+
+def _write(path: Path, text: str) -> Path:
+    with completed_file(path, overwrite=True) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return path
