@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | quality | memory | table | surveys`; without a name, speed.
+"""`python -m benchmarks speed | memory | table | surveys`; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -17,11 +17,11 @@ import tyro
 
 from tidefield.errors import RunError, TidefieldError
 
-DESCRIPTION = """What Tidefield achieves, and how fast: speed, quality, memory, and a page of all of them. Without a
-name, it is speed.
+DESCRIPTION = """What Tidefield achieves, and how fast: speed, memory, surveys, and a page of results. Without a name,
+it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
 
-A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes four commands:
-speed, quality and memory with the same --runs, then table."""
+A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes five commands:
+`tidefield compare`, `tidefield ablate`, speed and memory with the same --runs, then table."""
 
 
 def speed(
@@ -46,9 +46,9 @@ def speed(
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     from rich.console import Console
 
-    from benchmarks.records import stamp, write_json
     from benchmarks.speed import QUICK, Effort, measure_speed
     from benchmarks.table import speed_tables
+    from tidefield.compare.record import stamp, write_json
     from tidefield.config import PRESETS
     from tidefield.device import choose_device, keep_large_allocations
 
@@ -63,7 +63,7 @@ def speed(
     command = " ".join(["python -m benchmarks speed --runs RUNS", *options, f"--device {device}"])
     report |= {"command": command, **stamp()}
     for table in speed_tables(report):
-        console.print(table.for_the_console())
+        print(table.markdown(), end="\n\n")
     if runs is not None:
         write_json(runs / "speed.json", report)
 
@@ -83,40 +83,6 @@ def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> A
     survey = make_survey("river_mouths", seed=7, views=9 if quick else 16, width=64 if quick else 256)
     write_survey(survey, work / "scene")
     return load_scene(work / "scene")
-
-
-def quality(
-    data: Path,
-    runs: Path,
-    scenes: tuple[str, ...] = ("caliterra", "swindale", "turin_lot", "brighton_beach"),
-    minutes: float = 10.0,
-    width: int = 400,
-    presets: tuple[Literal["swift", "paper"], ...] = ("swift", "paper"),
-    floors: bool = True,
-    device: str = "cpu",
-) -> None:
-    """Train and evaluate on real scenes: the presets and the two floors, one after another, in processes of their own.
-
-    What is finished is not repeated: after an interruption, the same command goes on. With the evaluations it takes
-    hours.
-
-    Args:
-        data: Folder with the scenes.
-        runs: Folder for the results, as RUNS/SCENE/METHOD.
-        scenes: Names of scenes in the data folder.
-        minutes: Minutes of training of each preset on each scene.
-        width: Width of the photographs in pixels.
-        presets: Which to train.
-        floors: Evaluate the methods without training, too.
-        device: auto, cpu, cuda, cuda:N or mps.
-    """
-    from benchmarks.quality import FLOORS, Settings, measure_quality
-    from benchmarks.records import run_measured
-
-    methods = [*(FLOORS if floors else ()), *presets]
-    # Flushed, so that it stands before what the processes print.
-    say = partial(print, flush=True)
-    measure_quality(data, runs, scenes, methods, Settings(minutes, width, device), run_measured, say)
 
 
 def memory(
@@ -147,6 +113,8 @@ def surveys(
     names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
     pairs: int | None = None,
     many: int = 2000,
+    prepared: Path | None = None,
+    ready: Path | None = None,
     out: Path = Path("docs/surveys.md"),
 ) -> None:
     """Prepare surveys as they came from the camera, beside exhaustive structure from motion; write the page (hours).
@@ -157,30 +125,34 @@ def surveys(
         names: Of the surveys.
         pairs: Of the exhaustive run, match only so many pairs, and reckon the time of all; 0 leaves it out.
         many: Prepare so many copies of the first survey's photographs, too, for the memory it takes; 0 for none.
+        prepared: Folder of a `tidefield compare` on the prepared scenes, by the surveys' names, for the page.
+        ready: Folder of a `tidefield compare` on ready-made scenes of these names, for the page.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.many import measure_many
-    from benchmarks.records import run_measured
     from benchmarks.surveys import measure_surveys, write_page
+    from tidefield.compare.record import run_measured
 
     say = partial(print, flush=True)
     measure_surveys(photographs, runs, names, pairs, run_measured, say)
     if many:
         measure_many(photographs / names[0], runs, many, run_measured, say)
-    write_page(runs, names, out)
+    write_page(runs, names, prepared, ready, out)
     print(out)
 
 
-def table(runs: Path, out: Path = Path("docs/results.md")) -> None:
-    """Write the page of results from what the other commands kept.
+def table(comparison: Path, ablation: Path, runs: Path, out: Path = Path("docs/results.md")) -> None:
+    """Write the page of results from what was measured; what is missing is said to be.
 
     Args:
-        runs: Folder with what they kept; what is missing is said to be.
+        comparison: Folder of `tidefield compare`.
+        ablation: Folder of `tidefield ablate`.
+        runs: Folder of speed and memory.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
 
-    write_page(runs, out)
+    write_page(comparison, ablation, runs, out)
     print(out)
 
 
@@ -189,7 +161,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    commands = {"speed": speed, "quality": quality, "memory": memory, "table": table, "surveys": surveys}
+    commands = {"speed": speed, "memory": memory, "table": table, "surveys": surveys}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
     except TidefieldError as error:

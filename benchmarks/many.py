@@ -14,7 +14,7 @@ from typing import Any
 
 from PIL import Image
 
-from benchmarks.records import Runner, read_json, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
 
 WIDTH = 400
 APART_DEG = 0.05

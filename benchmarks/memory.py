@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks.records import Runner, run_measured, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
 
 SURVEY_WIDTH = 400
 MEMORY_FILE = "memory.json"

@@ -1,7 +1,8 @@
 """`tidefield prepare` on surveys as they came from the camera, beside exhaustive structure from motion.
 
 RUNS/SURVEY/scene is the prepared scene, RUNS/SURVEY/exhaustive the other's model, and RUNS/SURVEY/prepare.json and
-exhaustive/exhaustive.json hold what they took. What is there is not repeated.
+exhaustive/exhaustive.json hold what they took. What is there is not repeated. What comes of training on prepared scenes
+and on ready-made ones of the same surveys is read from comparisons.
 """
 
 from __future__ import annotations
@@ -12,10 +13,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.records import Runner, read_json, stamp, tidefield, write_json
-from benchmarks.table import NOTHING, Table
+from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
+from tidefield.compare.results import read_results
+from tidefield.compare.run import WHOLE
+from tidefield.compare.table import NOTHING, Table, shown
 from tidefield.errors import SurveyError
 from tidefield.files import completed_file
+
+AIMS = {"brighton_beach": (18, True), "turin_lot": (32, True), "swindale": (75, False)}
+"""Photographs to be placed, and whether the drone says how high it flew."""
+METRICS = (
+    ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
+    ("psnr_seen", "PSNR, dB", "{:.2f}"),
+    ("ssim_seen_cc", "SSIM after the colour fit", "{:.4f}"),
+)
 
 
 def measure_surveys(
@@ -44,10 +55,18 @@ def measure_surveys(
             run([sys.executable, "-m", "benchmarks.exhaustive", str(source), str(folder / "exhaustive"), *some], {})
 
 
-def write_page(runs: Path, surveys: Sequence[str], out: Path) -> None:
-    """What `measure_surveys` left, as Markdown."""
+def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready: Path | None, out: Path) -> None:
+    """What `measure_surveys` and comparisons left, as Markdown.
+
+    Args:
+        runs: the folder of `measure_surveys`.
+        surveys: their names.
+        prepared: a comparison on prepared scenes by the surveys' names; SURVEY_uneven is one of `--colour off`.
+        ready: a comparison on ready-made scenes of these names.
+        out: the file.
+    """
     records = {survey: _read(runs / survey) for survey in surveys}
-    made = stamp()["machine"]
+    many, made = read_json(runs / "many.json"), stamp()["machine"]
     text = "\n\n".join(
         [
             "# Surveys",
@@ -56,9 +75,13 @@ def write_page(runs: Path, surveys: Sequence[str], out: Path) -> None:
             "the same library (pycolmap) runs them: every photograph matched with every other, focal length free. "
             "Where only some of the pairs were matched, drawn at random, the time of all is reckoned from theirs and "
             "that of placing the photographs is not in it.",
+            "## What was aimed at",
+            _aims(records, many).markdown(),
+            "## What came of it",
             _quality(records).markdown(),
+            *_trained(surveys, prepared, ready),
             _time(records).markdown(),
-            *_many(read_json(runs / "many.json")),
+            *_many(many),
         ]
     )
     with completed_file(out, overwrite=True) as partial:
@@ -71,6 +94,69 @@ def _read(folder: Path) -> dict[str, Any]:
         "took": read_json(folder / "prepare.json"),
         "exhaustive": read_json(folder / "exhaustive" / "exhaustive.json"),
     }
+
+
+def _aims(records: dict[str, dict[str, Any]], many: dict[str, Any] | None) -> Table:
+    """Every aim, what came out, and whether that is enough."""
+    rows: list[list[str]] = []
+
+    for survey, (placed, height) in AIMS.items():
+        record = records.get(survey)
+        if record is None or record["report"] is None:
+            continue
+        report = record["report"]
+        shots, more = report["reconstruction_statistics"], report["tidefield"]
+        found = shots["reconstructed_shots_count"]
+        rows.append(_row(f"{survey}: {placed} photographs placed or more", f"{found}", found >= placed))
+        error = more["reprojection"]["mean_px"]
+        rows.append(_row(f"{survey}: mean reprojection error of 0.6 px or less", f"{error:.2f} px", error <= 0.6))
+        if height:
+            share = more["resolution"]["height_above_ground"]["mean"] / more["resolution"]["relative_altitude"]["mean"]
+            aim = f"{survey}: flight height within 3 % of the drone's own"
+            rows.append(_row(aim, f"{share - 1:+.1%}", abs(share - 1) <= 0.03))
+        for check in (r for r in more["residuals"] if r["kind"] == "check"):
+            for name, least in (("horizontal", 0.05), ("vertical", 0.10)):
+                aim = f"{survey}: control points left out in turn met within {100 * least:.0f} cm, {name} RMS"
+                value = check[f"rms_{name}"]
+                gsd = more["resolution"]["gsd"]["mean"]
+                shown = f"{100 * value:.1f} cm, {value / gsd:.1f} pixels on the ground"
+                rows.append(_row(aim, shown, value < least))
+            if record["took"] is not None and record["exhaustive"] is not None:
+                ratio = _whole(record["exhaustive"]) / record["took"]["seconds"]
+                rows.append(_row(f"{survey}: 3 times as fast as exhaustive or more", f"{ratio:.1f} times", ratio >= 3))
+    if many is not None:
+        aim = f"{many['photographs']} photographs in less than 4 GB"
+        rows.append(_row(aim, f"{many['peak_memory_bytes'] / 1e9:.2f} GB", many["peak_memory_bytes"] < 4e9))
+    return Table("", ["aim", "result", ""], rows)
+
+
+def _row(aim: str, shown: str, enough: bool) -> list[str]:
+    return [aim, shown, "met" if enough else "not met"]
+
+
+def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) -> list[str]:
+    """What `swift` makes of prepared scenes, of those without evened colours, and of ready-made ones."""
+    columns = {
+        "prepared": (prepared, ""),
+        "prepared with --colour off": (prepared, "_uneven"),
+        "ready-made": (ready, ""),
+    }
+    rows = []
+    for survey in surveys:
+        for metric, title, style in METRICS:
+            cells = []
+            for folder, suffix in columns.values():
+                results = None if folder is None else read_results(folder, [survey + suffix], [WHOLE])
+                cells.append(shown(results and results.metric(survey + suffix, WHOLE, metric), style))
+            rows.append([f"{survey}: {title}", *cells])
+    if not any(cell != NOTHING for row in rows for cell in row[1:]):
+        return []
+    text = (
+        "Over the pixels of the held-out photographs that two training photographs or more see. Prepared scenes may "
+        "hold other photographs out than ready-made ones, if they have others, and photographs whose colours were "
+        "evened are not the photographs as they were: the colour fit is what compares them."
+    )
+    return [Table("Trained and evaluated", ["", *columns], rows).markdown(), text]
 
 
 def _quality(records: dict[str, dict[str, Any]]) -> Table:

@@ -10,8 +10,8 @@ import numpy as np
 from camera_files import exif, photograph, survey_folder
 
 from benchmarks.many import APART_DEG, WIDTH, measure_many
-from benchmarks.records import Took
 from benchmarks.surveys import write_page
+from tidefield.compare.record import Took, write_json
 from tidefield.ingest.reading.photographs import read_survey
 from tidefield.ingest.survey import Survey
 
@@ -44,8 +44,45 @@ def test_copies_of_a_survey_are_one_huge_survey(tmp_path: Path) -> None:
     assert again == record
     assert len(seen) == 1
 
-    write_page(tmp_path / "runs", [], tmp_path / "page.md")
+    write_page(tmp_path / "runs", [], None, None, tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text()
     assert "50 small photographs" in page
     assert "| features, s | 30 |" in page
     assert "| peak memory, GB | 2.50 |" in page
+
+
+def test_the_page_says_what_was_aimed_at_and_what_came_of_training(tmp_path: Path) -> None:
+    check = {"kind": "check", "rms_horizontal": 0.09, "rms_vertical": 0.05}
+    report = {
+        "reconstruction_statistics": {"reconstructed_shots_count": 74, "initial_shots_count": 79},
+        "processing_statistics": {"steps_times": STAGES},
+        "tidefield": {
+            "reprojection": {"mean_px": 0.58},
+            "resolution": {"height_above_ground": {"mean": 74.0}, "gsd": {"mean": 0.06}},
+            "cameras": [{"focal_px": 1119.0}],
+            "residuals": [check],
+            "colour": None,
+        },
+    }
+    runs = tmp_path / "runs"
+    write_json(runs / "swindale" / "scene" / "report.json", report)
+    write_json(runs / "swindale" / "prepare.json", {"seconds": 150.0, "peak_memory_bytes": 10**9})
+    whole = {"seconds": {"features": 100.0, "matches": 300.0}, "pairs_matched": 3, "pairs": 3, "photographs": 79}
+    write_json(runs / "swindale" / "exhaustive" / "exhaustive.json", whole)
+    for folder, scene, psnr in ("a", "swindale", 27.0), ("a", "swindale_uneven", 26.0), ("b", "swindale", 26.5):
+        mean = {"psnr_seen": psnr - 1, "psnr_seen_cc": psnr, "ssim_seen_cc": 0.7}
+        write_json(tmp_path / folder / "runs" / scene / "tidefield" / "evaluation.json", {"mean": mean})
+    write_page(runs, ["swindale"], tmp_path / "a", tmp_path / "b", tmp_path / "page.md")
+    lines = (tmp_path / "page.md").read_text().splitlines()
+    for line in (
+        "| swindale: 75 photographs placed or more | 74 | not met |",
+        "| swindale: mean reprojection error of 0.6 px or less | 0.58 px | met |",
+        "| swindale: control points left out in turn met within 5 cm, horizontal RMS "
+        "| 9.0 cm, 1.5 pixels on the ground | not met |",
+        "| swindale: control points left out in turn met within 10 cm, vertical RMS "
+        "| 5.0 cm, 0.8 pixels on the ground | met |",
+        "| swindale: 3 times as fast as exhaustive or more | 2.7 times | not met |",
+        "| swindale: PSNR after the colour fit, dB | 27.00 | 26.00 | 26.50 |",
+        "| exhaustive / prepare | 2.7 |",
+    ):
+        assert line in lines, line
