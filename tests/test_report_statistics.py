@@ -200,6 +200,9 @@ def test_grid_lines_and_ticks_lie_where_their_labels_say():
                 if line.label:
                     value = float(line.label.replace("\u202f", ""))
                     assert crs[axis] @ world == pytest.approx(value, abs=1e-3)
+            if line.label:  # it keeps clear of the corners, where the other side's labels are
+                along, end = (line.x0 - 26, 3 * 240) if axis == 0 else (line.y0 - 24, 3 * 200)
+                assert 30 < along < end - 30
     geographic = np.array([[1.5e-5, 0, -0.0004], [0, 9e-6, 54.51]])
     west, *_, east = [tick.label for tick in degree_ticks(sheet, geographic, 0)]
     assert west.endswith("° W")

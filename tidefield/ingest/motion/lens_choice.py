@@ -220,10 +220,10 @@ def _told_of_terms(trials: Sequence[Trial]) -> list[str]:
     richer = [t for t in others if TERMS[t.lens] > TERMS[best.lens] and t.error_px < WORTH * best.error_px]
     if not richer or best.off_m is None:
         return []
-    other = min(richer, key=lambda trial: trial.error_px)
+    other, terms = min(richer, key=lambda trial: trial.error_px), TERMS[best.lens]
     return [
-        f"The lens has {TERMS[best.lens]} term(s) of distortion. With {TERMS[other.lens]} the matches would fit better "
-        f"({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras worse with their positions "
+        f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {TERMS[other.lens]} the matches would fit "
+        f"better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras worse with their positions "
         f"({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be bent."
     ]
 

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+LABEL_HALF = 32.0
+"""Half the length of a label, units of the paper."""
+
 Affine = Float64[np.ndarray, "2 3"]
 
 
@@ -43,7 +46,8 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Line:
-    """A line on the paper with a label at its first end; the label is empty where that end is outside the frame."""
+    """A line on the paper with a label at its first end; the label is empty where that end is outside the frame, or so
+    close to a corner that labels of two sides would meet."""
 
     x0: float
     y0: float
@@ -69,7 +73,7 @@ def grid_lines(sheet: Sheet, grid: Affine, axis: int) -> list[Line]:
         ends = np.stack([_crossing(grid, axis, value, edge), _crossing(grid, axis, value, opposite)])
         (x0, y0), (x1, y1) = sheet.at(ends).tolist()
         label = spaced(value, _decimals(step))
-        lines.append(Line(x0, y0, x1, y1, label if sheet.holds(ends[:1])[0] else ""))
+        lines.append(Line(x0, y0, x1, y1, label if _has_room(sheet, ends[:1], axis) else ""))
     return lines
 
 
@@ -83,8 +87,15 @@ def degree_ticks(sheet: Sheet, geographic: Affine, axis: int, length: float = 5)
         if sheet.holds(place)[0]:
             x, y = sheet.at(place)[0].tolist()
             label = f"{abs(value):.{_decimals(step)}f}° {('EW', 'NS')[axis][value < 0]}"
+            label = label if _has_room(sheet, place, axis) else ""
             ticks.append(Line(x, y, x, y - length, label) if axis == 0 else Line(x, y, x + length, y, label))
     return ticks
+
+
+def _has_room(sheet: Sheet, place: Float64[np.ndarray, "1 2"], axis: int) -> bool:
+    """Whether a label centred at a place on the frame keeps clear of the corners."""
+    gap = place[0, axis] - sheet.low[axis], sheet.high[axis] - place[0, axis]
+    return bool(sheet.holds(place)[0] and sheet.scale * min(gap) >= LABEL_HALF)
 
 
 def round_step(least: float) -> float:
