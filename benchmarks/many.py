@@ -1,7 +1,7 @@
 """A survey of thousands of photographs, made of a small one: does memory stay flat?
 
-The photographs are reduced and copied; every copy of the survey lies kilometres from the others, so that the real
-stages choose pairs, match, place and report as for one huge survey.
+The photographs are reduced and copied; every copy of the survey lies kilometres from the others and was flown hours
+after the one before, so that the real stages choose pairs, match, place and report as for one huge survey.
 """
 
 from __future__ import annotations
@@ -9,15 +9,18 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import ExifTags, Image
 
 from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
 
 WIDTH = 400
 APART_DEG = 0.05
+LATER = timedelta(hours=3)
+EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 
 
 def measure_many(source: Path, runs: Path, count: int, run: Runner, say: Callable[[str], object]) -> dict[str, Any]:
@@ -36,6 +39,15 @@ def measure_many(source: Path, runs: Path, count: int, run: Runner, say: Callabl
     return record
 
 
+def _flown_later(exif: Image.Exif, copy: int) -> None:
+    """Move a photograph's time on by a few hours for each copy."""
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    time = tags.get(ExifTags.Base.DateTimeOriginal)
+    if isinstance(time, str):
+        later = datetime.strptime(time, EXIF_TIME) + copy * LATER
+        tags[ExifTags.Base.DateTimeOriginal] = later.strftime(EXIF_TIME)
+
+
 def _copies(source: Path, folder: Path, count: int) -> None:
     """Reduced photographs, and gps.csv with the copies' places side by side."""
     from tidefield.ingest.reading.photographs import read_survey
@@ -52,7 +64,8 @@ def _copies(source: Path, folder: Path, count: int) -> None:
         with Image.open(photograph.path) as picture:
             height = round(picture.height * WIDTH / picture.width)
             exif = picture.getexif()
-            exif.pop(0x8825, None)  # GPS: gps.csv says where the copies are
+            exif.pop(ExifTags.IFD.GPSInfo, None)  # gps.csv says where the copies are
+            _flown_later(exif, copy)
             picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(folder / name, quality=92, exif=exif)
         row, column = divmod(copy, 20)
         latitude, longitude = place.latitude_deg + APART_DEG * row, place.longitude_deg + APART_DEG * column

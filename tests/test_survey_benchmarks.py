@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from camera_files import exif, photograph, survey_folder
+from camera_files import exif, photograph
+from PIL.ExifTags import Base
 
 from benchmarks.many import APART_DEG, WIDTH, measure_many
 from benchmarks.surveys import write_page
@@ -19,7 +20,9 @@ STAGES = {"quality": 2.0, "features": 30.4}
 
 
 def test_copies_of_a_survey_are_one_huge_survey(tmp_path: Path) -> None:
-    survey_folder(tmp_path / "card", count=3)
+    for index, place in enumerate([(46.84, -91.99), (46.8401, -91.99), (46.8402, -91.99)]):
+        table = exif({Base.DateTimeOriginal: f"2024:05:01 10:00:{index:02d}"}, place=place, height_m=200)
+        photograph(tmp_path / "card" / f"DJI_{index}.JPG", table=table)
     photograph(tmp_path / "card" / "nowhere.jpg", table=exif())
     seen: list[Survey] = []
 
@@ -39,6 +42,8 @@ def test_copies_of_a_survey_are_one_huge_survey(tmp_path: Path) -> None:
     assert {one.width for one in survey.photographs} == {WIDTH}
     assert ((apart < 3e-4) | (apart > 0.9 * APART_DEG)).all()
     assert (apart[0] < 3e-4).sum() == 3
+    hours = np.array([one.time_s for one in survey.photographs]) / 3600
+    assert set(np.round(hours - hours.min()).astype(int)) == set(range(0, 3 * 17, 3))
 
     again = measure_many(tmp_path / "card", tmp_path / "runs", 50, prepare, print)
     assert again == record
