@@ -88,7 +88,7 @@ def test_photographs_of_fields_far_apart_are_not_paired():
         replace(p, time_s=p.time_s + 2e6, position=replace(p.position, latitude_deg=56.0)) for p in here if p.position
     ]
     pairs = candidates([*here, *there, *also])
-    assert len([pair for pair in pairs if pair[0] // 20 != pair[1] // 20]) <= 2 * (1 + IN_SEQUENCE)  # in sequence
+    assert not [pair for pair in pairs if pair[0] // 20 != pair[1] // 20]
     assert len([pair for pair in pairs if pair[1] < 20]) > 100
 
 
@@ -105,6 +105,14 @@ def test_photographs_taken_one_after_the_other_are_paired_wherever_they_claim_to
     flight[50] = replace(flight[50], position=replace(flight[50].position, latitude_deg=-10.0))
     pairs = set(candidates(flight))
     assert {(49, 50), (50, 51), (48, 50), (50, 52)} <= pairs
+
+
+def test_flights_hours_apart_are_not_in_sequence():
+    field = [photograph(k, 54 + 20 * k / 111_000) for k in range(30)]
+    later = [photograph(30 + k, 54.5 + 20 * k / 111_000, time_s=3600.0 + k) for k in range(30)]
+    assert not [pair for pair in candidates([*field, *later]) if pair[0] < 30 <= pair[1]]
+    timeless = [replace(one, time_s=float("nan")) for one in (*field, *later)]
+    assert {(28, 30), (29, 30), (29, 31)} <= set(candidates(timeless))
 
 
 def test_pairs_whose_largest_features_match_are_promising_and_every_photograph_keeps_its_best():

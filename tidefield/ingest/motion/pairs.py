@@ -22,7 +22,9 @@ NEARBY = 24
 FAR = 4.0
 """Times the usual distance to the middle one of them; photographs farther apart show nothing in common."""
 IN_SEQUENCE = 2
-"""Photographs taken just before and after are paired in any case."""
+"""Photographs taken just before and after are paired in any case, ..."""
+PAUSE_S = 600.0
+"""... unless so much time lies between: a drone that has landed begins elsewhere."""
 FEW = 40
 """So few photographs are all paired with each other; it takes a minute and misses nothing."""
 GLANCE = 300
@@ -59,7 +61,11 @@ def candidates(photographs: Sequence[Photograph]) -> list[Pair]:
     pairs |= {_pair(k, other) for k in lost for other in range(count) if other != k}
     order = sorted(range(count), key=lambda k: (photographs[k].time_s, photographs[k].name))
     for ahead in range(1, IN_SEQUENCE + 1):
-        pairs |= {_pair(a, b) for a, b in zip(order, order[ahead:], strict=False)}
+        pairs |= {
+            _pair(a, b)
+            for a, b in zip(order, order[ahead:], strict=False)
+            if not photographs[b].time_s - photographs[a].time_s > PAUSE_S  # they may have no time
+        }
     return sorted(pairs)
 
 
