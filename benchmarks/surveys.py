@@ -143,12 +143,13 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
     }
     rows = []
     for survey in surveys:
+        found = []
+        for folder, suffix in columns.values():
+            name = survey + suffix
+            found.append(None if folder is None else read_results(folder, [name], [WHOLE]).by.get((name, WHOLE)))
         for metric, title, style in METRICS:
-            cells = []
-            for folder, suffix in columns.values():
-                results = None if folder is None else read_results(folder, [survey + suffix], [WHOLE])
-                cells.append(shown(results and results.metric(survey + suffix, WHOLE, metric), style))
-            rows.append([f"{survey}: {title}", *cells])
+            rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])
+        rows.append([f"{survey}: steps of training", *(shown(result and result.steps, "{:,}") for result in found)])
     if not any(cell != NOTHING for row in rows for cell in row[1:]):
         return []
     text = (

@@ -76,7 +76,9 @@ def test_the_page_says_what_was_aimed_at_and_what_came_of_training(tmp_path: Pat
     write_json(runs / "swindale" / "exhaustive" / "exhaustive.json", whole)
     for folder, scene, psnr in ("a", "swindale", 27.0), ("a", "swindale_uneven", 26.0), ("b", "swindale", 26.5):
         mean = {"psnr_seen": psnr - 1, "psnr_seen_cc": psnr, "ssim_seen_cc": 0.7}
-        write_json(tmp_path / folder / "runs" / scene / "tidefield" / "evaluation.json", {"mean": mean})
+        trained = {"trained": {"steps": 1500, "seconds": 600.0}}
+        evaluation = tmp_path / folder / "runs" / scene / "tidefield" / "evaluation.json"
+        write_json(evaluation, {"mean": mean, "configuration": trained})
     write_page(runs, ["swindale"], tmp_path / "a", tmp_path / "b", tmp_path / "page.md")
     lines = (tmp_path / "page.md").read_text().splitlines()
     for line in (
@@ -88,6 +90,7 @@ def test_the_page_says_what_was_aimed_at_and_what_came_of_training(tmp_path: Pat
         "| 5.0 cm, 0.8 pixels on the ground | met |",
         "| swindale: 3 times as fast as exhaustive or more | 2.7 times | not met |",
         "| swindale: PSNR after the colour fit, dB | 27.00 | 26.00 | 26.50 |",
+        "| swindale: steps of training | 1,500 | 1,500 | 1,500 |",
         "| exhaustive / prepare | 2.7 |",
     ):
         assert line in lines, line
