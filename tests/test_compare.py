@@ -242,6 +242,8 @@ def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_pat
 def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(SceneError, match="two scenes are named flats"):
         named([disk, tmp_path / "elsewhere" / "flats"])
+    (tmp_path / "other").symlink_to(disk)
+    assert named([disk, tmp_path / "other"]) == {"flats": disk, "other": tmp_path / "other"}
     assert set(MIPNERF360) == set(published.TABLE_2)
     made = []
 

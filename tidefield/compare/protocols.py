@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -71,7 +72,7 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
     Raises:
         SceneError: two have the same.
     """
-    names = [scene.resolve().name for scene in scenes]
+    names = [Path(os.path.abspath(scene)).name for scene in scenes]  # a link has a name of its own
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise SceneError(f"two scenes are named {twice}: expected different names of folders; rename or link one")
