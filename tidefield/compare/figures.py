@@ -59,9 +59,10 @@ def photographs_psnr(results: Results, scene: str, method: str, photograph: str)
 def most_different(
     truth: UInt8[np.ndarray, "H W 3"], renderings: list[UInt8[np.ndarray, "H W 3"]], side: int
 ) -> list[tuple[int, int]]:
-    """Upper left corners (u, v) of the squares in which the methods' errors differ most; squares do not overlap."""
+    """Upper left corners (u, v) of the squares in which the methods' errors differ most, or of one method are largest;
+    squares do not overlap."""
     errors = [uniform_filter(((r.astype(np.float64) - truth) ** 2).mean(2), side) for r in renderings]
-    spread: Float[np.ndarray, "H W"] = np.std(errors, axis=0) + _HARMLESS
+    spread: Float[np.ndarray, "H W"] = (np.std(errors, axis=0) if len(errors) > 1 else errors[0]) + _HARMLESS
     half, corners = side // 2, []
     height, width = spread.shape
     spread[:half], spread[height - half :], spread[:, :half], spread[:, width - half :] = 0, 0, 0, 0

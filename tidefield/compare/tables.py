@@ -64,7 +64,7 @@ def _quality(results: Results, name: str, title: str, style: str, more: bool) ->
             for method in results.methods
         ]
         known = [value for value in values if value is not None]
-        best = (max if more else min)(known) if known else None
+        best = (max if more else min)(known) if len(known) > 1 else None
         bold |= {(i, j + 1) for j, value in enumerate(values) if value is not None and value == best}
         rows.append([scene, *(shown(value, style) for value in values)])
     better = "more is better" if more else "less is better"
