@@ -13,7 +13,7 @@ from tidefield.compare.record import read_json, stamp
 from tidefield.compare.results import Results, read_results
 from tidefield.compare.run import METHODS, RUNS
 from tidefield.compare.table import NOTHING, Table, shown
-from tidefield.compare.tables import all_tables, missing_metrics
+from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 
@@ -65,6 +65,7 @@ def page(compared: Results, ablated: Results, speed: Mapping[str, Any] | None, m
                 "## Methods on the same photographs, split, resolution, machine and budget",
                 "Means over the held-out photographs.",
                 *(table.markdown() for table in (all_tables(_narrowed(compared)) if compared.by else ())),
+                *lpips_weights(compared),
                 *missing_metrics(compared),
                 "## What each part brings",
                 *([ablation_table(ablated).markdown()] if ablated.by else ["Not measured."]),

@@ -42,6 +42,7 @@ def evaluation(scene: Scene, psnr: float) -> dict:
         "rays_per_second": 1234.0,
         "seconds_per_frame": 0.5,
         "split": {"train": [], "test": []},
+        "lpips_weights": {"lpips_alex": "7be5be79" + 56 * "0", "lpips_vgg": 64 * "f"},
         "configuration": {"trained": {"steps": 7, "seconds": 600.0}},
     }
 
@@ -144,6 +145,8 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     page = (out / "tables.md").read_text()
     assert "| flats | 20.00 | - | **27.00** |" in page
     assert "LPIPS, VGG" in page
+    assert "LPIPS with alexnet-owt-7be5be79.pth, as it is published (SHA-256 7be5be79" in page
+    assert "LPIPS with vgg16-397923af.pth, which is another file than the published one (SHA-256 ffff" in page
     assert "LPIPS, AlexNet, all pixels (" not in page, "of what nobody has there is no table"
     assert "| flats, tidefield | 10.0 | 7 | 0.50 | 1,234 | 3.00, 3.00 |" in page
     numbers = json.loads((out / "comparison.json").read_text())

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from tidefield.compare import published
 from tidefield.compare.results import Result, Results
 from tidefield.compare.table import NOTHING, Table, shown
+from tidefield.train.lpips import BACKBONES
 
 METRICS = (
     ("psnr", "PSNR, dB", "{:.2f}", True),
@@ -44,6 +45,21 @@ def missing_metrics(results: Results) -> list[str]:
             if reason is not None and metric not in missing.setdefault(reason, []):
                 missing[reason].append(metric)
     return [f"No {', '.join(metrics)}: {reason}." for reason, metrics in missing.items()]
+
+
+def lpips_weights(results: Results) -> list[str]:
+    """Which weights LPIPS was measured with, as sentences; published files have the start of their hash in their name."""
+    found = {
+        (file, sha256)
+        for result in results.by.values()
+        for metric, sha256 in result.evaluation.get("lpips_weights", {}).items()
+        for _, file in [BACKBONES[metric]]
+    }
+    told = {True: "as it is published", False: "which is another file than the published one"}
+    return [
+        f"LPIPS with {file}, {told[sha256.startswith(file[-12:-4])]} (SHA-256 {sha256})."
+        for file, sha256 in sorted(found)
+    ]
 
 
 def quality_tables(results: Results) -> list[Table]:

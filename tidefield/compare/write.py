@@ -13,7 +13,7 @@ from tidefield.compare.record import stamp, write_json
 from tidefield.compare.results import Results
 from tidefield.compare.run import Settings
 from tidefield.compare.table import Table
-from tidefield.compare.tables import all_tables, missing_metrics
+from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
 from tidefield.data.load import load_scene
 from tidefield.files import completed_file
 
@@ -26,7 +26,7 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     """
     tables, made = all_tables(results), stamp()
     files = [
-        _write(out / "tables.md", _page(tables, missing_metrics(results), settings, made)),
+        _write(out / "tables.md", _page(tables, _remarks(results), settings, made)),
         _write(out / "tables.tex", "\n\n".join(table.latex() for table in tables) + "\n"),
         _write(out / "tables.csv", "\n".join(f"{table.title}\n{table.csv()}" for table in tables)),
     ]
@@ -59,11 +59,15 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     table, made = ablation_table(results), stamp()
     write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
     return [
-        _write(out / "ablation.md", _page([table], missing_metrics(results), settings, made)),
+        _write(out / "ablation.md", _page([table], _remarks(results), settings, made)),
         _write(out / "ablation.tex", table.latex() + "\n"),
         _write(out / "ablation.csv", table.csv()),
         out / "ablation.json",
     ]
+
+
+def _remarks(results: Results) -> list[str]:
+    return [*lpips_weights(results), *missing_metrics(results)]
 
 
 def _page(tables: list[Table], remarks: list[str], settings: Settings, made: Mapping[str, Any]) -> str:

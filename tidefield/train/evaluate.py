@@ -113,6 +113,7 @@ def evaluate(
         "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
         "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
         "version": __version__,
+        "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
     }
     with completed_file(path, overwrite=True) as partial:

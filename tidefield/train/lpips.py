@@ -7,6 +7,7 @@ optional extra), their weights from two files in torch hub's folder. Nothing is 
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import sys
 from collections.abc import Sequence
@@ -33,7 +34,11 @@ SMALLEST_PX = 32  # AlexNet's poolings leave nothing of a smaller image
 
 
 class Lpips:
-    """One backbone, ready for use; on CPU."""
+    """One backbone, ready for use; on CPU.
+
+    Attributes:
+        sha256: of the file of its weights.
+    """
 
     def __init__(self, backbone: Literal["alex", "vgg"], weights: Path) -> None:
         from torchmetrics.functional.image.lpips import _LPIPS
@@ -43,6 +48,7 @@ class Lpips:
         with torch.random.fork_rng(devices=[]):
             self._network = _LPIPS(net=backbone, pnet_rand=True)
         loaded = torch.load(weights, map_location="cpu", weights_only=True)
+        self.sha256 = hashlib.sha256(weights.read_bytes()).hexdigest()
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
         features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
