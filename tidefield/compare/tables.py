@@ -48,7 +48,7 @@ def missing_metrics(results: Results) -> list[str]:
 
 
 def lpips_weights(results: Results) -> list[str]:
-    """Which weights LPIPS was measured with, as sentences; published files have the start of their hash in their name."""
+    """Which weights LPIPS was measured with, as sentences; published files are named with the start of their hash."""
     found = {
         (file, sha256)
         for result in results.by.values()
