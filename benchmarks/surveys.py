@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
-from tidefield.compare.results import read_results
+from tidefield.compare.results import Result, read_results
 from tidefield.compare.run import WHOLE
 from tidefield.compare.table import NOTHING, Table, shown
 from tidefield.errors import SurveyError
@@ -22,6 +22,8 @@ from tidefield.files import completed_file
 
 AIMS = {"brighton_beach": (18, True), "turin_lot": (32, True), "swindale": (75, False)}
 """Photographs to be placed, and whether the drone says how high it flew."""
+UNEVEN = "_uneven"
+"""Ends the name of a scene that was prepared with --colour off."""
 METRICS = (
     ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
     ("psnr_seen", "PSNR, dB", "{:.2f}"),
@@ -70,13 +72,14 @@ def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready:
     text = "\n\n".join(
         [
             "# Surveys",
-            '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS"` wrote this page; nothing is typed by hand.',
+            '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS --prepared COMPARISON --ready COMPARISON"` '
+            "wrote this page; nothing is typed by hand.",
             f"On {made['cores']} cores of {made['processor']}, without a GPU. Exhaustive means COLMAP's defaults, as "
             "the same library (pycolmap) runs them: every photograph matched with every other, focal length free. "
             "Where only some of the pairs were matched, drawn at random, the time of all is reckoned from theirs and "
             "that of placing the photographs is not in it.",
             "## What was aimed at",
-            _aims(records, many).markdown(),
+            _aims(records, many, prepared, ready).markdown(),
             "## What came of it",
             _quality(records).markdown(),
             *_trained(surveys, prepared, ready),
@@ -96,7 +99,9 @@ def _read(folder: Path) -> dict[str, Any]:
     }
 
 
-def _aims(records: dict[str, dict[str, Any]], many: dict[str, Any] | None) -> Table:
+def _aims(
+    records: dict[str, dict[str, Any]], many: dict[str, Any] | None, prepared: Path | None, ready: Path | None
+) -> Table:
     """Every aim, what came out, and whether that is enough."""
     rows: list[list[str]] = []
 
@@ -124,6 +129,15 @@ def _aims(records: dict[str, dict[str, Any]], many: dict[str, Any] | None) -> Ta
             if record["took"] is not None and record["exhaustive"] is not None:
                 ratio = _whole(record["exhaustive"]) / record["took"]["seconds"]
                 rows.append(_row(f"{survey}: 3 times as fast as exhaustive or more", f"{ratio:.1f} times", ratio >= 3))
+        ours, plain, theirs = (
+            result and result.metric("psnr_seen_cc")
+            for result in (_run(prepared, survey), _run(prepared, survey + UNEVEN), _run(ready, survey))
+        )
+        if ours is not None and theirs is not None:
+            shown = f"{ours - theirs:+.2f} dB" + (
+                "" if plain is None else f", with --colour off {plain - theirs:+.2f} dB"
+            )
+            rows.append(_row(f"{survey}: trained, PSNR not under the ready-made scene's", shown, ours >= theirs))
     if many is not None:
         aim = f"{many['photographs']} photographs in less than 4 GB"
         rows.append(_row(aim, f"{many['peak_memory_bytes'] / 1e9:.2f} GB", many["peak_memory_bytes"] < 4e9))
@@ -134,19 +148,21 @@ def _row(aim: str, shown: str, enough: bool) -> list[str]:
     return [aim, shown, "met" if enough else "not met"]
 
 
+def _run(comparison: Path | None, scene: str) -> Result | None:
+    """What a comparison has of our network on a scene."""
+    return None if comparison is None else read_results(comparison, [scene], [WHOLE]).by.get((scene, WHOLE))
+
+
 def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) -> list[str]:
     """What `swift` makes of prepared scenes, of those without evened colours, and of ready-made ones."""
     columns = {
         "prepared": (prepared, ""),
-        "prepared with --colour off": (prepared, "_uneven"),
+        "prepared with --colour off": (prepared, UNEVEN),
         "ready-made": (ready, ""),
     }
     rows = []
     for survey in surveys:
-        found = []
-        for folder, suffix in columns.values():
-            name = survey + suffix
-            found.append(None if folder is None else read_results(folder, [name], [WHOLE]).by.get((name, WHOLE)))
+        found = [_run(folder, survey + suffix) for folder, suffix in columns.values()]
         for metric, title, style in METRICS:
             rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])
         rows.append([f"{survey}: steps of training", *(shown(result and result.steps, "{:,}") for result in found)])
@@ -155,7 +171,7 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
     text = (
         "Over the pixels of the held-out photographs that two training photographs or more see. Prepared scenes may "
         "hold other photographs out than ready-made ones, if they have others, and photographs whose colours were "
-        "evened are not the photographs as they were: the colour fit is what compares them."
+        "evened are other photographs: in those that became brighter the same misses count more, in darker ones less."
     )
     return [Table("Trained and evaluated", ["", *columns], rows).markdown(), text]
 
@@ -190,7 +206,7 @@ def _quality(records: dict[str, dict[str, Any]]) -> Table:
         row(f"{title}, RMS vertical, {name}", residual(kind, "rms_vertical", unit))
     row("photographs disagree in colour by, % (before)", lambda r: _colour(r, "before"))
     row("photographs disagree in colour by, % (after)", lambda r: _colour(r, "after"))
-    return Table("What came out", columns, rows)
+    return Table("Model", columns, rows)
 
 
 def _many(record: dict[str, Any] | None) -> list[str]:
