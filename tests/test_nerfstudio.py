@@ -4,11 +4,13 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
 import textured_wall as wall
 import torch
+from rich.console import Console
 
 from tidefield.baselines.nerfstudio import driver, environment
 from tidefield.baselines.nerfstudio.export import export
@@ -114,6 +116,34 @@ def test_without_nerfstudio_one_is_told_how_to_get_it(tmp_path: Path, monkeypatc
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(RunError, match="run `tidefield baselines install nerfacto`"):
         environment.python()
+
+
+def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    asked, starts = [], False
+
+    def run(words: list[str], **options: object) -> CompletedProcess[str]:
+        asked.append(words[1:])
+        return CompletedProcess(words, int(words[-1] == "check" and not starts), "", "no yaml")
+
+    monkeypatch.setattr(environment.subprocess, "run", run)
+    monkeypatch.setattr(environment.venv, "create", lambda folder, with_pip: folder.mkdir())
+    quiet = Console(quiet=True)
+    with pytest.raises(RunError, match=r"does not start \(no yaml\)"):
+        environment.install(False, quiet)
+    with pytest.raises(RunError, match="is not installed"):
+        environment.python()
+    starts = True
+    environment.install(False, quiet)
+    assert environment.python().is_relative_to(tmp_path)
+    packages = [word for words in asked for word in words]
+    assert "nerfstudio==1.1.5" in packages
+    assert any(word.startswith("torchvision==0.") for word in packages)
+    with pytest.raises(RunError, match="--overwrite"):
+        environment.install(False, quiet)
+    monkeypatch.setattr(environment.sys, "version_info", (3, 14, 0))
+    with pytest.raises(RunError, match=r"Python 3\.14: expected 3\.12 or older"):
+        environment.install(True, quiet)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from tidefield.baselines.nerfstudio.environment import python
+from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.baselines.nerfstudio.export import camera_to_json, export
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -28,7 +28,6 @@ from tidefield.train.loop import Budget
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
-WORKER = Path(__file__).with_name("worker.py")
 
 
 def train(

@@ -15,6 +15,7 @@ from rich.console import Console
 from tidefield.errors import RunError
 
 VERSION = "1.1.5"
+WORKER = Path(__file__).with_name("worker.py")
 _NEWEST_PYTHON = (3, 12)
 """The newest that NumPy 1, which nerfstudio needs, has wheels for."""
 _NEEDED = (
@@ -38,6 +39,7 @@ _NEEDED = (
     "protobuf",
     "psutil",
     "pyquaternion",
+    "pyyaml",
     "pytorch-msssim",
     "rawpy",
     "requests",
@@ -87,7 +89,7 @@ def install(overwrite: bool, console: Console) -> None:
         raise RunError(f"{folder} is there already: expected nothing; pass --overwrite to make it anew")
     if sys.version_info[:2] > _NEWEST_PYTHON:
         raise RunError(
-            f"nerfstudio {VERSION} does not install on Python {sys.version_info.major}.{sys.version_info.minor}: "
+            f"nerfstudio {VERSION} does not install on Python {'.'.join(map(str, sys.version_info[:2]))}: "
             f"expected {'.'.join(map(str, _NEWEST_PYTHON))} or older; install Tidefield there"
         )
     shutil.rmtree(folder, ignore_errors=True)
@@ -99,6 +101,10 @@ def install(overwrite: bool, console: Console) -> None:
     for words in ([f"torch=={torch}", *_NEEDED], ["--no-deps", f"torchvision=={_vision(torch)}"]):
         _pip(words)
     _pip(["--no-deps", f"nerfstudio=={VERSION}"])
+    checked = subprocess.run([str(_interpreter()), str(WORKER), "check"], capture_output=True, text=True, check=False)
+    if checked.returncode:
+        why = checked.stderr.strip().splitlines()[-1:] or ["without a word"]
+        raise RunError(f"nerfstudio was installed into {folder} but does not start ({why[0]}): expected it to; tell us")
     _complete().touch()
 
 

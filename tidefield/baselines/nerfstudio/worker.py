@@ -1,8 +1,8 @@
 """Trains one of nerfstudio's methods, or renders with it: runs in nerfstudio's own environment.
 
-Imports nothing of Tidefield. `python worker.py train JOB.json` or `python worker.py render JOB.json`; the parent writes
-the job (see `tidefield.baselines.nerfstudio.driver`), and this program prints nothing to standard output but its
-answers, one JSON object a line.
+Imports nothing of Tidefield. `worker.py train JOB.json`, `worker.py render JOB.json`, or `worker.py check` to see
+whether all is there. The parent writes the job (see `tidefield.baselines.nerfstudio.driver`), and this program prints
+nothing to standard output but its answers, one JSON object a line.
 """
 
 from __future__ import annotations
@@ -74,6 +74,9 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
         model.use_appearance_embedding = False
     if hasattr(model, "implementation") and not has_tiny_cuda_nn():
         model.implementation = "torch"
+    if job["device"] == "cpu" and hasattr(model, "eval_num_rays_per_chunk"):
+        # The same pictures: its 32,768 rays at once take 11 GB, and on a CPU several times as long.
+        model.eval_num_rays_per_chunk = 2048
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
         # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
@@ -189,13 +192,21 @@ def render(job: dict[str, Any]) -> None:
         answer(seconds=World(trainer, camera).render(Path(camera["file"])))
 
 
+def check(_: dict[str, Any]) -> None:
+    """Import all that training and rendering need."""
+    from nerfstudio.configs.method_configs import method_configs
+
+    assert {"nerfacto", "splatfacto"} <= set(method_configs)
+
+
 def main() -> None:
-    kind, job = sys.argv[1], json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
+    kind, *files = sys.argv[1:]
+    job = json.loads(Path(files[0]).read_text(encoding="utf-8")) if files else {}
     without_compiled_torchvision()
     import torchmetrics.image.lpip
 
     torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = Unused
-    {"train": train, "render": render}[kind](job)
+    {"train": train, "render": render, "check": check}[kind](job)
 
 
 if __name__ == "__main__":
