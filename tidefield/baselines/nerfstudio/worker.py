@@ -77,6 +77,8 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     if job["device"] == "cpu" and hasattr(model, "eval_num_rays_per_chunk"):
         # The same pictures: its 32,768 rays at once take 11 GB, and on a CPU several times as long.
         model.eval_num_rays_per_chunk = 2048
+        # In minutes, a CPU makes too few steps of its 4,096 rays for it to learn anything; more and smaller ones help.
+        config.pipeline.datamanager.train_num_rays_per_batch = 1024
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
         # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
