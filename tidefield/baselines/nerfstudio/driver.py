@@ -6,6 +6,7 @@ RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio w
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,6 +29,8 @@ from tidefield.train.loop import Budget
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
+KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
+"""What `tidefield.device.keep_large_allocations` does for us, as glibc takes it from the environment."""
 
 
 def train(
@@ -160,7 +163,14 @@ class _Process:
 def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process]:
     command = [str(python()), str(WORKER), kind, str(folder / JOB_FILE)]
     with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True)
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env={**os.environ, **KEEP_LARGE_ALLOCATIONS},
+        )
         try:
             yield _Process(process, folder)
         finally:
