@@ -64,8 +64,8 @@ class Train:
     overwrite: bool = False
     """Replace the run that is in the folder."""
     curve: bool = False
-    """Render two held-out views at half size now and then, for a curve of quality against time; the clock stands still
-    meanwhile."""
+    """Render two held-out views at a quarter of their size now and then, for a curve of quality against time; the
+    clock stands still meanwhile."""
     allow_missing: AllowMissing = False
     talk: OmitArgPrefixes[Talk] = Talk()
 

@@ -121,7 +121,7 @@ def write_curves(results: Results, path: Path) -> bool:
         axis.set_xscale("log")
         axis.set_title(scene, fontsize=10)
         axis.set_xlabel("seconds of training")
-        axis.set_ylabel("PSNR, dB (two views, half size)")
+        axis.set_ylabel("PSNR, dB (two small views)")
         axis.grid(alpha=0.3)
     for axis in axes[len(scenes) :]:
         axis.set_visible(False)

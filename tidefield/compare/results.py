@@ -20,7 +20,7 @@ class Result:
         folder: of the run.
         evaluation: its evaluation.json.
         process: its process.json: what training and evaluation took.
-        curve: (seconds of training, PSNR) of a few views at half size; empty where none was asked for.
+        curve: (seconds of training, PSNR) of a few small views; empty where none was asked for.
     """
 
     folder: Path
