@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import textured_wall as wall
 import torch
 from rich.console import Console
+from test_training import SMALL
 
-from tidefield.config import SWIFT, EncoderConfig
 from tidefield.model.rendering import Rendering
 from tidefield.train.curve import SHARES, SMALLER, make_curve
 from tidefield.train.display import Display
 from tidefield.train.loop import Budget, Trainer, train
-
-SMALL = replace(
-    SWIFT,
-    network=replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False), views=3),
-    train=replace(SWIFT.train, tiles=1, tile_px=16, crop_px=48),
-)
 
 
 def test_small_views_are_judged_by_their_mean_error():

@@ -39,14 +39,13 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
             with completed_file(file, overwrite=True) as partial:
                 figure.save(partial)
             files.append(file)
-    with completed_file(out / "curves.png", overwrite=True) as partial:
-        drawn = write_curves(results, partial)
-        if not drawn:
-            partial.touch()
-    if drawn:
-        files.append(out / "curves.png")
+    curves = out / "curves.png"
+    if any(result.curve for result in results.by.values()):
+        with completed_file(curves, overwrite=True) as partial:
+            write_curves(results, partial)
+        files.append(curves)
     else:
-        (out / "curves.png").unlink()
+        curves.unlink(missing_ok=True)
     return files
 
 

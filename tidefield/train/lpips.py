@@ -48,7 +48,8 @@ class Lpips:
         with torch.random.fork_rng(devices=[]):
             self._network = _LPIPS(net=backbone, pnet_rand=True)
         loaded = torch.load(weights, map_location="cpu", weights_only=True)
-        self.sha256 = hashlib.sha256(weights.read_bytes()).hexdigest()
+        with weights.open("rb") as file:
+            self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
         features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
