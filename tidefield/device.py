@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
 
 import torch
 
@@ -39,6 +41,14 @@ def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
     else:
         native = False
     return torch.autocast(device.type, dtype=torch.bfloat16) if native else nullcontext()
+
+
+def fuses(values: torch.Tensor) -> bool:
+    """Whether fused kernels work on these values: on CUDA, with Triton, and where TIDEFIELD_FUSED=1 asks for it.
+
+    They are not the default, because nobody has measured yet what they gain.
+    """
+    return values.is_cuda and os.environ.get("TIDEFIELD_FUSED") == "1" and find_spec("triton") is not None
 
 
 def keep_large_allocations() -> None:
