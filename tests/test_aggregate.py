@@ -115,6 +115,22 @@ def inputs(channels: int = C) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return draw(T, N, P, channels), torch.sigmoid(draw(T, N, P, 3, seed=3)), cosines(), some_valid()
 
 
+def test_a_view_counts_as_much_as_it_is_there():
+    features, colours, cosine, valid = inputs()
+    presence = torch.ones(T, N).double()
+    own = box()
+    same = own(features, colours, cosine, valid, presence)
+    for name, value in vars(own(features, colours, cosine, valid)).items():
+        torch.testing.assert_close(getattr(same, name), value)
+    presence[:, 1] = 0
+    without = valid.clone()
+    without[:, 1] = False
+    weight = direction_weights(cosine, valid, own.log_sharpness.exp(), presence)
+    assert not weight[:, 1].any()
+    torch.testing.assert_close(weight.sum(1), without.any(1).double())
+    assert not own(features, colours, cosine, valid, presence).view_weight[:, 1].any()
+
+
 def test_the_box_is_figure_2_sample_by_sample():
     """[F_i, mu, v] through one layer after the other, for one sample and view at a time."""
     own = box()

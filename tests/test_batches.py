@@ -158,9 +158,9 @@ def test_without_points_the_surface_is_between_near_and_far():
 def test_a_view_to_render_has_the_training_photographs_around_it(strategy: str):
     own = scene()
     surface = tile_surface(own.cameras[1], Surfaces(own)[1], torch.zeros(1, 2), 32)
-    chosen = choose_neighbours(own.cameras[1], surface, own, 100, strategy)
+    chosen, _ = choose_neighbours(own.cameras[1], surface, own, 100, strategy)
     assert sorted(chosen[0].tolist()) == list(own.train)
-    fewer = choose_neighbours(own.cameras[2], surface, own, 100, strategy, excluded=2)
+    fewer, _ = choose_neighbours(own.cameras[2], surface, own, 100, strategy, excluded=2)
     assert sorted(fewer[0].tolist()) == [0, 3, 5, 6]
     if strategy == "seen":
         assert set(chosen[0, :2].tolist()) == {0, 2}

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from tidefield.baselines.gather import read_photograph
 from tidefield.model.fill import fill_unseen
-from tidefield.model.gather import gather, joined, maps_from_images, weighted_rows
+from tidefield.model.gather import doubled, gather, joined, maps_from_images, weighted_rows
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -150,16 +150,28 @@ def test_weighted_rows_are_sums_with_the_right_gradient():
     assert torch.autograd.gradcheck(lambda r: weighted_rows(r, index, share), rows.requires_grad_())
 
 
-def test_a_cubic_reading_is_exact_on_quadratics_and_passes_through_the_texels():
-    """Keys' kernel with a = -1/2 reproduces polynomials of second degree."""
+def test_doubling_keeps_the_pixels_and_is_exact_on_quadratics_between_them():
+    """Keys' kernel with a = -1/2 reproduces polynomials of second degree; at the border texels are repeated."""
     v, u = torch.meshgrid(torch.arange(12.0).double() + 0.5, torch.arange(14.0).double() + 0.5, indexing="ij")
-    picture = torch.stack([0.3 * u * u - u * v, 2 * v * v - u + 1, u * v])[None]
-    maps = maps_from_images(picture, torch.zeros(1, 2), 1)
-    uv = 3 + torch.rand(1, 1, 200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6
-    values, _ = gather(maps, torch.tensor([[0]]), uv, cubic=True)
-    x, y = uv[0, 0].unbind(-1)
-    torch.testing.assert_close(values[0, 0], torch.stack([0.3 * x * x - x * y, 2 * y * y - x + 1, x * y], -1))
-    corners = torch.tensor([[[[0.5, 0.5], [13.5, 11.5]]]], dtype=torch.float64)
-    values, inside = gather(maps, torch.tensor([[0]]), corners, cubic=True)
+
+    def picture(u: Tensor, v: Tensor) -> Tensor:
+        return torch.stack([0.3 * u * u - u * v, 2 * v * v - u + 1, u * v])
+
+    twice = doubled(picture(u, v)[None])
+    assert twice.shape == (1, 3, 24, 28)
+    torch.testing.assert_close(twice[0, :, ::2, ::2], picture(u, v))
+    y, x = torch.meshgrid(0.5 + torch.arange(24.0).double() / 2, 0.5 + torch.arange(28.0).double() / 2, indexing="ij")
+    torch.testing.assert_close(twice[0, :, 2:-4, 2:-4], picture(x, y)[:, 2:-4, 2:-4])
+
+
+def test_a_doubled_picture_is_read_at_its_pixels_and_up_to_its_border():
+    picture = torch.rand(1, 3, 6, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    maps = maps_from_images(doubled(picture), torch.tensor([[10.0, 20.0]]), 0.5)
+    corner = torch.tensor([10.0, 20.0]).double()
+    uv = corner + torch.tensor([[0.5, 0.5], [7.5, 5.5], [3.5, 2.5], [0, 0], [8, 6]]).double()
+    values, inside = gather(maps, torch.tensor([[0]]), uv[None, None])
     assert inside.all()
-    torch.testing.assert_close(values[0, 0], torch.stack([picture[0, :, 0, 0], picture[0, :, -1, -1]]))
+    x, y = torch.tensor([0, 7, 3, 0]), torch.tensor([0, 5, 2, 0])
+    torch.testing.assert_close(values[0, 0, :4], picture[0, :, y, x].T)
+    outside = corner + torch.tensor([[-0.1, 3], [8.1, 3], [4, -0.1], [4, 6.1]]).double()
+    assert not gather(maps, torch.tensor([[0]]), outside[None, None])[1].any()

@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from tidefield.config import SWIFT, EncoderConfig
 from tidefield.data.batches import Batch
 from tidefield.model.network import Network, TileRendering
 from tidefield.train.losses import DEPTH_SCALE, GLIMPSE_WEIGHT, photometric, sparse_depth, structural
+from tidefield.train.lpips import prepare_torchvision
 
 SIDE, TILES = 8, 2
 NETWORK = Network(replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False)))
@@ -35,6 +35,7 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         inverse_depth=known * (0.2 + 0.01 * uniform(TILES, pixels)),
         depth_weight=known * uniform(TILES, pixels),
         neighbours=torch.zeros(TILES, 0, dtype=torch.long),
+        presence=torch.zeros(TILES, 0),
         which=torch.zeros(TILES, 0, dtype=torch.long),
         images=(),
         image_corner_px=(),
@@ -125,6 +126,9 @@ def test_the_depth_term_is_nothing_without_points_and_at_the_points():
 
 
 def test_the_structural_term_is_the_ssim_that_evaluation_measures():
+    prepare_torchvision()  # torchmetrics imports it where it is installed
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     rendering, batch = made()
     pictures = [x.unflatten(1, (SIDE, SIDE)).permute(0, 3, 1, 2) for x in (rendering.colour, batch.colours)]
     _, similarity = structural_similarity_index_measure(

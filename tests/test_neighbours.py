@@ -5,7 +5,7 @@ import textured_wall as wall
 import torch
 from torch import Tensor
 
-from tidefield.data.neighbours import ANGLE_SCALE_RAD, nearest, rank_by_direction, rank_by_view
+from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER, FADE, nearest, rank_by_direction, rank_by_view
 from tidefield.geometry.cameras import Cameras
 
 HEIGHT = 30.0
@@ -51,19 +51,19 @@ def nobody(count: int) -> Tensor:
 def test_above_flat_ground_the_nearest_photograph_comes_first():
     own = nadir_grid()
     target = flight(torch.tensor([[1.0, 0.3, HEIGHT]]))
-    chosen = nearest(rank_by_view(target, ground(target), own), nobody(25), 9)[0]
+    chosen = nearest(rank_by_view(target, ground(target), own), nobody(25), 9)[0][0]
     distance = (own.position_world - target.position_world).norm(dim=-1)
     assert chosen[0] == distance.argmin()
     assert distance[chosen[:3]].tolist() == pytest.approx(distance.sort().values[:3].tolist())
-    assert distance[chosen].max() < 8
+    assert distance[chosen].max() < 10
 
 
 def test_a_photograph_of_the_grid_has_its_four_neighbours_and_never_itself():
     own, middle = nadir_grid(), 12
     target = own[middle]
-    chosen = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 4)[0]
+    chosen = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 4)[0][0]
     assert set(chosen.tolist()) == {7, 11, 13, 17}
-    every = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 100)[0]
+    every = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 100)[0][0]
     assert sorted(every.tolist()) == [i for i in range(25) if i != middle]
 
 
@@ -74,9 +74,11 @@ def test_the_rank_is_the_share_seen_times_how_close_the_angle_is():
     rank = rank_by_view(target, surface, own)[0]
     for v in range(25):
         uv, z = own[v].project(surface[0])
-        seen, angles = 0, []
+        seen, angles = 0.0, []
         for p in range(5):
-            seen += bool(z[0, p] > 0 and 0 <= uv[0, p, 0] <= 64 and 0 <= uv[0, p, 1] <= 48)
+            if z[0, p] > 0:
+                u, w = uv[0, p].tolist()
+                seen += min(max(min(u, 64 - u, w, 48 - w) / (BORDER * 64), 0), 1)
             ours, theirs = (surface[0, p] - c.position_world[0] for c in (target, own[v]))
             angles.append(math.acos(float(ours @ theirs / ours.norm() / theirs.norm())))
         expected = seen / 5 * math.exp(-sum(angles) / 5 / ANGLE_SCALE_RAD)
@@ -93,7 +95,7 @@ def test_each_tile_has_its_own_neighbours():
     own = nadir_grid()
     targets = flight(torch.tensor([[-7.0, -7.0, HEIGHT], [7.0, 7.0, HEIGHT]]))
     surface = torch.cat([ground(targets[0]), ground(targets[1])])
-    first = nearest(rank_by_view(targets, surface, own), torch.zeros(2, 25, dtype=torch.bool), 1)
+    first, _ = nearest(rank_by_view(targets, surface, own), torch.zeros(2, 25, dtype=torch.bool), 1)
     assert first.flatten().tolist() == [0, 24]
 
 
@@ -105,7 +107,7 @@ def test_the_papers_strategy_ranks_by_the_angle_between_viewing_directions():
     target = flight(torch.tensor([[0.0, 0.0, HEIGHT]]))
     rank = rank_by_direction(target, own)
     torch.testing.assert_close(rank[0], (angles.cos() + 1) / 2)
-    assert nearest(rank, nobody(5), 5)[0].tolist() == [1, 4, 2, 0, 3]
+    assert nearest(rank, nobody(5), 5)[0][0].tolist() == [1, 4, 2, 0, 3]
 
 
 def test_the_direction_alone_cannot_tell_nadir_photographs_apart():
@@ -116,12 +118,26 @@ def test_the_direction_alone_cannot_tell_nadir_photographs_apart():
 def test_excluded_photographs_never_serve_even_where_nothing_else_is_worth_anything():
     rank = torch.tensor([[0.9, 0.0, 0.0, 0.8]])
     excluded = torch.tensor([[True, False, False, True]])
-    assert set(nearest(rank, excluded, 3)[0].tolist()) == {1, 2}
+    assert set(nearest(rank, excluded, 3)[0][0].tolist()) == {1, 2}
 
 
 def test_the_textured_walls_neighbours_are_those_beside_it():
     own = wall.cameras(7)
     surface = own[3].position_world[:, None] + torch.tensor([[[0.0, 0.0, wall.DEPTH], [0.5, 0.3, wall.DEPTH]]])
-    chosen = nearest(rank_by_view(own[3], surface, own), torch.arange(7)[None] == 3, 4)[0].tolist()
+    chosen = nearest(rank_by_view(own[3], surface, own), torch.arange(7)[None] == 3, 4)[0][0].tolist()
     assert set(chosen[:2]) == {2, 4}
     assert set(chosen[2:]) == {1, 5}
+
+
+def test_a_view_fades_before_it_is_left_out():
+    """As the last view's rank falls to that of the first one left out, its presence falls to nothing, evenly."""
+    rank = torch.tensor([[0.5, 0.9, better, 0.8] for better in (0.7, 0.5 + FADE * 0.5 / 2, 0.5, 0.3)])
+    chosen, presence = nearest(rank, torch.zeros(4, 4, dtype=torch.bool), 3)
+    assert chosen[:, :2].tolist() == [[1, 3]] * 4
+    assert presence[:, :2].tolist() == [[1, 1]] * 4
+    assert presence[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 1e-3, 1], abs=1e-4)
+
+
+def test_where_no_view_is_left_out_all_are_there():
+    chosen, presence = nearest(torch.tensor([[0.5, 0.2]]), torch.zeros(1, 2, dtype=torch.bool), 3)
+    assert (chosen.tolist(), presence.tolist()) == ([[0, 1]], [[1, 1]])

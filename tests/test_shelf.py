@@ -38,7 +38,7 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     view = at.cameras[1]
     middle = view.position_world + 5 * view.directions_world(seen_uv[None])[0]
     neighbours = torch.full((len(seen_uv), 1), 1)
-    views = FeatureShelf(network, at, CPU).views(neighbours, middle)
+    views = FeatureShelf(network, at, CPU).views(neighbours, torch.ones_like(neighbours).float(), middle)
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
@@ -67,4 +67,4 @@ def test_more_blocks_than_slots_are_refused(network: Network):
     cramped = FeatureShelf(network, scene(), CPU, budget_bytes=1)
     neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 5]])
     with pytest.raises(NoRoom):
-        cramped.views(neighbours, torch.zeros(2, 3))
+        cramped.views(neighbours, torch.ones_like(neighbours).float(), torch.zeros(2, 3))

@@ -14,9 +14,13 @@ from torch import Tensor
 from tidefield.config import TrainConfig
 from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
 from tidefield.data.prior import STRIDE, Observed, observed_depths, read_prior, surface_prior
-from tidefield.data.scene import Scene
+from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, pixel_grid, project
+
+FEW = 64
+"""Photographs that are ranked for every tile; of more, only those that every so many tiles see best."""
+EVERY = 7
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class Batch:
         inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
         depth_weight: how far to trust these, 0 to 1; 0 where there is none.
         neighbours: photographs serving as the tiles' neighbouring views.
+        presence: of these, how far each is there.
         which: for each neighbour, the image of `images` to read.
         images: what to encode, in groups of one size: crops of, or whole, photographs.
         image_corner_px: where in their photographs the images' upper left corners lie.
@@ -44,6 +49,7 @@ class Batch:
     inverse_depth: Float[Tensor, "T R"]
     depth_weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
+    presence: Float[Tensor, "T N"]
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
@@ -56,10 +62,15 @@ class Batch:
 
 
 class Surfaces:
-    """What a scene's sparse points say of every camera's surface, made when first asked for."""
+    """What a scene's sparse points say of every camera's surface, made when first asked for.
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    Args:
+        scene: whose cameras.
+        observed: points that are told as observed; the scene's own if not given.
+    """
+
+    def __init__(self, scene: Scene, observed: SparsePoints | None = None) -> None:
+        self.scene, self.points = scene, observed or scene.points
         self._priors: dict[int, Tensor] = {}
         self._observed: dict[int, Observed] = {}
 
@@ -72,7 +83,7 @@ class Surfaces:
     def observed(self, index: int) -> Observed:
         """The sparse points that one photograph observed."""
         if index not in self._observed:
-            self._observed[index] = observed_depths(self.scene.cameras[index], self.scene.points, index)
+            self._observed[index] = observed_depths(self.scene.cameras[index], self.points, index)
         return self._observed[index]
 
 
@@ -117,16 +128,23 @@ def choose_neighbours(
     count: int,
     strategy: str,
     excluded: int | None = None,
-) -> Int[Tensor, "T N"]:
-    """Training photographs that serve as neighbouring views of one camera's tiles, best first."""
+) -> tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]]:
+    """Training photographs that serve as neighbouring views of one camera's tiles, best first, and how far each is
+    there (`nearest`)."""
     train = torch.tensor(scene.train)
+    if strategy != "direction" and len(train) > FEW and len(surface_world) > EVERY:
+        # What some tiles see best, all of them see best that lie between: the work of ranking stays small, however
+        # many photographs there are.
+        some = rank_by_view(camera, surface_world[::EVERY], scene.cameras[train])
+        train = train[some.topk(min(2 * count + 2, len(train)), dim=1).indices.unique()]
     candidates = scene.cameras[train]
     if strategy == "direction":
         rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
     else:
         rank = rank_by_view(camera, surface_world, candidates)
     out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
-    return train[nearest(rank, out, count)]
+    chosen, presence = nearest(rank, out, count)
+    return train[chosen], presence
 
 
 def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
@@ -149,19 +167,21 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     size = scene.cameras.size_px[targets]
     room = (size - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
-    surfaces_world, neighbours, weights, depths = [], [], [], []
+    surfaces_world, neighbours, presences, weights, depths = [], [], [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], surfaces[target]
         surface = tile_surface(camera, prior, at[None], side)
         surfaces_world.append(surface[0, 0])
-        neighbours.append(choose_neighbours(camera, surface, scene, views, config.neighbours, target)[0])
+        found, presence = choose_neighbours(camera, surface, scene, views, config.neighbours, target)
+        neighbours.append(found[0])
+        presences.append(presence[0])
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
             others = scene.cameras[train[train != target]]
             weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
         weights.append(weight)
         depths.append(_sparse_depth(surfaces.observed(target), at, side))
-    chosen = torch.stack(neighbours)
+    chosen, present = torch.stack(neighbours), torch.stack(presences)
     tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
     colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
     weight = torch.stack(weights) * inside
@@ -172,7 +192,7 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
         which, images, corners = _whole(scene, chosen)
     else:
         which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
-    return Batch(targets, corner, colours, weight, inverse_depth, depth_weight, chosen, which, images, corners)
+    return Batch(targets, corner, colours, weight, inverse_depth, depth_weight, chosen, present, which, images, corners)
 
 
 def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:

@@ -107,7 +107,10 @@ def read_header(path: Path) -> tuple[int, int, bool]:
 
 
 def open_photographs(
-    files: Sequence[PhotographFile], background_rgb: tuple[float, float, float], progress: Progress | None = None
+    files: Sequence[PhotographFile],
+    background_rgb: tuple[float, float, float],
+    progress: Progress | None = None,
+    cache: Path | None = None,
 ) -> Photographs:
     """All photographs, undistorted and resized: from the cache, or decoded into it.
 
@@ -115,11 +118,12 @@ def open_photographs(
         files: the photographs.
         background_rgb: what photographs with alpha are composited on, in [0, 1].
         progress: told of every photograph that is decoded.
+        cache: a folder; the user's if not given.
 
     Raises:
         SceneError: for a photograph that cannot be decoded whole, or a full disk.
     """
-    store = _cache_folder() / f"{_key(files, background_rgb)}.photographs"
+    store = (cache or _cache_folder()) / f"{_key(files, background_rgb)}.photographs"
     expected = sum(file.bytes for file in files)
     try:
         if store.is_file() and store.stat().st_size == expected:

@@ -38,7 +38,12 @@ _SMALLEST_WIDTH = 16
 
 
 def load_scene(
-    root: Path, *, width: int | None = None, allow_missing: bool = False, progress: Progress | None = None
+    root: Path,
+    *,
+    width: int | None = None,
+    allow_missing: bool = False,
+    progress: Progress | None = None,
+    cache: Path | None = None,
 ) -> Scene:
     """Read a scene: poses, sparse points, and photographs without distortion at the working resolution.
 
@@ -47,6 +52,7 @@ def load_scene(
         width: of every photograph in pixels, its aspect kept; None and what is wider than a photograph mean its own.
         allow_missing: go on without photographs that are named but not there.
         progress: called with (ready, of how many) while photographs are decoded; not at all when they are cached.
+        cache: folder for decoded photographs; the user's if not given.
 
     Raises:
         SceneError: when the folder is no scene or a damaged one.
@@ -62,7 +68,7 @@ def load_scene(
     points = _sparse_points(posed, pinholes)
 
     white = (1.0, 1.0, 1.0)
-    photographs = open_photographs(files, posed.background_rgb or white, progress)
+    photographs = open_photographs(files, posed.background_rgb or white, progress, cache)
     alphas = (photographs.alpha(i) for i in range(len(photographs)))
     see_through = any(alpha is not None and bool((alpha < 255).any()) for alpha in alphas)
     train, test = _split(posed)

@@ -89,23 +89,28 @@ def _visible(camera: Cameras, points: SparsePoints, cameras: Cameras) -> tuple[N
     uv, z = camera.project(points.xyz_world)
     margin = FRAME_MARGIN * camera.size_px[0]
     inside = (z[0] > 0) & (uv[0] > -margin).all(-1) & (uv[0] < camera.size_px[0] + margin).all(-1)
-    facing = inside & _seen_from_similar_direction(camera, points, cameras)
+    facing = inside & _seen_from_similar_direction(camera, points, cameras, inside)
     keep = facing if facing.any() else inside
     return uv[0, keep].double().cpu().numpy(), 1 / z[0, keep].double().cpu().numpy()
 
 
-def _seen_from_similar_direction(camera: Cameras, points: SparsePoints, cameras: Cameras) -> Bool[Tensor, " P"]:
-    """Whether some photograph observed a point from within `WIDEST_ANGLE_DEG` of this camera's direction to it."""
+def _seen_from_similar_direction(
+    camera: Cameras, points: SparsePoints, cameras: Cameras, asked: Bool[Tensor, " P"]
+) -> Bool[Tensor, " P"]:
+    """Whether some photograph observed a point from within `WIDEST_ANGLE_DEG` of this camera's direction to it; only
+    the points that are asked for are looked at, which are few in a large scene."""
 
     def towards(position_world: Tensor, xyz: Tensor) -> Tensor:
         return torch.nn.functional.normalize(xyz - position_world, dim=-1)
 
-    ours = towards(camera.position_world, points.xyz_world)
-    theirs = towards(cameras.position_world[points.camera_index], points.xyz_world[points.point_index])
-    cosine = (ours[points.point_index] * theirs).sum(-1)
+    observations = asked[points.point_index].nonzero()[:, 0]
+    which = points.point_index[observations].long()
+    xyz = points.xyz_world[which]
+    theirs = towards(cameras.position_world[points.camera_index[observations]], xyz)
+    cosine = (towards(camera.position_world, xyz) * theirs).sum(-1)
     # A point without observations keeps the start value: nothing speaks against it.
-    best = torch.ones(len(ours), device=cosine.device, dtype=cosine.dtype)
-    best = best.scatter_reduce(0, points.point_index.long(), cosine, "amax", include_self=False)
+    best = torch.ones(len(asked), device=cosine.device, dtype=cosine.dtype)
+    best = best.scatter_reduce(0, which, cosine, "amax", include_self=False)
     return best >= np.cos(np.radians(WIDEST_ANGLE_DEG))
 
 

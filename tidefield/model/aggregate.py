@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tidefield.device import fuses
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -38,7 +40,10 @@ class Evidence:
 
 
 def direction_weights(
-    cosine: Float[Tensor, "T N P"], valid: Bool[Tensor, "T N P"], sharpness: Float[Tensor, ""]
+    cosine: Float[Tensor, "T N P"],
+    valid: Bool[Tensor, "T N P"],
+    sharpness: Float[Tensor, ""],
+    presence: Float[Tensor, "T N"] | None = None,
 ) -> Float[Tensor, "T N P"]:
     """Eq. 6: w~_i = max(0, exp(s (d.d_i - 1)) - min_j exp(s (d.d_j - 1))), normalised over the views.
 
@@ -49,12 +54,16 @@ def direction_weights(
         cosine: d.d_i between the unit directions from the target's and from each view's camera to the sample.
         valid: whether the view sees the sample.
         sharpness: s, learnable.
+        presence: how far each view is there, a factor of its w~; not in the paper.
     """
     closeness = torch.exp(sharpness * (cosine - 1))
     least = closeness.masked_fill(~valid, math.inf).amin(1, keepdim=True)
     raw = (closeness - least).clamp(min=0).masked_fill(~valid, 0.0)
+    shared = valid.to(raw)
+    if presence is not None:
+        raw, shared = raw * presence[..., None], shared * presence[..., None]
     total = raw.sum(1, keepdim=True)
-    shared = valid / valid.sum(1, keepdim=True).clamp(min=1)
+    shared = shared / shared.sum(1, keepdim=True).clamp(min=1e-9)
     # Below 1e-6 the differences are rounding of equal angles, not a preference.
     tied = total < 1e-6
     return torch.where(tied, shared, raw / total.masked_fill(tied, 1.0))
@@ -64,6 +73,10 @@ def weighted_moments(
     values: Float[Tensor, "T N P C"], weight: Float[Tensor, "T N P"]
 ) -> tuple[Float[Tensor, "T P C"], Float[Tensor, "T P C"]]:
     """Mean and variance over the views; the weights sum to 1 or, where no view is valid, to 0."""
+    if fuses(values):
+        from tidefield.model import fused
+
+        return fused.moments(values.float(), weight)
     w = weight[..., None]
     mean = (w * values).sum(1)
     return mean, (w * (values - mean[:, None]).square()).sum(1)
@@ -100,15 +113,18 @@ class Aggregate(nn.Module):
         colours: Float[Tensor, "T N P 3"],
         cosine: Float[Tensor, "T N P"],
         valid: Bool[Tensor, "T N P"],
+        presence: Float[Tensor, "T N"] | None = None,
     ) -> Evidence:
         sharpness = self.log_sharpness.exp()
         # With a sharpness of 0 all directions are the same, and the views share equally.
-        weight = direction_weights(cosine, valid, 0 * sharpness if self.alike else sharpness)
+        weight = direction_weights(cosine, valid, 0 * sharpness if self.alike else sharpness, presence)
         mean, variance = weighted_moments(features, weight)
         # A linear layer of [F_i, mu, v] is a sum of linear layers; the shared part is computed once for all views.
         shared = self.shared(torch.cat([mean, variance], dim=-1))
         per_view = F.relu(self.second(F.relu(self.own(features) + shared[:, None])))
         trust = torch.sigmoid(self.trust(per_view)[..., 0]) * valid
+        if presence is not None:
+            trust = trust * presence[..., None]
         seen = valid.any(1)
         # Where no view is valid the sum is 0, and so are the pooled features.
         pooled = weighted_moments(per_view, trust / trust.sum(1, keepdim=True).clamp(min=1e-6))

@@ -75,5 +75,5 @@ class ColourBlend(nn.Module):
             near.append(closeness / 4)
         logits = self.logit(F.relu(self.view(evidence.per_view) + self.direction(torch.cat(near, dim=-1))))
         if self.angle is not None:
-            logits = logits + self.angle * closeness
+            logits = logits + self.angle * closeness + gathered.presence.log()[..., None, None]
         return logits[..., 0].masked_fill(~gathered.valid, -torch.inf)

@@ -20,7 +20,7 @@ from tidefield.model.colour import ColourBlend
 from tidefield.model.compositing import composite
 from tidefield.model.encoder import Encoder
 from tidefield.model.field import Field
-from tidefield.model.gather import maps_from_images
+from tidefield.model.gather import doubled, maps_from_images
 from tidefield.model.intervals import Intervals, histogram, refined, sample
 from tidefield.model.stage import Samples, Stage, place_samples
 from tidefield.model.views import Encoded, Gathered, Views
@@ -183,8 +183,9 @@ class Network(nn.Module):
                 feature = feature + self.descriptors[str(stride)](means)
             channels = [means, feature] if stride > 1 else [feature]
             maps[stride] = maps_from_images(torch.cat(channels, dim=1), corner, stride)
-        colours = photographs if self.config.as_printed else self._sharpened(photographs)
-        return Encoded(maps, maps_from_images(colours, corner, 1), cubic=not self.config.as_printed)
+        if self.config.as_printed:
+            return Encoded(maps, maps_from_images(photographs, corner, 1))
+        return Encoded(maps, maps_from_images(doubled(self._sharpened(photographs)), corner, 0.5))
 
     def _sharpened(self, photographs: Float[Tensor, "K 3 H W"]) -> Float[Tensor, "K 3 H W"]:
         """Against the blur of reading between pixels and of blending: learned, begins as none, and sums to one."""

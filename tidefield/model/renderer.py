@@ -27,6 +27,8 @@ VALUES_AT_ONCE = 5_000_000
 """Values gathered at once by a stage: enough to keep a few cores busy, few enough for their cache ..."""
 GPU_FACTOR = 16
 """... and so many times as many keep a GPU busy."""
+BEHIND_PHOTOGRAPHS, BEHIND_STEP = 32, 16
+"""Photographs, and pixels between their pixels, whose mean colour lies behind what lets light through."""
 BLOCK_TILES = 16
 """Tiles along the sides of the blocks that a view is made in, so that tiles that follow one another see the same."""
 
@@ -50,8 +52,9 @@ class Renderer:
         self.tiles_at_once = max(1, room // gathered)
         net = network.config
         self.fills = bool(net.views) and not net.as_printed and net.field is None and scene.background_rgb is None
-        means = [even(scene, i).mean((0, 1)) for i in scene.train]
-        self.fallback = torch.stack(means).mean(0)
+        few = scene.train[:: -(-len(scene.train) // BEHIND_PHOTOGRAPHS)]
+        lines = slice(None, None, BEHIND_STEP)
+        self.fallback = torch.stack([even(scene, i, lines, lines).mean((0, 1)) for i in few]).mean(0)
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras) -> Rendering:
@@ -85,10 +88,12 @@ class Renderer:
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
         surface = tile_surface(camera, prior, corners, TILE_PX)
         views, strategy = self.network.config.views, self.config.train.neighbours
-        neighbours = choose_neighbours(camera, surface, self.scene, views, strategy) if views else None
+        neighbours = presence = None
+        if views:
+            neighbours, presence = choose_neighbours(camera, surface, self.scene, views, strategy)
         parts = []
         for some in torch.arange(len(corners)).split(self.tiles_at_once):
-            chosen = None if neighbours is None else neighbours[some]
+            chosen = None if neighbours is None or presence is None else (neighbours[some], presence[some])
             parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
         found = torch.cat(parts)
         seen = torch.ones_like(found[..., 0])
@@ -125,19 +130,24 @@ class Renderer:
         camera: Cameras,
         prior: Float[Tensor, "3 h w"],
         corners: Float[Tensor, "T 2"],
-        neighbours: Int[Tensor, "T N"] | None,
+        neighbours: tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]] | None,
         middle_world: Float[Tensor, "T 3"],
     ) -> Float[Tensor, "T R 5"]:
         views = None
         if neighbours is not None:
             assert self.shelf is not None
             try:
-                views = self.shelf.views(neighbours, middle_world)
+                views = self.shelf.views(*neighbours, middle_world)
             except NoRoom:
                 if len(corners) == 1:
                     raise
-                halves = zip(corners.chunk(2), neighbours.chunk(2), middle_world.chunk(2), strict=True)
-                return torch.cat([self._tiles(camera, prior, *half) for half in halves])
+                half = len(corners) // 2
+                return torch.cat(
+                    [
+                        self._tiles(camera, prior, corners[s], (neighbours[0][s], neighbours[1][s]), middle_world[s])
+                        for s in (slice(half), slice(half, None))
+                    ]
+                )
         index = torch.zeros(len(corners), dtype=torch.long)
         tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
         start = start_intervals(self.network, tiles, prior[None].to(self.device))

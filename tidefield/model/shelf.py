@@ -53,14 +53,17 @@ class FeatureShelf:
         texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
         self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
-        self._encoded = Encoded(features, self._empty(like.photographs), like.cubic)
+        self._encoded = Encoded(features, self._empty(like.photographs))
         self._held: OrderedDict[tuple[int, int, int], int] = OrderedDict()
 
-    def views(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> Views:
+    def views(
+        self, neighbours: Int[Tensor, "T N"], presence: Float[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]
+    ) -> Views:
         """The neighbours of tiles, encoded around what each tile shows.
 
         Args:
             neighbours: photographs.
+            presence: how far each of them is there.
             middle_world: the surface in the middle of each tile.
 
         Raises:
@@ -77,7 +80,8 @@ class FeatureShelf:
             if key not in self._held:
                 self._encode(key)
         which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.shape)
-        return Views(self.cameras[neighbours.reshape(-1).to(self.device)], which, self._encoded)
+        cameras = self.cameras[neighbours.reshape(-1).to(self.device)]
+        return Views(cameras, which, presence.to(self.device), self._encoded)
 
     def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
         """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""
@@ -105,8 +109,8 @@ class FeatureShelf:
             maps.size[slot], maps.origin_px[slot] = block.size[0], block.origin_px[0]
         self._held[key] = slot
 
-    def _texels(self, stride: int) -> int:
-        return math.prod(-(-side // stride) for side in self._side)
+    def _texels(self, stride: int | float) -> int:
+        return math.prod(math.ceil(side / stride) for side in self._side)
 
     def _empty(self, like: FeatureMaps) -> FeatureMaps:
         texels, channels = self._texels(like.stride), like.rows.shape[1]

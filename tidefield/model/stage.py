@@ -97,7 +97,8 @@ class Stage(nn.Module):
             known = torch.ones(tiles, count, dtype=torch.bool, device=field.device)
             grey = field.new_full((tiles, count, 3), 0.5)
             return Evidence(self.from_field(field), empty, empty[..., 0], grey, grey[..., 0] * 0, known)
-        evidence = self.aggregate(gathered.features, gathered.colours, gathered.cosine, gathered.valid)
+        presence = None if self.as_printed else gathered.presence
+        evidence = self.aggregate(gathered.features, gathered.colours, gathered.cosine, gathered.valid, presence)
         if field is None:
             return evidence
         return replace(

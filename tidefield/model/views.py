@@ -25,6 +25,7 @@ class Gathered:
         directions: d_i, unit, from each view's camera to the sample.
         cosine: d.d_i with the target's direction.
         valid: whether the sample is in front of the camera and inside the encoded part of the photograph.
+        presence: how far each view is there (`data.neighbours.nearest`).
     """
 
     colours: Float[Tensor, "T N P 3"]
@@ -32,6 +33,7 @@ class Gathered:
     directions: Float[Tensor, "T N P 3"]
     cosine: Float[Tensor, "T N P"]
     valid: Bool[Tensor, "T N P"]
+    presence: Float[Tensor, "T N"]
 
 
 @dataclass(frozen=True)
@@ -41,19 +43,17 @@ class Encoded:
     Attributes:
         features: by stride; from stride 2 on the first three channels are the photographs' mean colours, at the common
             exposure.
-        photographs: the colours themselves, at stride 1.
-        cubic: whether these are to be read by cubic instead of bilinear interpolation.
+        photographs: the colours themselves, at stride 1 or 1/2.
     """
 
     features: dict[int, FeatureMaps]
     photographs: FeatureMaps
-    cubic: bool
 
     @staticmethod
     def joined(parts: list[Encoded]) -> Encoded:
         """Groups of photographs of one size each as one set."""
         features = {stride: joined([part.features[stride] for part in parts]) for stride in parts[0].features}
-        return Encoded(features, joined([part.photographs for part in parts]), parts[0].cubic)
+        return Encoded(features, joined([part.photographs for part in parts]))
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,13 @@ class Views:
     Attributes:
         cameras: of the T N views, tile by tile.
         which: the map of each view.
+        presence: how far each view is there (`data.neighbours.nearest`).
         encoded: all maps.
     """
 
     cameras: Cameras
     which: Int[Tensor, "T N"]
+    presence: Float[Tensor, "T N"]
     encoded: Encoded
 
     def read(
@@ -90,7 +92,7 @@ class Views:
         values, on_map = gather(self.encoded.features[stride], self.which, uv)
         colours, features = values.split([3, values.shape[-1] - 3], dim=-1) if stride > 1 else (values, values)
         if detail or stride == 1:
-            colours, on_map = gather(self.encoded.photographs, self.which, uv, self.encoded.cubic)
+            colours, on_map = gather(self.encoded.photographs, self.which, uv)
         offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
         theirs = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
         return Gathered(
@@ -99,4 +101,5 @@ class Views:
             directions=theirs,
             cosine=(theirs * directions[:, None]).sum(-1),
             valid=inside & on_map,
+            presence=self.presence,
         )
