@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | memory | table | surveys`; without a name, speed.
+"""`python -m benchmarks speed | frames | memory | table | card | surveys`; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -17,11 +17,11 @@ import tyro
 
 from tidefield.errors import RunError, TidefieldError
 
-DESCRIPTION = """What Tidefield achieves, and how fast: speed, memory, surveys, and a page of results. Without a name,
-it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
+DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
+a name, it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
 
-A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes five commands:
-`tidefield compare`, `tidefield ablate`, speed and memory with the same --runs, then table."""
+A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes six commands:
+`tidefield compare`, `tidefield ablate`, speed, frames and memory with the same --runs, then table."""
 
 
 def speed(
@@ -83,6 +83,37 @@ def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> A
     survey = make_survey("river_mouths", seed=7, views=9 if quick else 16, width=64 if quick else 256)
     write_survey(survey, work / "scene")
     return load_scene(work / "scene")
+
+
+def frames(
+    scene: Path,
+    runs: Path,
+    preset: Literal["swift", "paper"] = "swift",
+    weights: Path | None = None,
+    device: str = "cpu",
+) -> None:
+    """Views of a scene that nothing was trained on: the first, further ones, many photographs, steadiness (minutes).
+
+    Args:
+        scene: The scene, a survey.
+        runs: Keep the figures in this folder's frames.json.
+        preset: Which network.
+        weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    from benchmarks.frames import measure_frames
+    from benchmarks.table import frame_tables
+    from tidefield.device import choose_device, keep_large_allocations
+    from tidefield.train.weights import shipped
+
+    keep_large_allocations()
+    found = weights or shipped(preset)
+    if found is None:
+        raise RunError(f"no weights of {preset} came with Tidefield: expected --weights; train some or use swift")
+    record = measure_frames(scene, runs, preset, found, str(choose_device(device)))
+    for table in frame_tables(record):
+        print(table.markdown(), end="\n\n")
 
 
 def memory(
@@ -147,7 +178,7 @@ def table(comparison: Path, ablation: Path, runs: Path, out: Path = Path("docs/r
     Args:
         comparison: Folder of `tidefield compare`.
         ablation: Folder of `tidefield ablate`.
-        runs: Folder of speed and memory.
+        runs: Folder of speed, frames and memory.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
@@ -156,12 +187,24 @@ def table(comparison: Path, ablation: Path, runs: Path, out: Path = Path("docs/r
     print(out)
 
 
+def card(weights: Path, comparison: Path) -> None:
+    """Write the card that lies beside weights, from the file itself and from what was measured.
+
+    Args:
+        weights: Of `tidefield pretrain`.
+        comparison: Folder of a `tidefield compare` with the method zero-shot.
+    """
+    from benchmarks.card import write_card
+
+    print(write_card(weights, comparison))
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Entry point: exit status 2 for a user's mistake, 130 after an interruption."""
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    commands = {"speed": speed, "memory": memory, "table": table, "surveys": surveys}
+    commands = {"speed": speed, "frames": frames, "memory": memory, "table": table, "card": card, "surveys": surveys}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
     except TidefieldError as error:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bars import SCENES, Bar, judge
+from benchmarks.bars import SCENES, Bar, Kept, judge
+from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_table, variants
 from tidefield.compare.record import read_json, stamp
@@ -34,14 +35,14 @@ def write_page(comparison: Path, ablation: Path, runs: Path, out: Path) -> None:
     """
     compared = read_results(comparison, _scenes(comparison), METHODS)
     ablated = read_results(ablation, _scenes(ablation), variants(()))
-    speed, memory = read_json(runs / SPEED_FILE), read_json(runs / MEMORY_FILE)
-    if not (compared.by or ablated.by or speed or memory):
+    kept = Kept(*(read_json(runs / file) for file in (SPEED_FILE, MEMORY_FILE, FRAMES_FILE)))
+    if not (compared.by or ablated.by or kept.speed or kept.memory or kept.frames):
         raise RunError(
             f"{comparison}, {ablation} and {runs} hold no results: expected what `tidefield compare`, `tidefield "
             "ablate` and the benchmarks leave there; run them"
         )
     with completed_file(out, overwrite=True) as partial:
-        partial.write_text(page(compared, ablated, speed, memory), encoding="utf-8")
+        partial.write_text(page(compared, ablated, kept), encoding="utf-8")
 
 
 def _scenes(folder: Path) -> tuple[str, ...]:
@@ -50,18 +51,18 @@ def _scenes(folder: Path) -> tuple[str, ...]:
     return (*(scene for scene in SCENES if scene in there), *sorted(there - set(SCENES)))
 
 
-def page(compared: Results, ablated: Results, speed: Mapping[str, Any] | None, memory: Mapping[str, Any] | None) -> str:
+def page(compared: Results, ablated: Results, kept: Kept) -> str:
     """The whole page."""
     return (
         "\n\n".join(
             [
                 "# Results",
                 '`make bench ARGS="table --comparison COMPARISON --ablation ABLATION --runs RUNS"` wrote this page '
-                "from what `tidefield compare`, `tidefield ablate`, `speed` and `memory` left in these folders; "
-                "nothing is typed by hand.",
-                "\n".join(f"- {line}" for line in _circumstances(compared, ablated, speed, memory)),
+                "from what `tidefield compare`, `tidefield ablate`, `speed`, `frames` and `memory` left in these "
+                "folders; nothing is typed by hand.",
+                "\n".join(f"- {line}" for line in _circumstances(compared, ablated, kept)),
                 "## What was aimed at",
-                _bar_table(judge(compared, speed, memory)).markdown(),
+                _bar_table(judge(compared, kept)).markdown(),
                 "## Methods on the same photographs, split, resolution, machine and budget",
                 "Means over the held-out photographs.",
                 *(table.markdown() for table in (all_tables(_narrowed(compared)) if compared.by else ())),
@@ -70,11 +71,13 @@ def page(compared: Results, ablated: Results, speed: Mapping[str, Any] | None, m
                 "## What each part brings",
                 *([ablation_table(ablated).markdown()] if ablated.by else ["Not measured."]),
                 "## Speed",
-                *_speed(speed),
+                *_speed(kept.speed),
+                "## Views of a scene that nothing was trained on",
+                *([table.markdown() for table in frame_tables(kept.frames)] if kept.frames else ["Not measured."]),
                 "## A large frame",
-                _frame(memory),
+                _frame(kept.memory),
                 "## Commands",
-                "\n".join(f"    {command}" for command in _commands(compared, ablated, speed, memory)),
+                "\n".join(f"    {command}" for command in _commands(compared, ablated, kept)),
             ]
         )
         + "\n"
@@ -87,9 +90,7 @@ def _narrowed(results: Results) -> Results:
     return Results(results.scenes, there, results.by)
 
 
-def _records(
-    compared: Results, ablated: Results, speed: Mapping[str, Any] | None, memory: Mapping[str, Any] | None
-) -> list[Mapping[str, Any]]:
+def _records(compared: Results, ablated: Results, kept: Kept) -> list[Mapping[str, Any]]:
     """Everything with a date, a machine and a command."""
     processes = [
         result.process[step]
@@ -98,11 +99,11 @@ def _records(
         for step in ("train", "evaluate")
         if step in result.process
     ]
-    return [record for record in (*processes, speed, memory) if record]
+    return [record for record in (*processes, *vars(kept).values()) if record]
 
 
-def _circumstances(compared: Results, ablated: Results, *others: Mapping[str, Any] | None) -> list[str]:
-    records = _records(compared, ablated, *others)
+def _circumstances(compared: Results, ablated: Results, kept: Kept) -> list[str]:
+    records = _records(compared, ablated, kept)
     machines, dates = [], sorted({record["date"] for record in records})
     for machine in (record["machine"] for record in records):
         text = (
@@ -177,6 +178,33 @@ def _micro(seconds: float | None) -> float | None:
     return None if seconds is None else seconds * 1e6
 
 
+def frame_tables(frames: Mapping[str, Any]) -> list[Table]:
+    """Seconds of views, and how steady they are."""
+    (width, height), first = frames["size_px"], frames["first"]
+    rows = [
+        ("the first, from the scene on disk and with the program's start", f"{first['seconds']:.1f}"),
+        ("every further one along a flight, median", f"{frames['further_seconds']:.2f}"),
+        *(
+            (f"one view again and again, of {count} photographs", f"{seconds:.2f}")
+            for count, seconds in frames["by_photographs"].items()
+        ),
+    ]
+    steady = [
+        (name, f"{found['mean_levels']:.2f}", f"{found['greatest_levels']:.2f}")
+        for name, found in frames["steadiness"].items()
+    ]
+    title = f"Zero-shot views of {width} x {height} px, {frames['preset']}, {frames['device']}"
+    return [
+        Table(title, ["view", "seconds"], rows),
+        Table(
+            "Neighbours that fade before they are left out: how much consecutive views of a flight differ where they "
+            "show the same, levels of 255",
+            ["neighbours", "mean", "the two that differ most"],
+            steady,
+        ),
+    ]
+
+
 def _frame(memory: Mapping[str, Any] | None) -> str:
     if memory is None:
         return "Not measured."
@@ -188,11 +216,9 @@ def _frame(memory: Mapping[str, Any] | None) -> str:
     )
 
 
-def _commands(
-    compared: Results, ablated: Results, speed: Mapping[str, Any] | None, memory: Mapping[str, Any] | None
-) -> list[str]:
+def _commands(compared: Results, ablated: Results, kept: Kept) -> list[str]:
     """Each once."""
-    found = [record["command"] for record in (speed, memory) if record]
+    found = [record["command"] for record in vars(kept).values() if record]
     for results in (compared, ablated):
         for result in results.by.values():
             for step in ("train", "evaluate"):

@@ -1,0 +1,98 @@
+"""The card that lies beside shipped weights: what they are, from the file itself and from what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.bars import UNSEEN
+from tidefield.compare.results import Results, read_results
+from tidefield.compare.run import RUNS, UNTRAINED, ZERO_SHOT
+from tidefield.compare.table import Table, shown
+from tidefield.compare.tables import METRICS, lpips_weights
+from tidefield.errors import RunError
+from tidefield.files import completed_file
+from tidefield.train.weights import about, sha256
+
+METHODS = (ZERO_SHOT, "nerfacto", *UNTRAINED)
+LICENCES = {
+    "brighton_beach": "BSD-2-Clause, (c) 2017 Piero Toffanin",
+    "turin_lot": "MIT, from the repository vinstray/i-sfm",
+}
+"""Of the photographs of real scenes that may be learned from."""
+
+
+def write_card(weights: Path, comparison: Path) -> Path:
+    """Write PRESET.md beside the weights.
+
+    Args:
+        weights: of `tidefield pretrain`.
+        comparison: of `tidefield compare` with the method zero-shot.
+
+    Returns:
+        The card.
+
+    Raises:
+        RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
+    """
+    folder = comparison / RUNS
+    scenes = sorted(path.parent.name for path in folder.glob(f"*/{ZERO_SHOT}"))
+    results = read_results(comparison, scenes, METHODS)
+    if not any(method == ZERO_SHOT for _, method in results.by):
+        raise RunError(f"{comparison} holds no zero-shot results: expected some; run `tidefield compare` with them")
+    out = weights.with_suffix(".md")
+    with completed_file(out, overwrite=True) as partial:
+        partial.write_text(card(weights, results), encoding="utf-8")
+    return out
+
+
+def card(weights: Path, results: Results) -> str:
+    """The whole card."""
+    told = about(weights)
+    unknown = [name for name in told["real"] if name not in LICENCES]
+    if unknown:
+        raise RunError(f"{weights} learned from {', '.join(unknown)}: expected scenes whose licences are known")
+    real = "".join(f"\n- {name}: the training photographs ({LICENCES[name]})" for name in told["real"])
+    machine, preset = told["machine"], told["config"]["preset"]
+    named = f" --real {' '.join(told['real'])}" if told["real"] else ""
+    parts = [
+        f"# Weights of the preset {preset}",
+        f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, SHA-256 `{sha256(weights)}`. "
+        "`python -m benchmarks card` wrote this card from the file and from what `tidefield compare` measured.",
+        "## What for",
+        "Views of scenes that nothing was trained on (`--zero-shot`), and a start for `tidefield train`. For drone "
+        "photographs of tidal flats that overlap well and have sparse points. Where few photographs see a place, where "
+        "things move, and far from where photographs were taken, views are guesses: do not measure in them.",
+        "## What they were trained on",
+        "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
+        f"moving water and wrong poses; a quarter of the steps without sparse points{real}",
+        f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
+        f"cores, {told['date']}, Tidefield {told['version']}:",
+        f"    tidefield pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
+        "PSNR in dB on scenes that nothing is learned from (of the real ones, their held-out photographs), two small "
+        "views of each:",
+        _curve(told["validation"]).markdown(),
+        "## What they achieve",
+        "Zero-shot, means over the held-out photographs; `docs/results.md` says how the peers were trained. Nothing of "
+        f"{' and '.join(UNSEEN)} was ever learned from.",
+        *(_quality(results, *metric).markdown() for metric in METRICS[:4]),
+        *lpips_weights(results),
+        "## Licence",
+        "Apache-2.0, as Tidefield itself.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _curve(points: list[Mapping[str, Any]]) -> Table:
+    kinds = list(points[0]["psnr"]) if points else []
+    rows = [(f"{point['step']:,}", *(f"{point['psnr'][kind]:.2f}" for kind in kinds)) for point in points]
+    return Table("", ["step", *kinds], rows)
+
+
+def _quality(results: Results, metric: str, title: str, style: str, _: bool) -> Table:
+    rows = [
+        (scene, *(shown(results.metric(scene, method, metric), style) for method in METHODS))
+        for scene in results.scenes
+    ]
+    return Table(title, ["scene", *METHODS], rows)

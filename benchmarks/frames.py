@@ -1,0 +1,198 @@
+"""Frames of a scene that nothing was trained on: how soon the first, how fast the others, how steady they are.
+
+What is measured:
+- The first: a `tidefield render` of its own, from the scene on disk with nothing decoded before, to the written file.
+- The others: one after the other along a flight, in one process.
+- The same view of a survey that lies there once, and among more and more copies of itself.
+- How much consecutive frames of a flight differ where they show the same: the second one's colours are read where the
+  first one's depths say that its pixels lie, and pixels at which the two frames' depths disagree are left out.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
+from tidefield.config import PRESETS
+from tidefield.data.batches import choose_neighbours
+from tidefield.data.images import Photographs
+from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
+from tidefield.data.surface import surface_points
+from tidefield.geometry.cameras import Cameras
+from tidefield.methods import zero_shot
+from tidefield.model.rendering import Render, Rendering
+from tidefield.products.trajectory import make_trajectory
+from tidefield.train.weights import shipped
+
+FRAMES_FILE = "frames.json"
+SIZE_PX = (800, 600)
+FURTHER = 5
+"""Frames after the first whose median time is told."""
+COUNTS = (200, 2000)
+"""Photographs among which the survey's own are looked at again."""
+FLIGHT_FRAMES = 240
+"""Of a flight past all photographs, ten seconds long."""
+STEADY_FRAMES, STEADY_WIDTH = 48, 320
+"""Of the flight's middle, whose steadiness is judged."""
+SAME_DEPTH = 0.02
+"""Share of the depth by which two frames may disagree about a point that both show."""
+
+
+def measure_frames(
+    folder: Path, runs: Path, preset: Literal["swift", "paper"], weights: Path, device: str, run: Runner = run_measured
+) -> dict[str, Any]:
+    """Everything; kept in RUNS/frames.json and returned.
+
+    Args:
+        folder: of the scene.
+        runs: where the result goes.
+        preset, weights: of the network.
+        device: where to render.
+        run: runs a command.
+    """
+    scene = load_scene(folder)
+    name = scene.names[(scene.test or scene.train)[0]]
+    first = _first(folder, name, preset, weights, device, runs, run)
+    where = torch.device(device)
+
+    def view_of(other: Scene) -> Render:
+        return zero_shot(PRESETS[preset], weights, other, where)[0]
+
+    width, height = SIZE_PX
+    flight = make_trajectory("cameras", scene, frames=FLIGHT_FRAMES, width=width, height=height).cameras
+    middle = len(flight) // 2
+    shown = flight[middle : middle + 1]
+    record = {
+        "preset": preset,
+        "weights": weights == shipped(preset),
+        "device": device,
+        "size_px": list(SIZE_PX),
+        "photographs": len(scene.names),
+        "first": first,
+        "further_seconds": _further(view_of(scene), flight[middle : middle + FURTHER + 1]),
+        "by_photographs": {
+            str(count): _again(view_of(among_copies(scene, count)), shown) for count in (len(scene.names), *COUNTS)
+        },
+        "steadiness": _steadiness(view_of, scene),
+        "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset} --device {device}",
+        **stamp(),
+    }
+    write_json(runs / FRAMES_FILE, record)
+    return record
+
+
+def _first(folder: Path, name: str, preset: str, weights: Path, device: str, runs: Path, run: Runner) -> dict[str, Any]:
+    runs.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=runs, prefix=".frames-") as work:
+        words = ["--zero-shot", "--preset", preset, "--weights", weights, "--camera", name, "--device", device]
+        size = ["--width", SIZE_PX[0], "--height", SIZE_PX[1]]
+        command = tidefield("render", folder, Path(work) / "frame.png", *words, *size, "--quiet")
+        return asdict(run(command, {"XDG_CACHE_HOME": str(Path(work) / "cache")}))
+
+
+def _further(view: Render, cameras: Cameras) -> float:
+    view(cameras[0])
+    return statistics.median(_seconds(view, cameras[k]) for k in range(1, len(cameras)))
+
+
+def _again(view: Render, camera: Cameras) -> float:
+    """Seconds of a frame whose photographs have been encoded."""
+    view(camera)
+    return statistics.median(_seconds(view, camera) for _ in range(3))
+
+
+def _seconds(view: Render, camera: Cameras) -> float:
+    start = time.perf_counter()
+    view(camera)
+    return time.perf_counter() - start
+
+
+def among_copies(scene: Scene, count: int) -> Scene:
+    """The scene's survey in a grid of copies of itself, side by side, that has `count` photographs."""
+    own, points = len(scene.names), scene.points
+    copies = -(-count // own)
+    side = 1
+    while side * side < copies:
+        side += 1
+    spread = scene.cameras.position_world - scene.cameras.position_world.mean(0)
+    across = torch.linalg.svd(spread, full_matrices=False).Vh[:2]  # the plane that was flown in
+    steps = torch.tensor([[k % side, k // side] for k in range(copies)]).float()
+    shifts = 6 * spread.norm(dim=1).max() * steps @ across
+    which = torch.arange(count)
+    pose = scene.cameras.T_world_camera[which % own].clone()
+    pose[:, :, 3] += shifts[which // own]
+    if points is not None:
+        total = len(points.xyz_world)
+        camera = torch.cat([points.camera_index + k * own for k in range(copies)])
+        kept = camera < count
+        points = replace(
+            points,
+            xyz_world=(points.xyz_world + shifts[:, None]).reshape(-1, 3),
+            error_px=points.error_px.repeat(copies),
+            point_index=torch.cat([points.point_index + k * total for k in range(copies)])[kept],
+            camera_index=camera[kept],
+            uv_px=points.uv_px.repeat(copies, 1)[kept],
+        )
+    return replace(
+        scene,
+        names=tuple(f"{k // own}/{scene.names[k % own]}" for k in range(count)),
+        cameras=replace(scene.cameras[which % own], T_world_camera=pose),
+        photographs=Photographs(tuple(scene.photographs[k % own] for k in range(count))),
+        points=points,
+        train=tuple(k * own + i for k in range(copies) for i in scene.train if k * own + i < count),
+        test=(),
+    )
+
+
+def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, dict[str, float]]:
+    own = scene.cameras[scene.train[0]]
+    height = max(16, round(STEADY_WIDTH * own.height / own.width))
+    flight = make_trajectory("cameras", scene, frames=FLIGHT_FRAMES, width=STEADY_WIDTH, height=height).cameras
+    first = (len(flight) - STEADY_FRAMES) // 2
+    cameras = [flight[k] for k in range(first, first + STEADY_FRAMES)]
+    view = view_of(scene)
+    result = {"with fading": _summary([view(camera) for camera in cameras], cameras)}
+    with _without_fading():
+        result["without"] = _summary([view(camera) for camera in cameras], cameras)
+    return result
+
+
+def _summary(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> dict[str, float]:
+    found = list(changes(frames, cameras))
+    return {"mean_levels": statistics.mean(found), "greatest_levels": max(found)}
+
+
+def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator[float]:
+    """Mean absolute difference, in levels of 255, of what each two consecutive frames both show."""
+    for this, other, camera, next_camera in zip(frames, frames[1:], cameras, cameras[1:], strict=False):
+        uv, z = next_camera.project(surface_points(camera, this.depth))
+        grid = (uv / next_camera.size_px[:, None] * 2 - 1)[:, :, None]
+        maps = torch.cat([other.colour, other.depth[..., None]], -1).permute(2, 0, 1)[None]
+        found = F.grid_sample(maps, grid, align_corners=False, padding_mode="border")[0, :, :, 0]
+        same = (grid.abs() < 1).all(-1)[0, :, 0] & ((found[3] - z[0]).abs() < SAME_DEPTH * z[0])
+        yield 255 * (found[:3].T - this.colour.reshape(-1, 3)).abs().mean(-1)[same].mean().item()
+
+
+@contextmanager
+def _without_fading() -> Iterator[None]:
+    """Neighbours count in full until they are left out."""
+
+    def full(*words: Any) -> tuple[Tensor, Tensor]:
+        neighbours, presence = choose_neighbours(*words)
+        return neighbours, torch.ones_like(presence)
+
+    with patch("tidefield.model.renderer.choose_neighbours", full):
+        yield
