@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tidefield import cli, commands, meter
+from tidefield import cli, meter
+from tidefield.commands import demonstration
 from tidefield.data import synthetic
 from tidefield.data.synthetic import make_survey, write_survey
 
@@ -147,7 +148,7 @@ def test_the_demonstration_makes_all_that_it_names(
         return make_survey(category, seed, views, width=width // 10, supersample=1)
 
     monkeypatch.setattr(synthetic, "make_survey", smaller)
-    monkeypatch.setattr(commands, "DEMO_FRAMES", 4)
+    monkeypatch.setattr(demonstration, "FRAMES", 4)
     out = tmp_path / "demo"
     call("demo", out, "--minutes", 0.01, "--device", "cpu")
     named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("What was made:")[1].strip().splitlines()]

@@ -45,6 +45,7 @@ def test_every_command_is_shown() -> None:
         "prepare",
         "import",
         "train",
+        "pretrain",
         "evaluate",
         "render",
         "compare",

@@ -1,4 +1,4 @@
-"""The command line: `tidefield prepare | import | train | evaluate | render | compare | ablate | baselines | demo`.
+"""The command line: `tidefield COMMAND`, as `tidefield --help` lists them.
 
 Only what is needed to answer --help is imported here; torch and the rest are imported once a command is known.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from tidefield.errors import TidefieldError
-from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import, Prepare, Render, Talk, Train
+from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import, Prepare, Pretrain, Render, Talk, Train
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,6 +42,7 @@ def _run() -> None:
             "prepare": Prepare,
             "import": Import,
             "train": Train,
+            "pretrain": Pretrain,
             "evaluate": Evaluate,
             "render": Render,
             "compare": Compare,
@@ -59,6 +60,7 @@ def _run() -> None:
         Prepare: commands.prepare,
         Import: commands.import_project,
         Train: commands.train,
+        Pretrain: commands.pretrain,
         Evaluate: commands.evaluate,
         Render: commands.render,
         Compare: commands.compare,

@@ -13,18 +13,35 @@ from tidefield.baselines.nerf import NerfLearner
 from tidefield.baselines.nerfstudio import driver
 from tidefield.config import Config, NerfConfig, NerfstudioConfig
 from tidefield.data.scene import Scene
+from tidefield.model.network import Network
+from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render
 from tidefield.train.checkpoint import Progress, Run, load_network
 from tidefield.train.loop import Learner, Trainer
+from tidefield.train.weights import read_weights, sha256
 
 FLOORS = {"plane-sweep": plane_sweep.make, "sparse-depth": sparse_depth.make, "nearest": nearest.make}
 
 
-def make_learner(config: Config | NerfConfig, scene: Scene, seed: int, device: torch.device) -> Learner:
-    """What trains a method that lives in this process."""
+def make_learner(
+    config: Config | NerfConfig, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
+) -> Learner:
+    """What trains a method that lives in this process; our network may begin with trained weights."""
     if isinstance(config, NerfConfig):
         return NerfLearner(config, scene, seed, device)
-    return Trainer(config, scene, seed, device)
+    return Trainer(config, scene, seed, device, weights)
+
+
+def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device) -> tuple[Render, str]:
+    """A preset with trained weights on a scene that it was not trained on, and the weights' SHA-256.
+
+    Raises:
+        RunError: the weights are not there, or not the preset's.
+    """
+    network = Network(config.network).to(device)
+    read_weights(weights, network)
+    network.eval()
+    return Renderer(network, scene, config, device), sha256(weights)
 
 
 @contextmanager

@@ -14,7 +14,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 Preset = Literal["swift", "paper"]
 Floor = Literal["plane-sweep", "sparse-depth", "nearest"]
 Trained = Literal["tidefield", "nerf", "nerfacto", "splatfacto"]
-Compared = Literal["tidefield", "paper", "nerf", "nerfacto", "splatfacto", "plane-sweep", "sparse-depth", "nearest"]
+Compared = Literal[
+    "tidefield", "zero-shot", "paper", "nerf", "nerfacto", "splatfacto", "plane-sweep", "sparse-depth", "nearest"
+]
 Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Go on without photographs that the scene names but does not have.")]
@@ -28,6 +30,28 @@ class Talk:
     """Say more."""
     quiet: Annotated[bool, arg(aliases=["-q"])] = False
     """Say nothing but errors."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """How long to train."""
+
+    minutes: float | None = None
+    """So long; 10 if neither this nor --steps is given."""
+    steps: int | None = None
+    """So many steps instead."""
+
+
+@dataclass(frozen=True)
+class ZeroShot:
+    """A scene as it is, with weights that were trained elsewhere, instead of a run."""
+
+    zero_shot: bool = False
+    """Do so."""
+    preset: Preset = "swift"
+    """The network."""
+    weights: Path | None = None
+    """Its weights, of `tidefield pretrain`; those that came with Tidefield if not given."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +72,16 @@ class Train:
     method: Trained = "tidefield"
     """Train a peer instead: classical NeRF, or nerfstudio's nerfacto or splatfacto, which `tidefield baselines install
     nerfacto` installs."""
-    minutes: float | None = None
-    """Train for so long; 10 if neither this nor --steps is given."""
-    steps: int | None = None
-    """Train for so many steps instead."""
+    length: OmitArgPrefixes[Length] = Length()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
     device: Device = "auto"
     seed: int = 0
     """Of the weights and of the order of the photographs."""
+    from_scratch: bool = False
+    """Begin with random weights instead of those that came with Tidefield."""
+    weights: Path | None = None
+    """Begin with these weights, of `tidefield pretrain`."""
     field: bool = False
     """Add the per-scene field (a hash grid) to what the neighbours say."""
     resume: bool = False
@@ -71,6 +96,28 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Pretrain:
+    """Train across scenes, for weights that work where nothing was trained: procedural tidal flats, and real scenes.
+
+    Writes OUT/weights.safetensors. Ctrl-C saves before it stops; --resume goes on from there. Several GPUs or machines
+    train together under torchrun: `torchrun --nproc-per-node 4 -m tidefield.cli pretrain OUT --steps 100000`.
+    """
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder for the result; must be new, unless --resume is given."""
+    real: tuple[Path, ...] = ()
+    """Scenes to learn from, too; of them only the training photographs."""
+    preset: Preset = "swift"
+    length: OmitArgPrefixes[Length] = Length()
+    seed: int = 0
+    """Of the weights, the scenes and their order."""
+    device: Device = "auto"
+    resume: bool = False
+    """Go on with what is in the folder."""
+    talk: OmitArgPrefixes[Talk] = Talk()
+
+
+@dataclass(frozen=True)
 class Evaluate:
     """Compare renderings of the held-out photographs with the photographs.
 
@@ -78,14 +125,15 @@ class Evaluate:
     sparse-depth` into a folder of its own, for methods that need no training.
     """
 
-    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
-    """A run, or with --method a scene."""
+    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A run, or with --method or --zero-shot a scene."""
     out: Annotated[Positional[Path | None], arg(metavar="[OUT]")] = None
     """Where to write; the run itself if not given."""
     method: Floor | None = None
     """Evaluate this method on a scene instead of a run."""
+    zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     width: int | None = None
-    """Width of the photographs in pixels, with --method; a run knows its own."""
+    """Width of the photographs in pixels, with --method or --zero-shot; a run knows its own."""
     device: Device = "auto"
     download_lpips: bool = False
     """Fetch the weights that LPIPS needs (AlexNet 233 MB, VGG 528 MB) if they are not there."""
@@ -99,14 +147,15 @@ class Evaluate:
 class Render:
     """Render a video along a path (OUT.mp4), or the view of one photograph's camera with its depth (OUT.png)."""
 
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """A trained run."""
+    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A trained run, or with --zero-shot a scene."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """The file to write; .mp4 for a video, .png with --camera."""
     path: str = "orbit"
     """orbit, cameras (a flight among them), strip (straight down) or a camera-path JSON of nerfstudio's viewer."""
     camera: str | None = None
     """Name of a photograph whose camera is rendered instead of a path."""
+    zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     frames: int = 240
     """Frames of the video; 24 are a second."""
     width: int | None = None
@@ -181,14 +230,14 @@ class Compare:
     """Scenes; with --protocol tidalflats in addition to its own, with --protocol mipnerf360 the folder of the data
     set."""
     methods: tuple[Compared, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
-    """Which, in the order of the tables. tidefield and paper are presets of ours; nerf is classical NeRF; nerfacto and
+    """Which, in the order of the tables. tidefield and paper are presets of ours, zero-shot is the former without any
+    training on the scene; nerf is classical NeRF; nerfacto and
     splatfacto are nerfstudio's; the others need no training."""
-    minutes: float | None = None
-    """Train each for so long; 10 if neither this nor --steps is given."""
-    steps: int | None = None
-    """Train each for so many steps instead."""
+    length: OmitArgPrefixes[Length] = Length()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
+    from_scratch: bool = False
+    """Begin our presets with random weights."""
     protocol: Literal["mipnerf360", "tidalflats"] | None = None
     """Scenes with a name: the seven public ones of mip-NeRF 360, or five synthetic tidal flats."""
     out: Path = Path("comparison")
@@ -210,10 +259,7 @@ class Ablate:
     """Which; all of them if not given."""
     preset: Preset = "swift"
     """What they are variants of."""
-    minutes: float | None = None
-    """Train each for so long; 10 if neither this nor --steps is given."""
-    steps: int | None = None
-    """Train each for so many steps instead."""
+    length: OmitArgPrefixes[Length] = Length()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
     out: Path = Path("ablation")

@@ -19,7 +19,8 @@ UNTRAINED = ("plane-sweep", "sparse-depth", "nearest")
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and once more for the noise of an ablation."""
 PEERS = ("nerfacto", "nerf", "splatfacto")
-METHODS = (WHOLE, "paper", *PEERS, *UNTRAINED)
+ZERO_SHOT = "zero-shot"
+METHODS = (WHOLE, ZERO_SHOT, "paper", *PEERS, *UNTRAINED)
 """What can be compared; in an ablation, the variants of our network, too."""
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
 
@@ -34,6 +35,7 @@ class Settings:
         device: where everything is computed.
         seed: of weights and batches.
         preset: that "tidefield" stands for, and that variants change.
+        from_scratch: whether our presets begin with random weights.
     """
 
     minutes: float | None
@@ -42,14 +44,16 @@ class Settings:
     device: str
     seed: int
     preset: str = "swift"
+    from_scratch: bool = False
 
 
 def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict[str, list[str]]:
     """The tidefield commands of a method on a scene, by name, in their order."""
     device = ["--device", settings.device]
     width = [] if settings.width is None else ["--width", str(settings.width)]
-    if method in UNTRAINED:
-        return {"evaluate": ["evaluate", str(scene), str(folder), "--method", method, *width, *device]}
+    if method in (ZERO_SHOT, *UNTRAINED):
+        kind = ["--zero-shot", "--preset", settings.preset] if method == ZERO_SHOT else ["--method", method]
+        return {"evaluate": ["evaluate", str(scene), str(folder), *kind, *width, *device]}
     seed = ["--seed", str(settings.seed + (method == OTHER_SEED))]
     if settings.minutes is not None:
         budget = ["--minutes", f"{settings.minutes:g}", "--curve"]
@@ -64,10 +68,11 @@ def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict
 def _kind(method: str, settings: Settings) -> list[str]:
     if method in PEERS:
         return ["--method", method]
+    begin = ["--from-scratch"] if settings.from_scratch else []
     if method == "paper":
-        return ["--preset", "paper"]
+        return ["--preset", "paper", *begin]
     variant = [] if method in (WHOLE, OTHER_SEED) else ["--variant", method]
-    return ["--preset", settings.preset, *variant]
+    return ["--preset", settings.preset, *variant, *begin]
 
 
 def compare(
@@ -106,10 +111,12 @@ def compare(
 
 
 def _record(scene: Path, method: str, settings: Settings) -> dict[str, object]:
-    """What a result depends on; of what is not trained, no budget."""
+    """What a result depends on; of what is not trained, no budget, and of others' methods, not how ours begin."""
     kept = asdict(settings)
-    if method in UNTRAINED:
+    if method in (ZERO_SHOT, *UNTRAINED):
         kept |= {"minutes": None, "steps": None, "seed": None}
+    if method in (ZERO_SHOT, *PEERS, *UNTRAINED):
+        del kept["from_scratch"]
     return {**kept, "scene": str(scene.resolve())}
 
 

@@ -119,7 +119,7 @@ def cost_table(results: Results) -> Table:
         for method in results.methods
         if (scene, method) in results.by
     ]
-    return Table("What it took", columns, rows)
+    return Table("What it took; evaluating with the networks of LPIPS, where they are there", columns, rows)
 
 
 def _cost(result: Result) -> Sequence[str]:

@@ -26,7 +26,7 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     """
     tables, made = all_tables(results), stamp()
     files = [
-        _write(out / "tables.md", _page(tables, _remarks(results), settings, made)),
+        _write(out / "tables.md", _page("Comparison", tables, _remarks(results), settings, made)),
         _write(out / "tables.tex", "\n\n".join(table.latex() for table in tables) + "\n"),
         _write(out / "tables.csv", "\n".join(f"{table.title}\n{table.csv()}" for table in tables)),
     ]
@@ -58,7 +58,7 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     table, made = ablation_table(results), stamp()
     write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
     return [
-        _write(out / "ablation.md", _page([table], _remarks(results), settings, made)),
+        _write(out / "ablation.md", _page("Ablation", [table], _remarks(results), settings, made)),
         _write(out / "ablation.tex", table.latex() + "\n"),
         _write(out / "ablation.csv", table.csv()),
         out / "ablation.json",
@@ -69,12 +69,12 @@ def _remarks(results: Results) -> list[str]:
     return [*lpips_weights(results), *missing_metrics(results)]
 
 
-def _page(tables: list[Table], remarks: list[str], settings: Settings, made: Mapping[str, Any]) -> str:
+def _page(title: str, tables: list[Table], remarks: list[str], settings: Settings, made: Mapping[str, Any]) -> str:
     machine = made["machine"]
     budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
     lines = [
-        "# Comparison",
-        "Means over the held-out photographs. Every method had the same photographs, split, resolution and machine, "
+        f"# {title}",
+        "Means over the held-out photographs. Each had the same photographs, split, resolution and machine, "
         f"and {budget} of training, one after another.",
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
         f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "

@@ -107,7 +107,8 @@ def _unfit(prepared: Prepared) -> list[report.LeftOut]:
 
 def _unplaced(prepared: Prepared, scene: Path) -> list[report.LeftOut]:
     """Photographs that are not in the model, with the likely reason: how well they match any other."""
-    used = [p for p in prepared.survey.photographs if p.name in prepared.used and p.name not in set(prepared.models[0])]
+    unplaced = prepared.used - set(prepared.models[0])
+    used = [photograph for photograph in prepared.survey.photographs if photograph.name in unplaced]
     if not used:
         return []
     elsewhere = {name: model for model in prepared.models[1:] for name in model}

@@ -97,7 +97,8 @@ def prepare(survey: Survey, scene: Path, wishes: Wishes, device: pycolmap.Device
     making.matches(making.pairs(good.photographs))
     models, lens = making.poses()
     located = making.georeference(good)
-    registered = [photograph for photograph in good.photographs if photograph.name in set(models[0])]
+    placed = set(models[0])
+    registered = [photograph for photograph in good.photographs if photograph.name in placed]
     evening = making.images(registered, located)
     used = frozenset(photograph.name for photograph in good.photographs)
     return Prepared(survey, verdicts, used, models, lens, located, evening, making.stages.seconds)

@@ -34,6 +34,7 @@ class Run:
         width: of its photographs, pixels; None for their own.
         seed: of weights and batches.
         config: network and training.
+        weights: SHA-256 of the trained weights that it began with; None from scratch.
         version: of the program that began it.
     """
 
@@ -41,6 +42,7 @@ class Run:
     width: int | None
     seed: int
     config: AnyConfig
+    weights: str | None = None
     version: str = __version__
 
 
@@ -60,6 +62,7 @@ def write_run(folder: Path, run: Run) -> None:
         "seed": run.seed,
         "version": run.version,
         "config": config_to_json(run.config),
+        "weights": run.weights,
     }
     with completed_file(folder / RUN_FILE, overwrite=True) as partial:
         partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
@@ -76,10 +79,11 @@ def read_run(folder: Path) -> Run:
         raise RunError(f"{path} has {path.stat().st_size} bytes: expected a small file that `tidefield train` wrote")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        keys = {"scene", "width", "seed", "version", "config"}
+        keys = {"scene", "width", "seed", "version", "config", "weights"}
         if not isinstance(data, dict) or set(data) != keys:
             raise ValueError(f"expected the keys {sorted(keys)}")
-        return Run(Path(data["scene"]), data["width"], data["seed"], config_from_json(data["config"]), data["version"])
+        config = config_from_json(data["config"])
+        return Run(Path(data["scene"]), data["width"], data["seed"], config, data["weights"], data["version"])
     except (ValueError, TypeError) as error:
         raise RunError(f"{path} cannot be read as a run ({error}): expected what `tidefield train` wrote") from error
 

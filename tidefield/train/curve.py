@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import UInt8
@@ -16,6 +17,9 @@ from tidefield.data.scene import Scene
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering, to_8_bit
+
+if TYPE_CHECKING:
+    from tidefield.train.loop import Learner
 
 SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Of the budget, when the views are rendered."""
@@ -47,6 +51,18 @@ class Curve:
         ]
         values = [-10 * torch.log10(error.clamp(min=1e-10)).item() for error in errors]
         self.points.append((seconds, sum(values) / len(values)))
+
+    def watch(self, folder: Path, used: float) -> Callable[[Learner, float], None]:
+        """Renders and writes when a share of `SHARES` is used, of those above the one that is used already."""
+        due = [share for share in SHARES if share > used]
+
+        def look(learner: Learner, share: float) -> None:
+            if due and share >= due[0]:
+                due[:] = [later for later in due if later > share]
+                self.add(learner.progress.seconds, learner.views(self.cameras))
+                self.write(folder)
+
+        return look
 
     def write(self, folder: Path) -> None:
         """RUN/curve.json."""

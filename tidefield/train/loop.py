@@ -18,19 +18,18 @@ import torch
 from tensorboardX import SummaryWriter
 from torch import nn
 
-from tidefield.config import Config
-from tidefield.data.batches import Surfaces, draw_batch
+from tidefield.config import Config, TrainConfig
+from tidefield.data.batches import Surfaces
 from tidefield.data.scene import Scene
-from tidefield.device import mixed_precision
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.network import Network, Tiles
-from tidefield.model.renderer import Renderer, start_intervals
+from tidefield.model.network import Network
+from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
-from tidefield.model.views import Encoded, Views
 from tidefield.train.checkpoint import Progress, load_training, save_checkpoint
-from tidefield.train.curve import SHARES, Curve
 from tidefield.train.display import Display
-from tidefield.train.losses import photometric, psnr, sparse_depth, structural
+from tidefield.train.losses import psnr
+from tidefield.train.objective import Objective
+from tidefield.train.weights import read_weights
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +52,10 @@ class Budget:
             return min(1.0, progress.step / max(self.steps, 1))
         assert self.minutes is not None, "a budget is steps or minutes"
         return min(1.0, progress.seconds / max(60 * self.minutes, 1e-9))
+
+
+Watch = Callable[["Learner", float], None]
+"""Is told of the learner and of the share of the budget that is used."""
 
 
 class Learner(ABC):
@@ -87,6 +90,11 @@ class Learner(ABC):
         self.cameras = scene.cameras.to(device)
 
     @property
+    def leads(self) -> bool:
+        """Whether it writes what has been learned: one of several processes that train together."""
+        return True
+
+    @property
     @abstractmethod
     def rays_per_step(self) -> int:
         """Rays that a step learns from."""
@@ -102,6 +110,18 @@ class Learner(ABC):
     @abstractmethod
     def renderer(self) -> Render:
         """What has been learned so far as a method; the network is in evaluation mode."""
+
+    def views(self, cameras: Sequence[Cameras]) -> list[Rendering]:
+        """What has been learned so far, seen by some cameras."""
+        self.network.eval()
+        render = self.renderer()
+        renderings = [render(camera) for camera in cameras]
+        self.network.train()
+        return renderings
+
+    def agreed(self, stop: bool) -> bool:
+        """Whether to stop: where several processes train together, when one of them is asked to."""
+        return stop
 
     def resume(self, folder: Path) -> None:
         self.progress = load_training(folder, self.network, self.optimizer, self.generator)
@@ -132,55 +152,50 @@ class Trainer(Learner):
 
     network: Network
 
-    def __init__(self, config: Config, scene: Scene, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, config: Config, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
+    ) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = Network(config.network).to(device)
+        if weights is not None:
+            read_weights(weights, network)
         if network.field is not None:
             network.field.cover(*scene_ball(scene))
-        field = [p for name, p in network.named_parameters() if name.startswith("field.")]
-        rest = [p for name, p in network.named_parameters() if not name.startswith("field.")]
-        train = config.train
-        groups = [{"params": rest, "peak": train.learning_rate}, {"params": field, "peak": train.field_learning_rate}]
         # A small epsilon: the field's gradients are tiny, and Adam's default would stop them.
-        super().__init__(network, groups, scene, seed, device, betas=(0.9, 0.99), eps=1e-12)
+        super().__init__(network, groups_of(network, config.train), scene, seed, device, (0.9, 0.99), 1e-12)
         self.config = config
         self.surfaces = Surfaces(scene)
+        self.objective = Objective(network, config.train)
 
     @property
     def rays_per_step(self) -> int:
         return self.config.train.tiles * self.config.train.tile_px**2
 
     def rate(self, share: float) -> float:
-        warm = min(1.0, (self.progress.step + 1) / self.config.train.warm_up)
-        return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
+        return cosine_rate(self.progress.step, share, self.config.train.warm_up)
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
-        network, config, device, side = self.network, self.config, self.device, self.config.train.tile_px
-        batch = draw_batch(self.scene, self.surfaces, config.train, config.network.views, self.generator).to(device)
-        views = None
-        if batch.images:
-            parts = []
-            with mixed_precision(device):
-                for images, corner in zip(batch.images, batch.image_corner_px, strict=True):
-                    parts.append(network.encode(images, corner))
-            views = Views(self.cameras[batch.neighbours.reshape(-1)], batch.which, Encoded.joined(parts))
-        tiles = Tiles(self.cameras[batch.targets], batch.corner_px, side)
-        priors = torch.stack([self.surfaces[i] for i in batch.targets.tolist()]).to(device)
-        opaque = self.scene.background_rgb is None
-        rendering = network(tiles, views, start_intervals(network, tiles, priors), opaque, self.generator)
-        loss, error = photometric(rendering, batch, network, side)
-        if config.train.structure_weight:
-            loss = loss + config.train.structure_weight * structural(rendering, batch, side)
-        if config.train.depth_weight:
-            loss = loss + config.train.depth_weight * sparse_depth(rendering, batch, network, side)
-        return loss, error
+        return self.objective(self.scene, self.surfaces, self.cameras, self.config.network.views, self.generator)
 
     def renderer(self) -> Render:
         return Renderer(self.network, self.scene, self.config, self.device)
 
 
-def train(trainer: Learner, folder: Path, budget: Budget, display: Display, curve: Curve | None = None) -> bool:
+def groups_of(network: Network, config: TrainConfig) -> list[dict[str, Any]]:
+    """The network's parameters as the optimiser takes them: the per-scene field has a rate of its own."""
+    field = [p for name, p in network.named_parameters() if name.startswith("field.")]
+    rest = [p for name, p in network.named_parameters() if not name.startswith("field.")]
+    return [{"params": rest, "peak": config.learning_rate}, {"params": field, "peak": config.field_learning_rate}]
+
+
+def cosine_rate(step: int, share: float, warm_up: int) -> float:
+    """Learning rate as a share of its peak: up in a line, down half a cosine."""
+    warm = min(1.0, (step + 1) / warm_up)
+    return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def train(trainer: Learner, folder: Path, budget: Budget, display: Display, watch: Watch | None = None) -> bool:
     """Train until the budget is used; save every minute and at the end, and on Ctrl-C or a polite kill.
 
     Args:
@@ -188,17 +203,16 @@ def train(trainer: Learner, folder: Path, budget: Budget, display: Display, curv
         folder: the run's.
         budget: steps or minutes.
         display: where progress is shown.
-        curve: what to render now and then, and to judge.
+        watch: called after every step; the clock stands still meanwhile.
 
     Returns:
         Whether the budget was used up; False after an interruption, from which `resume` goes on.
     """
     progress = trainer.progress
-    writer = SummaryWriter(str(folder / "tensorboard"))
+    writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=trainer.leads)
     saved = pictured = time.monotonic()
-    due = [share for share in SHARES if share > budget.share(progress)]
     with writer, display, _interruption() as interrupted:
-        while budget.share(progress) < 1 and not interrupted():
+        while budget.share(progress) < 1 and not trainer.agreed(interrupted()):
             error = trainer.step(budget)
             if not math.isfinite(error):
                 raise FloatingPointError(
@@ -209,37 +223,29 @@ def train(trainer: Learner, folder: Path, budget: Budget, display: Display, curv
             if progress.step % 20 == 0:
                 writer.add_scalar("train/psnr", psnr(mean), progress.step)
                 writer.add_scalar("train/mean_square_error", error, progress.step)
-            if curve is not None and due and budget.share(progress) >= due[0]:
-                due = [share for share in due if share > budget.share(progress)]
-                curve.add(progress.seconds, _views(trainer, curve.cameras))
-                curve.write(folder)
+            if watch is not None:
+                watch(trainer, budget.share(progress))
             now = time.monotonic()
+            if not trainer.leads:
+                continue
             if now - saved > SAVE_SECONDS:
                 trainer.save(folder)
                 saved = now
             if now - pictured > PICTURE_SECONDS:
                 _picture(trainer, writer)
                 pictured = time.monotonic()
-        trainer.save(folder)
-        if not interrupted():
+        if trainer.leads:
+            trainer.save(folder)
+        if trainer.leads and not interrupted():
             _picture(trainer, writer)
     return budget.share(progress) >= 1
-
-
-def _views(trainer: Learner, cameras: Sequence[Cameras]) -> list[Rendering]:
-    """What has been learned so far, seen by some cameras."""
-    trainer.network.eval()
-    render = trainer.renderer()
-    renderings = [render(camera) for camera in cameras]
-    trainer.network.train()
-    return renderings
 
 
 def _picture(trainer: Learner, writer: SummaryWriter) -> None:
     """A held-out view, if there is one, as TensorBoard picture."""
     scene = trainer.scene
     index = (scene.test or scene.train)[0]
-    (rendering,) = _views(trainer, [scene.cameras[index]])
+    (rendering,) = trainer.views([scene.cameras[index]])
     both = torch.cat([scene.photographs[index].float() / 255, rendering.colour], dim=1)
     writer.add_image("truth and rendering", both.numpy(), trainer.progress.step, dataformats="HWC")
 

@@ -31,6 +31,8 @@ NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
 KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
 """What `tidefield.device.keep_large_allocations` does for us, as glibc takes it from the environment."""
+END_SECONDS = 30
+"""For which a worker may take to end by itself."""
 
 
 def train(
@@ -177,9 +179,12 @@ def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None, "both are asked for"
                 pipe.close()
-            if kind == "render":
+            try:
+                # With its input at its end it stops, and stops the processes that nerfstudio has started.
+                process.wait(timeout=END_SECONDS if kind == "render" else None)
+            except subprocess.TimeoutExpired:
                 process.terminate()
-            process.wait()
+                process.wait()
 
 
 def _failed(folder: Path) -> RunError:

@@ -1,0 +1,222 @@
+"""Training across scenes: the stream, processes that learn together, and weights as a file."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import textured_wall as wall
+import torch
+import torch.multiprocessing as processes
+from rich.console import Console
+from safetensors import safe_open
+from test_training import SMALL
+
+from tidefield.commands import pretrain as pretrain_command
+from tidefield.config import SWIFT
+from tidefield.data.batches import Surfaces
+from tidefield.data.synthetic import Flight
+from tidefield.errors import RunError
+from tidefield.model.network import Network
+from tidefield.options import Length, Pretrain
+from tidefield.train import pretrain, stream
+from tidefield.train.loop import Budget, Trainer
+from tidefield.train.pretrain import Pretrainer, Validation
+from tidefield.train.stream import Clutter, Drawn, Recipe, Stream, recipe
+from tidefield.train.weights import read_weights, sha256, write_weights
+
+CPU = torch.device("cpu")
+QUIET = Console(quiet=True)
+
+
+class Walls:
+    """Stands in for the stream: a textured wall that others see differently."""
+
+    def __init__(self, rank: int = 0) -> None:
+        scene = wall.scene(wall.cameras(6 + rank))
+        self.drawn = Drawn(scene, Surfaces(scene), scene.cameras)
+        self.asked: list[int] = []
+
+    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+        self.asked.append(step)
+        return self.drawn
+
+
+def small_recipe(seed: int, number: int) -> Recipe:
+    misposed = (1,) if number == 1 else ()
+    return Recipe("ground_textures", 100 * seed + number, 4, 32, Flight(altitude_m=20.0), misposed)
+
+
+def test_recipes_repeat_and_differ() -> None:
+    assert recipe(3, 5) == recipe(3, 5)
+    every = [recipe(3, number) for number in range(100)]
+    assert len({one.seed for one in every}) == 100
+    clutter = [one for one in every if isinstance(one, Clutter)]
+    assert 20 < len(clutter) < 60
+    assert {(one.rig, one.white) for one in clutter} == {
+        ("front", False),
+        ("around", False),
+        ("around", True),
+        ("above", False),
+    }
+    made = [one for one in every if isinstance(one, Recipe)]
+    assert len({one.category for one in made}) == 5
+    assert {one.flight.exposure_spread > 0 for one in made} == {True, False}
+    assert {one.flight.water_motion > 0 for one in made} == {True, False}
+    assert {len(one.misposed) for one in made} == {0, 1}
+    assert all(index < one.views for one in made for index in one.misposed)
+
+
+def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr(stream, "AT_HAND", 2)
+    monkeypatch.setattr(stream, "STEPS_EACH", 4)
+    generator = torch.Generator().manual_seed(0)
+    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+        names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
+    assert set(names[0]) == {"7-000000", "7-000001"}
+    assert set(names[1]) == {"7-000001", "7-000002"}
+    assert not (tmp_path / "scenes" / "7-000000").exists()
+    assert not (tmp_path / "cache").exists(), "the user's cache would grow without end"
+    made = (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns
+    again = torch.Generator().manual_seed(0)
+    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+        for _ in range(8):
+            scenes.draw(0, again)  # the first is made once more, ...
+        assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
+    assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
+
+
+def test_scenes_come_with_and_without_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "recipe", lambda seed, number: Clutter("front", 5 * seed + number, 4, 32, False))
+    generator = torch.Generator().manual_seed(0)
+    with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
+        drawn = [scenes.draw(0, generator) for _ in range(60)]
+    with_points = [one for one in drawn if one.scene.points is not None]
+    blind = [one for one in drawn if one.scene.points is None]
+    assert 5 < len(blind) < 30
+    assert len({one.scene.root for one in with_points}) == stream.AT_HAND
+    one = blind[0]
+    same = next(other for other in with_points if other.scene.root == one.scene.root)
+    inner, outer = same.scene.cameras.near_far, one.scene.cameras.near_far
+    assert (outer[:, 0] < inner[:, 0]).all()
+    assert (outer[:, 1] > inner[:, 1]).all()
+    assert len(one.surfaces.observed(0).uv_px) == len(same.surfaces.observed(0).uv_px) > 0
+    assert one.surfaces[0][0].isnan().all(), "nothing is expected without points"
+
+
+def test_a_photograph_is_told_a_wrong_attitude(tmp_path: Path) -> None:
+    given = small_recipe(0, 1)
+    right = stream.make_survey(given.category, given.seed, given.views, given.width, given.flight)
+    wrong = stream.misposed(right, given)
+    between = right.cameras.T_world_camera[:, :, :3].mT @ wrong.cameras.T_world_camera[:, :, :3]
+    angle = torch.rad2deg(torch.acos(((between.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
+    torch.testing.assert_close(angle, torch.tensor([0.0, stream.MISPOSED_DEG, 0.0, 0.0]), atol=0.05, rtol=0)
+    torch.testing.assert_close(wrong.cameras.T_world_camera[:, :, 3], right.cameras.T_world_camera[:, :, 3])
+
+
+def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
+    seen = []
+    monkeypatch.setattr(
+        learner,
+        "objective",
+        lambda scene, surfaces, cameras, views, generator: seen.append(views) or (torch.zeros(()), torch.zeros(())),
+    )
+    for _ in range(200):
+        learner.loss()
+    assert set(seen) == set(pretrain.VIEWS)
+    assert seen.count(5) > seen.count(12)
+
+
+def learn_together(rank: int, folder: str) -> None:
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
+    os.environ["MASTER_PORT"] = Path(folder, "port").read_text()
+    torch.set_num_threads(1)
+    device = pretrain.join(CPU)
+    learner = Pretrainer(SMALL, Walls(rank), wall.scene(wall.cameras(4)), 0, device)
+    assert learner.leads == (rank == 0)
+    assert learner.agreed(rank == 1), "one that is asked to stop stops both"
+    for _ in range(3):
+        learner.step(Budget(steps=3))
+    torch.save(learner.network.state_dict(), Path(folder, f"{rank}.pt"))
+    torch.distributed.destroy_process_group()
+
+
+def test_two_processes_learn_the_same_from_different_scenes(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        (tmp_path / "port").write_text(str(free.getsockname()[1]))
+    processes.spawn(learn_together, (str(tmp_path),), nprocs=2)
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
+    alone = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
+    for _ in range(3):
+        alone.step(Budget(steps=3))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+    assert any(not torch.equal(value, first[name]) for name, value in alone.network.state_dict().items())
+
+
+def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretrain, "VALIDATION_STEPS", 2)
+    scene = wall.scene(wall.cameras(5), (1, 3))
+    learner = Pretrainer(SMALL, Walls(), scene, 0, CPU)
+    validation = Validation({"wall": scene}, tmp_path)
+    for step in range(1, 5):
+        learner.progress.step = step
+        validation(learner, 0.1)
+    again = Validation({"wall": scene}, tmp_path)
+    learner.progress.step = 4
+    again(learner, 0.1)
+    learner.progress.step = 5
+    again(learner, 1.0)
+    points = json.loads((tmp_path / "validation.json").read_text())
+    assert [point["step"] for point in points] == [2, 4, 5]
+    assert all(5 < point["psnr"]["wall"] < 60 for point in points)
+
+
+def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
+    scene = wall.scene(wall.cameras(4))
+    trainer, file = Trainer(SMALL, scene, 1, CPU), tmp_path / "w.safetensors"
+    write_weights(file, trainer.network, SMALL, {"steps": 5})
+    with safe_open(file, framework="pt") as stored:
+        assert json.loads(stored.metadata()["tidefield"])["steps"] == 5
+        assert {stored.get_tensor(name).dtype for name in stored.keys()} == {torch.float16}  # noqa: SIM118
+    begun = Trainer(SMALL, scene, 2, CPU, file)
+    for name, value in trainer.network.state_dict().items():
+        assert torch.equal(begun.network.state_dict()[name], value.half().float()), name
+    fewer = replace(SMALL, network=replace(SMALL.network, views=2))
+    read_weights(file, Network(fewer.network))
+    assert len(sha256(file)) == 64
+
+
+def test_wrong_weights_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "w.safetensors"
+    with pytest.raises(RunError, match="is no file of weights"):
+        read_weights(file, Network(SMALL.network))
+    write_weights(file, Network(SMALL.network), SMALL, {})
+    with pytest.raises(RunError, match=r"another network \(encoder differ\)"):
+        read_weights(file, Network(SWIFT.network))
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(RunError, match="damaged"):
+        read_weights(file, Network(SMALL.network))
+
+
+def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr("tidefield.commands.training.PRESETS", {"swift": SMALL})
+    scene = wall.scene(wall.cameras(5), (1, 3))
+    monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": scene})
+    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
+    with pytest.raises(RunError, match="--resume"):
+        pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
+    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=3), device="cpu", resume=True), QUIET)
+    points = json.loads((tmp_path / "out" / "validation.json").read_text())
+    assert [point["step"] for point in points] == [2, 3]
+    read_weights(tmp_path / "out" / "weights.safetensors", Network(SMALL.network))

@@ -1,0 +1,212 @@
+"""An endless stream of scenes to learn from: procedural tidal flats and clutter, and real ones.
+
+Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
+next, which another process has made meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from multiprocessing.pool import AsyncResult
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from tidefield.data.batches import Surfaces
+from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
+from tidefield.data.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
+from tidefield.data.synthetic.clutter import Rig, make_clutter
+from tidefield.geometry.cameras import Cameras
+
+AT_HAND = 6
+"""Procedural scenes at a time."""
+STEPS_EACH = 250
+"""Steps after which the oldest makes room."""
+CLUTTER_SHARE = 0.4
+"""Of the procedural scenes that are no tidal flats, so that depth is learned, too."""
+RIGS: tuple[Rig, ...] = ("front", "around", "above")
+REAL_SHARE = 0.3
+"""Of the steps that learn from a real scene, where there are some."""
+WIDTHS = (256, 400)
+"""Of real scenes' photographs: each is there at both."""
+MISPOSED_DEG = 0.6
+BLIND_SHARE = 0.25
+"""Of the steps that do without sparse points, as many scenes that are not surveys have none."""
+BLIND_NEAR, BLIND_FAR = (0.3, 0.95), (1.05, 3.0)
+"""Factors of the scene's near and far that they are given instead."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a procedural scene is made of; equal recipes make equal scenes.
+
+    Attributes:
+        category, seed, views, width, flight: of the survey.
+        misposed: photographs whose attitude is told wrong, as structure from motion now and then does.
+    """
+
+    category: str
+    seed: int
+    views: int
+    width: int
+    flight: Flight
+    misposed: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """What a scene that is no survey is made of: see `make_clutter`."""
+
+    rig: Rig
+    seed: int
+    views: int
+    width: int
+    white: bool
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A scene with what training asks of it; cameras are where the network is."""
+
+    scene: Scene
+    surfaces: Surfaces
+    cameras: Cameras
+
+
+def recipe(seed: int, number: int) -> Recipe | Clutter:
+    """Scene `number` of a seed: all that deployment may meet, drawn at random."""
+    random = np.random.default_rng([seed, number, 77])
+    if random.random() < CLUTTER_SHARE:
+        rig: Rig = RIGS[int(random.integers(len(RIGS)))]
+        white = rig == "around" and bool(random.random() < 0.6)
+        width = int(random.choice([224, 288]))
+        return Clutter(rig, int(random.integers(1 << 31)), int(random.integers(14, 24)), width, white)
+    views = int(random.integers(18, 32))
+    flight = Flight(
+        altitude_m=float(math.exp(random.uniform(math.log(18), math.log(110)))),
+        forward_overlap=float(random.uniform(0.6, 0.88)),
+        side_overlap=float(random.uniform(0.5, 0.8)),
+        focal_ratio=float(random.uniform(0.6, 1.2)),
+        aspect=float(random.choice([0.5625, 0.667, 0.75])),
+        jitter_deg=float(random.uniform(0.5, 4.0)),
+        oblique_share=float(random.choice([0.0, 0.0, 0.3, 0.8])),
+        exposure_spread=float(random.choice([0.0, 0.05, 0.15, 0.3])),
+        water_motion=float(random.choice([0.0, 2.0])),
+        sun_elevation_deg=float(random.uniform(20, 70)),
+        wetness=float(random.uniform(0, 1)),
+    )
+    misposed = tuple(int(k) for k in random.choice(views, int(random.random() < 0.3), replace=False))
+    category = str(random.choice(list(CATEGORIES)))
+    return Recipe(category, int(random.integers(1 << 31)), views, int(random.choice([224, 288, 352])), flight, misposed)
+
+
+def make(given: Recipe, folder: Path) -> None:
+    """Write a recipe's scene; the folder appears when it is complete."""
+    torch.set_num_threads(1)
+    half = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(half, ignore_errors=True)
+    survey = make_survey(given.category, given.seed, given.views, given.width, given.flight)
+    write_survey(misposed(survey, given), half, suffix=".jpg")
+    half.rename(folder)
+
+
+def misposed(survey: Survey, given: Recipe) -> Survey:
+    """The survey as structure from motion tells it that got some attitudes wrong."""
+    pose = survey.cameras.T_world_camera.clone()
+    random = np.random.default_rng([given.seed, 5])
+    for index in given.misposed:
+        axis = torch.from_numpy(random.normal(size=3)).float()
+        angle = math.radians(MISPOSED_DEG)
+        skew = torch.tensor([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]]) / axis.norm()
+        turn = torch.linalg.matrix_exp(angle * skew)
+        pose[index, :, :3] = pose[index, :, :3] @ turn
+    return replace(survey, cameras=replace(survey.cameras, T_world_camera=pose))
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Where scenes to learn from come from."""
+
+    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+        """A scene for a step; the same for the same step and state of the generator."""
+        ...
+
+
+class Stream:
+    """Draws scenes.
+
+    Args:
+        folder: where the procedural ones lie while they are at hand.
+        real: folders of scenes of which only the training photographs are learned from.
+        seed: of the procedural ones.
+        device: where the network is.
+    """
+
+    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
+        self.folder, self.seed, self.device = folder, seed, device
+        loaded = [load_scene(path, width=width) for path in real for width in WIDTHS]
+        self.real = [self._both(scene) for scene in loaded]
+        self.pictures = tuple(scene.photographs[i] for scene in loaded for i in scene.train)
+        self.pool: dict[int, tuple[Drawn, Drawn]] = {}
+        self.coming: dict[int, AsyncResult[None]] = {}
+        # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
+        self.maker = get_context("spawn").Pool(1)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.maker.terminate()
+        self.maker.join()
+
+    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+        """A scene for a step; the same for the same step, seed and state of the generator."""
+        first = step // STEPS_EACH
+        blind = bool(torch.rand((), generator=generator) < BLIND_SHARE)
+        if self.real and torch.rand((), generator=generator) < REAL_SHARE:
+            return self.real[int(torch.randint(len(self.real), (), generator=generator))][blind]
+        number = first + int(torch.randint(AT_HAND, (), generator=generator))
+        for gone in [k for k in self.pool if k < first]:
+            del self.pool[gone]
+            shutil.rmtree(self._path(gone), ignore_errors=True)
+        for soon in range(first, first + AT_HAND + 1):
+            self._order(soon)
+        if number not in self.pool:
+            self.pool[number] = self._both(self._made(number))
+        return self.pool[number][blind]
+
+    def _made(self, number: int) -> Scene:
+        given = recipe(self.seed, number)
+        if isinstance(given, Clutter):
+            return make_clutter(given.seed, given.views, given.width, given.rig, self.pictures, given.white)
+        if number in self.coming:
+            self.coming.pop(number).get()
+        return load_scene(self._path(number), cache=self._path(number) / "decoded")  # forgotten with the scene
+
+    def _order(self, number: int) -> None:
+        """Have a survey made, unless it is there or coming; clutter is made when it is wanted."""
+        given = recipe(self.seed, number)
+        if isinstance(given, Recipe) and number not in self.coming and not self._path(number).exists():
+            self.coming[number] = self.maker.apply_async(make, (given, self._path(number)))
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{self.seed}-{number:06d}"
+
+    def _both(self, scene: Scene) -> tuple[Drawn, Drawn]:
+        """A scene with its sparse points, and without; what is known of its depths is told to the loss in any case."""
+        random = np.random.default_rng([self.seed, len(scene.names), int(scene.cameras.size_px[0, 0])])
+        factors = torch.tensor([random.uniform(*BLIND_NEAR), random.uniform(*BLIND_FAR)]).float()
+        cameras = replace(scene.cameras, near_far=scene.cameras.near_far * factors)
+        blind = replace(scene, points=None, cameras=cameras)
+        return (
+            Drawn(scene, Surfaces(scene), scene.cameras.to(self.device)),
+            Drawn(blind, Surfaces(blind, scene.points), cameras.to(self.device)),
+        )
