@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import tyro
 
+from tidefield.cores import spin_briefly
 from tidefield.errors import RunError, TidefieldError
 
 DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
@@ -42,8 +43,7 @@ def speed(
     """
     if quick and runs is not None:
         raise RunError("--quick was given with --runs: such figures are not worth keeping; leave one of them out")
-    # As the tidefield command does, before torch is imported.
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    spin_briefly()
     from rich.console import Console
 
     from benchmarks.speed import QUICK, Effort, measure_speed
@@ -101,17 +101,13 @@ def frames(
         weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
         device: auto, cpu, cuda, cuda:N or mps.
     """
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    spin_briefly()
     from benchmarks.frames import measure_frames
     from benchmarks.table import frame_tables
     from tidefield.device import choose_device, keep_large_allocations
-    from tidefield.train.weights import shipped
 
     keep_large_allocations()
-    found = weights or shipped(preset)
-    if found is None:
-        raise RunError(f"no weights of {preset} came with Tidefield: expected --weights; train some or use swift")
-    record = measure_frames(scene, runs, preset, found, str(choose_device(device)))
+    record = measure_frames(scene, runs, preset, weights, str(choose_device(device)))
     for table in frame_tables(record):
         print(table.markdown(), end="\n\n")
 

@@ -52,8 +52,18 @@ def judge(results: Results, kept: Kept) -> list[Bar]:
     ) -> Gains:
         return {scene: _gain(results, scene, name, own, others, more) for scene in scenes}
 
-    def zero_shot(name: str, others: tuple[str, ...], scenes: tuple[str, ...], more: bool = True) -> Gains:
-        return gain(name, others, scenes, more, "zero-shot")
+    def ahead_of_nerfacto(own: str, scenes: tuple[str, ...], who: str, where: str) -> list[Bar]:
+        kinds = (("psnr", "PSNR above", "{:+.2f} dB"), ("ssim", "SSIM above", "{:+.4f}"))
+        kinds += (("lpips_vgg", "LPIPS (VGG) below", "{:+.4f}"),)
+        return [
+            _on_each(
+                f"{who}{title} Nerfacto's {where}",
+                gain(name, peer, scenes, not title.endswith("below"), own),
+                style,
+                lambda x: x > 0,
+            )
+            for name, title, style in kinds
+        ]
 
     blending = gain("psnr_seen_cc", FLOORS, SURVEYS)
     structure = gain("ssim_seen_cc", FLOORS, SURVEYS)
@@ -64,36 +74,12 @@ def judge(results: Results, kept: Kept) -> list[Bar]:
         _on_each("SSIM above the better floor on each survey", structure, "{:+.4f}", lambda x: x > 0),
         _in_the_mean("PSNR above the better floor", blending, GAIN_DB),
         _on_each("PSNR not below the preset paper's on any survey", paper, "{:+.2f} dB", lambda x: x >= 0),
-        _on_each("PSNR above Nerfacto's on each scene", gain("psnr", peer, SCENES), "{:+.2f} dB", lambda x: x > 0),
-        _on_each("SSIM above Nerfacto's on each scene", gain("ssim", peer, SCENES), "{:+.4f}", lambda x: x > 0),
-        _on_each(
-            "LPIPS (VGG) below Nerfacto's on each scene",
-            gain("lpips_vgg", peer, SCENES, more=False),
-            "{:+.4f}",
-            lambda x: x > 0,
-        ),
+        *ahead_of_nerfacto("tidefield", SCENES, "", "on each scene"),
         _in_the_mean("PSNR above Nerfacto's, doubly seen pixels", gain("psnr_seen", peer, SCENES), AHEAD_DB),
-        _on_each(
-            "Zero-shot, PSNR above Nerfacto's where nothing was learned",
-            zero_shot("psnr", peer, UNSEEN),
-            "{:+.2f} dB",
-            lambda x: x > 0,
-        ),
-        _on_each(
-            "Zero-shot, SSIM above Nerfacto's where nothing was learned",
-            zero_shot("ssim", peer, UNSEEN),
-            "{:+.4f}",
-            lambda x: x > 0,
-        ),
-        _on_each(
-            "Zero-shot, LPIPS (VGG) below Nerfacto's where nothing was learned",
-            zero_shot("lpips_vgg", peer, UNSEEN, more=False),
-            "{:+.4f}",
-            lambda x: x > 0,
-        ),
+        *ahead_of_nerfacto("zero-shot", UNSEEN, "Zero-shot, ", "where nothing was learned"),
         _on_each(
             "Zero-shot, PSNR above the better floor on each scene",
-            zero_shot("psnr", FLOORS, SCENES),
+            gain("psnr", FLOORS, SCENES, own="zero-shot"),
             "{:+.2f} dB",
             lambda x: x > 0,
         ),

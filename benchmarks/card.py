@@ -13,6 +13,7 @@ from tidefield.compare.table import Table, shown
 from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
 from tidefield.files import completed_file
+from tidefield.train.stream import BLIND_SHARE, CLUTTER_SHARE
 from tidefield.train.weights import about, sha256
 
 METHODS = (ZERO_SHOT, "nerfacto", *UNTRAINED)
@@ -65,8 +66,9 @@ def card(weights: Path, results: Results) -> str:
         "photographs of tidal flats that overlap well and have sparse points. Where few photographs see a place, where "
         "things move, and far from where photographs were taken, views are guesses: do not measure in them.",
         "## What they were trained on",
-        "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
-        f"moving water and wrong poses; a quarter of the steps without sparse points{real}",
+        f"- procedural scenes: {1 - CLUTTER_SHARE:.0%} of them tidal flats of five categories, of random altitude, "
+        "overlap, lens, sun, wetness, exposure, with moving water and wrong poses, the others clutter of cards and "
+        f"boxes; {BLIND_SHARE:.0%} of the steps without sparse points{real}",
         f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
         f"cores, {told['date']}, Tidefield {told['version']}:",
         f"    tidefield pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
@@ -76,7 +78,7 @@ def card(weights: Path, results: Results) -> str:
         "## What they achieve",
         "Zero-shot, means over the held-out photographs; `docs/results.md` says how the peers were trained. Nothing of "
         f"{' and '.join(UNSEEN)} was ever learned from.",
-        *(_quality(results, *metric).markdown() for metric in METRICS[:4]),
+        *(_quality(results, metric, title, style).markdown() for metric, title, style, _ in METRICS[:4]),
         *lpips_weights(results),
         "## Licence",
         "Apache-2.0, as Tidefield itself.",
@@ -90,7 +92,7 @@ def _curve(points: list[Mapping[str, Any]]) -> Table:
     return Table("", ["step", *kinds], rows)
 
 
-def _quality(results: Results, metric: str, title: str, style: str, _: bool) -> Table:
+def _quality(results: Results, metric: str, title: str, style: str) -> Table:
     rows = [
         (scene, *(shown(results.metric(scene, method, metric), style) for method in METHODS))
         for scene in results.scenes

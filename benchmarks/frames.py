@@ -35,7 +35,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render, Rendering
 from tidefield.products.trajectory import make_trajectory
-from tidefield.train.weights import shipped
+from tidefield.train.weights import given_or_shipped
 
 FRAMES_FILE = "frames.json"
 SIZE_PX = (800, 600)
@@ -52,21 +52,27 @@ SAME_DEPTH = 0.02
 
 
 def measure_frames(
-    folder: Path, runs: Path, preset: Literal["swift", "paper"], weights: Path, device: str, run: Runner = run_measured
+    folder: Path,
+    runs: Path,
+    preset: Literal["swift", "paper"],
+    given: Path | None,
+    device: str,
+    run: Runner = run_measured,
 ) -> dict[str, Any]:
     """Everything; kept in RUNS/frames.json and returned.
 
     Args:
         folder: of the scene.
         runs: where the result goes.
-        preset, weights: of the network.
+        preset: which network.
+        given: its weights; those that came with Tidefield if None.
         device: where to render.
         run: runs a command.
     """
-    scene = load_scene(folder)
+    scene, weights = load_scene(folder), given_or_shipped(given, preset)
     name = scene.names[(scene.test or scene.train)[0]]
     first = _first(folder, name, preset, weights, device, runs, run)
-    where = torch.device(device)
+    where, named = torch.device(device), "" if given is None else " --weights WEIGHTS"
 
     def view_of(other: Scene) -> Render:
         return zero_shot(PRESETS[preset], weights, other, where)[0]
@@ -77,7 +83,6 @@ def measure_frames(
     shown = flight[middle : middle + 1]
     record = {
         "preset": preset,
-        "weights": weights == shipped(preset),
         "device": device,
         "size_px": list(SIZE_PX),
         "photographs": len(scene.names),
@@ -87,7 +92,7 @@ def measure_frames(
             str(count): _again(view_of(among_copies(scene, count)), shown) for count in (len(scene.names), *COUNTS)
         },
         "steadiness": _steadiness(view_of, scene),
-        "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset} --device {device}",
+        "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --device {device}",
         **stamp(),
     }
     write_json(runs / FRAMES_FILE, record)

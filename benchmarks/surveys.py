@@ -134,10 +134,10 @@ def _aims(
             for result in (_run(prepared, survey), _run(prepared, survey + UNEVEN), _run(ready, survey))
         )
         if ours is not None and theirs is not None:
-            shown = f"{ours - theirs:+.2f} dB" + (
+            gain = f"{ours - theirs:+.2f} dB" + (
                 "" if plain is None else f", with --colour off {plain - theirs:+.2f} dB"
             )
-            rows.append(_row(f"{survey}: trained, PSNR not under the ready-made scene's", shown, ours >= theirs))
+            rows.append(_row(f"{survey}: trained, PSNR not under the ready-made scene's", gain, ours >= theirs))
     if many is not None:
         aim = f"{many['photographs']} photographs in less than 4 GB"
         rows.append(_row(aim, f"{many['peak_memory_bytes'] / 1e9:.2f} GB", many["peak_memory_bytes"] < 4e9))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from tidefield.cores import spin_briefly
 from tidefield.errors import TidefieldError
 from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import, Prepare, Pretrain, Render, Talk, Train
 
@@ -73,9 +74,7 @@ def _run() -> None:
 
 def _begin(talk: Talk) -> Console:
     """Set up messages; returns the console that commands print to."""
-    # Before torch is imported: threads that wait spinning for work take the cores from those that have some, and a
-    # busy machine becomes several times slower; those that do not spin at all wake up late on a quiet one.
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    spin_briefly()
     from rich.console import Console
     from rich.logging import RichHandler
 

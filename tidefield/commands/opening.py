@@ -17,10 +17,10 @@ from tidefield.errors import RunError
 from tidefield.meter import Meter
 from tidefield.methods import trained, zero_shot
 from tidefield.model.rendering import Render as RenderMethod
-from tidefield.options import Evaluate, Length, Render, ZeroShot
+from tidefield.options import Evaluate, Length, Render
 from tidefield.train.checkpoint import read_run
 from tidefield.train.loop import Budget
-from tidefield.train.weights import shipped
+from tidefield.train.weights import given_or_shipped
 
 DEFAULT_MINUTES = 10.0
 
@@ -51,7 +51,7 @@ def opened(options: Evaluate | Render, console: Console) -> Iterator[tuple[Scene
     if options.zero.zero_shot:
         width = options.width if isinstance(options, Evaluate) else None
         scene, config = load(source, width, options.allow_missing, console), PRESETS[options.zero.preset]
-        view, digest = zero_shot(config, _given_or_shipped(options.zero), scene, where)
+        view, digest = zero_shot(config, given_or_shipped(options.zero.weights, options.zero.preset), scene, where)
         yield scene, view, {**config_to_json(config), "weights": digest}
         return
     if isinstance(options, Evaluate) and options.width is not None:
@@ -61,12 +61,3 @@ def opened(options: Evaluate | Render, console: Console) -> Iterator[tuple[Scene
     with trained(source, run, scene, where) as (view, progress):
         done = {"steps": progress.step, "seconds": progress.seconds}
         yield scene, view, {**config_to_json(run.config), "seed": run.seed, "weights": run.weights, "trained": done}
-
-
-def _given_or_shipped(asked: ZeroShot) -> Path:
-    found = asked.weights or shipped(asked.preset)
-    if found is None:
-        raise RunError(
-            f"no weights of {asked.preset} came with Tidefield: expected --weights; train some, or use swift"
-        )
-    return found

@@ -56,10 +56,7 @@ def train(options: Train, console: Console) -> None:
             write_run(folder, run)
         watch = curve and curve.watch(folder, budget.share(learner.progress))
         finished, progress = train_loop(learner, folder, budget, Display(console), watch), learner.progress
-    console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
-    if not finished:
-        console.print("interrupted; the same command with --resume goes on")
-        raise KeyboardInterrupt
+    _end(progress, finished, folder, console)
 
 
 def pretrain(options: Pretrain, console: Console) -> None:
@@ -84,7 +81,12 @@ def pretrain(options: Pretrain, console: Console) -> None:
         done, real = learner.progress, [scene.resolve().name for scene in options.real]
         about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **stamp()}
         write_weights(folder / WEIGHTS_FILE, learner.network, config, {**about, "validation": validation.points})
-        console.print(f"{done.step} steps in {done.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
+    _end(learner.progress, finished, folder, console)
+
+
+def _end(progress: Progress, finished: bool, folder: Path, console: Console) -> None:
+    """Tell what was done; a training that was interrupted ends its command as an interruption."""
+    console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
     if not finished:
         console.print("interrupted; the same command with --resume goes on")
         raise KeyboardInterrupt

@@ -7,7 +7,6 @@ optional extra), their weights from two files in torch hub's folder. Nothing is 
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import sys
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tidefield.errors import RunError
+from tidefield.files import file_sha256
 
 BACKBONES: dict[str, tuple[Literal["alex", "vgg"], str]] = {
     "lpips_alex": ("alex", "alexnet-owt-7be5be79.pth"),
@@ -48,8 +48,7 @@ class Lpips:
         with torch.random.fork_rng(devices=[]):
             self._network = _LPIPS(net=backbone, pnet_rand=True)
         loaded = torch.load(weights, map_location="cpu", weights_only=True)
-        with weights.open("rb") as file:
-            self.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        self.sha256 = file_sha256(weights)
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
         features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})

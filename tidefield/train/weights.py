@@ -5,7 +5,6 @@ Those that ship with Tidefield lie in `tidefield/weights/`, beside a card that s
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +18,7 @@ from torch import Tensor
 from tidefield import __version__
 from tidefield.config import Config, config_to_json
 from tidefield.errors import RunError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, file_sha256
 from tidefield.model.network import Network
 
 WEIGHTS_FILE = "weights.safetensors"
@@ -31,6 +30,18 @@ def shipped(preset: str) -> Path | None:
     """The weights of a preset that came with Tidefield, if there are some."""
     file = SHIPPED / f"{preset}.safetensors"
     return file if file.is_file() else None
+
+
+def given_or_shipped(given: Path | None, preset: str) -> Path:
+    """Weights that are named, else those of the preset that came with Tidefield.
+
+    Raises:
+        RunError: there are neither.
+    """
+    found = given or shipped(preset)
+    if found is None:
+        raise RunError(f"no weights of {preset} came with Tidefield: expected --weights; train some, or use swift")
+    return found
 
 
 def write_weights(path: Path, network: Network, config: Config, about: dict[str, Any]) -> None:
@@ -55,9 +66,8 @@ def sha256(path: Path) -> str:
     Raises:
         RunError: it is not there.
     """
-    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
-        raise RunError(f"{path} is no file of weights: expected one that `tidefield pretrain` wrote; name it")
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    _refuse_others(path)
+    return file_sha256(path)
 
 
 def about(path: Path) -> dict[str, Any]:
@@ -69,15 +79,19 @@ def about(path: Path) -> dict[str, Any]:
     return _read(path)[0]
 
 
+def _refuse_others(path: Path) -> None:
+    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
+        raise RunError(f"{path} is no file of weights: expected one that `tidefield pretrain` wrote; name it")
+
+
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    sha256(path)
+    _refuse_others(path)
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {})["tidefield"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if not isinstance(header["config"]["network"], dict):
-            raise TypeError("its network is no object")
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        _comparable(header["config"]["network"])
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RunError(
             f"{path} is damaged or of another program ({error}): expected what `tidefield pretrain` wrote; name others"
         ) from error

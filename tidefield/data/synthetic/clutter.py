@@ -9,7 +9,7 @@ Alphabet: K surfaces, V photographs, R rays.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -76,7 +76,7 @@ def make_clutter(
     tasks = [partial(_photograph, cards, textures, cameras[i], sun) for i in range(views)]
     photographs, depth = (torch.stack(parts) for parts in zip(*in_parallel(tasks, "cpu"), strict=True))
     near_far = torch.stack([_near_far(d) for d in depth])
-    cameras = Cameras(**{**vars(cameras), "near_far": near_far})
+    cameras = replace(cameras, near_far=near_far)
     return Scene(
         root=Path(f"clutter-{rig}-{seed}"),
         names=tuple(f"{i:03d}.png" for i in range(views)),
