@@ -13,7 +13,7 @@ from tidefield.compare.table import Table, shown
 from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
 from tidefield.files import completed_file
-from tidefield.train.stream import BLIND_SHARE, CLUTTER_SHARE
+from tidefield.train.stream import SPARSE_POINTS, SPARSE_SHARE
 from tidefield.train.weights import about, sha256
 
 METHODS = (ZERO_SHOT, "nerfacto", *UNTRAINED)
@@ -66,9 +66,9 @@ def card(weights: Path, results: Results) -> str:
         "photographs of tidal flats that overlap well and have sparse points. Where few photographs see a place, where "
         "things move, and far from where photographs were taken, views are guesses: do not measure in them.",
         "## What they were trained on",
-        f"- procedural scenes: {1 - CLUTTER_SHARE:.0%} of them tidal flats of five categories, of random altitude, "
-        "overlap, lens, sun, wetness, exposure, with moving water and wrong poses, the others clutter of cards and "
-        f"boxes; {BLIND_SHARE:.0%} of the steps without sparse points{real}",
+        "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
+        f"moving water and wrong poses{real}",
+        f"{SPARSE_SHARE:.0%} of the steps knew {SPARSE_POINTS[0]:.0%} to {SPARSE_POINTS[1]:.0%} of the sparse points.",
         f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
         f"cores, {told['date']}, Tidefield {told['version']}:",
         f"    tidefield pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",

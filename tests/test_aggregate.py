@@ -167,14 +167,14 @@ def test_what_invalid_views_hold_changes_nothing(folded: bool):
     hidden = ~valid
     changed = [t.masked_fill(hidden.reshape(hidden.shape + (1,) * (t.dim() - 3)), 0.77) for t in (features, colours)]
     after = own(*changed, cosine.masked_fill(hidden, -1.0), valid)
-    for name in ("density", "view_weight", "mean_colour", "disagreement", "valid"):
+    for name in ("density", "view_weight", "mean_colour", "disagreement", "count", "valid"):
         torch.testing.assert_close(getattr(before, name), getattr(after, name))
 
 
 def test_the_order_of_the_views_does_not_matter():
     own, order = box(), torch.tensor([2, 0, 3, 1])
     before, after = own(*inputs()), own(*(t[:, order] for t in inputs()))
-    for name in ("density", "mean_colour", "disagreement", "valid"):
+    for name in ("density", "mean_colour", "disagreement", "count", "valid"):
         torch.testing.assert_close(getattr(before, name), getattr(after, name))
     torch.testing.assert_close(before.per_view[:, order], after.per_view)
     torch.testing.assert_close(before.view_weight[:, order], after.view_weight)
@@ -210,6 +210,7 @@ def test_views_that_count_alike_are_averaged_whatever_their_directions():
     own = randomise(Aggregate(C, H, folded=False, alike=True).double())
     features, colours, cosine, valid = inputs()
     evidence = own(features, colours, cosine, valid)
+    torch.testing.assert_close(evidence.count, valid.sum(1).double())
     for t, p in [(0, 0), (1, 4), (1, 5)]:
         expected = colours[t, valid[t, :, p], p].mean(0) + 0.5 * (not valid[t, :, p].any())
         torch.testing.assert_close(evidence.mean_colour[t, p], expected)

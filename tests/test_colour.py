@@ -30,7 +30,8 @@ def scene() -> tuple[Evidence, Gathered, Tensor]:
     direction = unit(generator, T, P)
     theirs = F.normalize(direction[:, None] + 0.3 * unit(generator, T, N, P), dim=-1)
     cosine = (theirs * direction[:, None]).sum(-1)
-    evidence = Evidence(draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), draw(T, P), valid.any(1))
+    agreement = draw(T, P), valid.sum(1).double()
+    evidence = Evidence(draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), *agreement, valid.any(1))
     there = torch.ones(T, N).double()
     return evidence, Gathered(draw(T, N, P, 3), draw(T, N, P, 4), theirs, cosine, valid, there), direction
 

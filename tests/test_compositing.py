@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from tidefield.model.compositing import composite, weights
+from tidefield.model.compositing import composite, surface_logits, weights
 
 
 def random_ray(rays: int = 20, samples: int = 9, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -87,3 +88,24 @@ def test_opaque_and_empty_samples_have_finite_gradients():
     weights(sigma, endless(torch.ones(4))).square().sum().backward()
     assert sigma.grad is not None
     assert sigma.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_surface_logits_weigh_samples_by_the_softmax_of_their_scores(opaque: bool):
+    _, delta = random_ray()
+    score = 3 * torch.randn(delta.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    sigma = F.softplus(surface_logits(score, opaque)) / delta
+    candidates = score if opaque else F.pad(score, (0, 1))
+    expected = torch.softmax(candidates, -1)[..., : score.shape[-1]]
+    torch.testing.assert_close(weights(sigma, endless(delta) if opaque else delta), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_surface_logits_and_their_gradients_are_finite_for_samples_that_cannot_be_told_apart_from_nothing():
+    score = torch.tensor([[-30.0] * 5, [-30.0, 0.0, -30.0, 40.0, -30.0], [60.0, -30.0, -30.0, -30.0, 0.0]])
+    for opaque in (True, False):
+        given = score.clone().requires_grad_()
+        logits = surface_logits(given, opaque)
+        logits.sum().backward()
+        assert logits.isfinite().all()
+        assert given.grad is not None
+        assert given.grad.isfinite().all()

@@ -26,7 +26,7 @@ from tidefield.options import Length, Pretrain
 from tidefield.train import pretrain, stream
 from tidefield.train.loop import Budget, Trainer
 from tidefield.train.pretrain import Pretrainer, Validation
-from tidefield.train.stream import Clutter, Drawn, Recipe, Stream, recipe
+from tidefield.train.stream import Drawn, Recipe, Stream, recipe
 from tidefield.train.weights import read_weights, sha256, write_weights
 
 CPU = torch.device("cpu")
@@ -55,20 +55,11 @@ def test_recipes_repeat_and_differ() -> None:
     assert recipe(3, 5) == recipe(3, 5)
     every = [recipe(3, number) for number in range(100)]
     assert len({one.seed for one in every}) == 100
-    clutter = [one for one in every if isinstance(one, Clutter)]
-    assert 20 < len(clutter) < 60
-    assert {(one.rig, one.white) for one in clutter} == {
-        ("front", False),
-        ("around", False),
-        ("around", True),
-        ("above", False),
-    }
-    made = [one for one in every if isinstance(one, Recipe)]
-    assert len({one.category for one in made}) == 5
-    assert {one.flight.exposure_spread > 0 for one in made} == {True, False}
-    assert {one.flight.water_motion > 0 for one in made} == {True, False}
-    assert {len(one.misposed) for one in made} == {0, 1}
-    assert all(index < one.views for one in made for index in one.misposed)
+    assert len({one.category for one in every}) == 5
+    assert {one.flight.exposure_spread > 0 for one in every} == {True, False}
+    assert {one.flight.water_motion > 0 for one in every} == {True, False}
+    assert {len(one.misposed) for one in every} == {0, 1}
+    assert all(index < one.views for one in every for index in one.misposed)
 
 
 def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,22 +83,25 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
 
 
-def test_scenes_come_with_and_without_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "recipe", lambda seed, number: Clutter("front", 5 * seed + number, 4, 32, False))
+def test_scenes_come_with_their_points_and_with_few_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr(stream, "AT_HAND", 1)
     generator = torch.Generator().manual_seed(0)
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
-        drawn = [scenes.draw(0, generator) for _ in range(60)]
-    with_points = [one for one in drawn if one.scene.points is not None]
-    blind = [one for one in drawn if one.scene.points is None]
-    assert 5 < len(blind) < 30
-    assert len({one.scene.root for one in with_points}) == stream.AT_HAND
-    one = blind[0]
-    same = next(other for other in with_points if other.scene.root == one.scene.root)
-    inner, outer = same.scene.cameras.near_far, one.scene.cameras.near_far
-    assert (outer[:, 0] < inner[:, 0]).all()
-    assert (outer[:, 1] > inner[:, 1]).all()
-    assert len(one.surfaces.observed(0).uv_px) == len(same.surfaces.observed(0).uv_px) > 0
-    assert one.surfaces[0][0].isnan().all(), "nothing is expected without points"
+        drawn = [scenes.draw(0, generator) for _ in range(40)]
+    count = [len(one.scene.points.xyz_world) for one in drawn if one.scene.points is not None]
+    assert len(count) == 40
+    assert len(set(count)) == 2
+    assert min(count) < 0.4 * max(count)
+    assert 10 < count.count(min(count)) < 30
+    few, whole = drawn[count.index(min(count))], drawn[count.index(max(count))]
+    assert len(few.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px) > 0
+    assert not torch.equal(few.surfaces[0], whole.surfaces[0])
+    points = few.scene.points
+    assert points is not None
+    assert len(points.error_px) == len(points.xyz_world) == len(points.point_index.unique())
+    seen_at = few.scene.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
+    assert (seen_at - points.uv_px).norm(dim=-1).median() < 1, "every observation is still of its point"
 
 
 def test_a_photograph_is_told_a_wrong_attitude(tmp_path: Path) -> None:
@@ -139,6 +133,13 @@ def learn_together(rank: int, folder: str) -> None:
     os.environ["MASTER_PORT"] = Path(folder, "port").read_text()
     torch.set_num_threads(1)
     device = pretrain.join(CPU)
+    assert pretrain.processes() == 2
+    pretrain.CATEGORIES = ("ground_textures",)
+    pretrain.Recipe = lambda *asked: small_recipe(0, 0)
+    made = Path(folder, "validation", "ground_textures")
+    assert rank == 1 or not made.exists()
+    assert list(pretrain.validation_scenes(Path(folder), [], QUIET)) == ["ground_textures"]
+    Path(folder, f"{rank}.seed").write_text(str(pretrain.own_seed(5)))
     learner = Pretrainer(SMALL, Walls(rank), wall.scene(wall.cameras(4)), 0, device)
     assert learner.leads == (rank == 0)
     assert learner.agreed(rank == 1), "one that is asked to stop stops both"
@@ -153,6 +154,7 @@ def test_two_processes_learn_the_same_from_different_scenes(tmp_path: Path) -> N
         free.bind(("localhost", 0))
         (tmp_path / "port").write_text(str(free.getsockname()[1]))
     processes.spawn(learn_together, (str(tmp_path),), nprocs=2)
+    assert [(tmp_path / f"{rank}.seed").read_text() for rank in (0, 1)] == ["5", "1000008"]
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
     alone = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
     for _ in range(3):

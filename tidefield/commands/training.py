@@ -65,13 +65,16 @@ def pretrain(options: Pretrain, console: Console) -> None:
     from tidefield.train.stream import Stream
 
     budget, folder, config = budget_of(options.length), options.out, PRESETS[options.preset]
-    if not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    device = across.join(choose_device(options.device))  # none gets further, and writes, before all have looked
+    if occupied:
         raise RunError(f"{folder} is not empty: expected a new folder; choose another, or go on in it with --resume")
-    device = across.join(choose_device(options.device))
+    if not across.leads():
+        console = Console(quiet=True)
     if across.together() and budget.steps is None:
         raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    with Stream(folder / "scenes", options.real, options.seed, device) as stream:
+    with Stream(folder / "scenes", options.real, across.own_seed(options.seed), device) as stream:
         shown = next(iter(validation.scenes.values()))
         learner = across.Pretrainer(config, stream, shown, options.seed, device)
         if options.resume:
@@ -80,6 +83,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
     if learner.leads:
         done, real = learner.progress, [scene.resolve().name for scene in options.real]
         about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **stamp()}
+        about["processes"] = across.processes()
         write_weights(folder / WEIGHTS_FILE, learner.network, config, {**about, "validation": validation.points})
     _end(learner.progress, finished, folder, console)
 

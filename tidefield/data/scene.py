@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tidefield.data.images import Photographs
@@ -30,6 +30,18 @@ class SparsePoints:
     point_index: Int[Tensor, " O"]
     camera_index: Int[Tensor, " O"]
     uv_px: Float[Tensor, "O 2"]
+
+    def subset(self, kept: Bool[Tensor, " P"]) -> SparsePoints:
+        """Some of the points, and what observed them."""
+        seen = kept[self.point_index.long()]
+        number = kept.cumsum(0) - 1
+        return SparsePoints(
+            xyz_world=self.xyz_world[kept],
+            error_px=self.error_px[kept],
+            point_index=number[self.point_index[seen].long()].to(self.point_index),
+            camera_index=self.camera_index[seen],
+            uv_px=self.uv_px[seen],
+        )
 
 
 @dataclass(frozen=True)

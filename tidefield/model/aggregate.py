@@ -28,6 +28,8 @@ class Evidence:
         mean_colour: the views' colours averaged with the direction weights; middle grey where there are none.
         disagreement: how differently the views see the sample: a weighted sum of the variances of their features; not
             in the paper, and 0 where a network is as printed.
+        count: how many views that is, in effect: one over the sum of the squared direction weights; 0 where none is
+            valid.
         valid: whether anything is known of the sample.
     """
 
@@ -36,6 +38,7 @@ class Evidence:
     view_weight: Float[Tensor, "T N P"]
     mean_colour: Float[Tensor, "T P 3"]
     disagreement: Float[Tensor, "T P"]
+    count: Float[Tensor, "T P"]
     valid: Bool[Tensor, "T P"]
 
 
@@ -134,5 +137,6 @@ class Aggregate(nn.Module):
             view_weight=trust,
             mean_colour=(weight[..., None] * colours).sum(1) + 0.5 * ~seen[..., None],
             disagreement=torch.zeros_like(weight[:, 0]) if self.metric is None else variance @ self.metric.exp(),
+            count=seen / weight.square().sum(1).clamp(min=1e-6),
             valid=seen,
         )

@@ -8,18 +8,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tidefield.config import NetworkConfig, StageConfig
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.aggregate import Aggregate, Evidence
-from tidefield.model.compositing import weights
+from tidefield.model.compositing import surface_logits, weights
 from tidefield.model.intervals import Intervals
 from tidefield.model.ray_transformer import RayTransformer
 from tidefield.model.views import Gathered
 
+UNLIKELY = -30.0
+"""Score of a sample that no view sees."""
 NOISE = 1e-4
 """Variance of a colour below which views agree: 2.5 of 255 levels."""
 
@@ -80,8 +82,8 @@ class Stage(nn.Module):
         self.as_printed = network.as_printed
         if not network.as_printed:
             self.guide = nn.Linear(3, hidden)
-            # At the start: density where the views agree and, in the first pass, within some samples of where the
-            # surface is expected; the network corrects it.
+            # At the start: the surface is where the views agree and, in the first pass, within some samples of where
+            # it is expected; the network corrects it.
             self.match = nn.Parameter(torch.tensor(3.0))
             self.guide_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
             self.guide_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
@@ -96,7 +98,8 @@ class Stage(nn.Module):
             empty = field.new_zeros(tiles, 0, count, self.hidden)
             known = torch.ones(tiles, count, dtype=torch.bool, device=field.device)
             grey = field.new_full((tiles, count, 3), 0.5)
-            return Evidence(self.from_field(field), empty, empty[..., 0], grey, grey[..., 0] * 0, known)
+            none = grey[..., 0] * 0
+            return Evidence(self.from_field(field), empty, empty[..., 0], grey, none, none, known)
         presence = None if self.as_printed else gathered.presence
         evidence = self.aggregate(gathered.features, gathered.colours, gathered.cosine, gathered.valid, presence)
         if field is None:
@@ -110,8 +113,9 @@ class Stage(nn.Module):
     ) -> Float[Tensor, "T R M"]:
         """How much each sample contributes to its ray.
 
-        Density is predicted per unit of length. With views the unit is the mean spacing of the ray's samples, which the
-        features resolve, whatever the scene's scale; a field, which must say the same from everywhere, brings its own.
+        Density is predicted per unit of length. With views the unit is a length that their features resolve, whatever
+        the scene's scale: the sample's own interval or, as printed, the mean one of the ray; a field, which must say
+        the same from everywhere, brings its own.
         """
         shape = samples.place.shape
         x = evidence.density.unflatten(1, shape[1:])
@@ -119,22 +123,37 @@ class Stage(nn.Module):
         bias: Tensor | float = 0.0
         if not self.as_printed:
             x, bias = self._guide(x, samples, intervals)
-            difference = torch.log(evidence.disagreement.unflatten(1, shape[1:]) + NOISE).masked_fill(~valid, 9.0)
-            bias = bias - self.match * (difference - difference.amin(-1, keepdim=True))
+            if unit is None:
+                score = (bias + self._agreement(evidence, valid)).masked_fill(~valid, UNLIKELY)
+                bias = surface_logits(score, opaque)
         if hasattr(self, "transformer"):
             rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
             x = self.transformer(*rays).unflatten(0, shape[:2])
-        length = samples.delta.mean(-1, keepdim=True) if unit is None else unit
-        sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
         delta = samples.delta
+        length = unit
+        if unit is None:
+            length = delta.mean(-1, keepdim=True) if self.as_printed else delta.clamp(min=1e-9)
+        sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
         if opaque:
             delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)
         return weights(sigma, delta)
 
+    def _agreement(self, evidence: Evidence, valid: Bool[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
+        """How much likelier the surface is at each sample than at the ray's usual one, from how well the views agree.
+
+        As if what k views see were normal: of one surface with a small variance, of k different things with a large
+        one. The logarithm of the ratio of the two likelihoods grows with k - 1, so a lone view, which always agrees
+        with itself, says nothing.
+        """
+        freedom = (evidence.count.unflatten(1, valid.shape[1:]) - 1).clamp(min=0) * valid
+        unlike = torch.log(evidence.disagreement.unflatten(1, valid.shape[1:]) + NOISE)
+        usual = (freedom * unlike).sum(-1, keepdim=True) / freedom.sum(-1, keepdim=True).clamp(min=1e-3)
+        return self.match * freedom * (usual - unlike)
+
     def _guide(
         self, x: Float[Tensor, "T R M H"], samples: Samples, intervals: Intervals
     ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
-        """Tell the samples where the surface is expected: as a feature, and as a bias of their density."""
+        """Tell the samples where the surface is expected: as a feature, and as a score."""
         expected = intervals.expected_place
         known = expected.isfinite()[..., None]
         # In samples, so that it means the same for any number of them and any interval.

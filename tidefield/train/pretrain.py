@@ -43,6 +43,21 @@ def together() -> bool:
     return dist.is_available() and dist.is_initialized()
 
 
+def processes() -> int:
+    """How many train together; 1 for one alone."""
+    return dist.get_world_size() if together() else 1
+
+
+def leads() -> bool:
+    """Whether this process writes and tells what is learned: the first one does."""
+    return not together() or dist.get_rank() == 0
+
+
+def own_seed(seed: int) -> int:
+    """A seed of this process's own."""
+    return seed + (1_000_003 * dist.get_rank() if together() else 0)
+
+
 def join(device: torch.device) -> torch.device:
     """Take part in what `torchrun` started, if it did; returns where this process computes."""
     if "LOCAL_RANK" not in os.environ:
@@ -51,11 +66,14 @@ def join(device: torch.device) -> torch.device:
         device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
         torch.cuda.set_device(device)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    dist.barrier()
     return device
 
 
 def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> dict[str, Scene]:
     """A procedural scene of each kind, that no stream has, and the real ones, by kind."""
+    if not leads():
+        dist.barrier()  # the first process makes them
     scenes = {}
     for number, category in enumerate(CATEGORIES):
         path = folder / "validation" / category
@@ -63,6 +81,8 @@ def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> d
             console.print(f"Making a scene to validate on: {category}", highlight=False)
             make(Recipe(category, (1 << 31) + number, 16, 224, Flight(), ()), path)
         scenes[category] = load_scene(path)
+    if together() and leads():
+        dist.barrier()
     return scenes | {path.resolve().name: load_scene(path, width=VALIDATION_WIDTH) for path in real}
 
 
@@ -83,21 +103,19 @@ class Pretrainer(Learner):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = Network(config.network).to(device)
-        rank = dist.get_rank() if together() else 0
-        super().__init__(network, groups_of(network, config.train), shown, seed + rank, device, (0.9, 0.99), 1e-12)
-        self.config, self.stream, self.seed = config, stream, seed + rank
+        self.config, self.stream, self.seed = config, stream, own_seed(seed)
+        super().__init__(network, groups_of(network, config.train), shown, self.seed, device, (0.9, 0.99), 1e-12)
         objective = Objective(network, config.train)
         # Of a network without a field, what only acts between views (eq. 6) has no gradient where one view sees.
         self.objective = DistributedDataParallel(objective, find_unused_parameters=True) if together() else objective
 
     @property
     def leads(self) -> bool:
-        return not together() or dist.get_rank() == 0
+        return leads()
 
     @property
     def rays_per_step(self) -> int:
-        processes = dist.get_world_size() if together() else 1
-        return processes * self.config.train.tiles * self.config.train.tile_px**2
+        return processes() * self.config.train.tiles * self.config.train.tile_px**2
 
     def rate(self, share: float) -> float:
         return cosine_rate(self.progress.step, share, self.config.train.warm_up)
@@ -125,7 +143,7 @@ class Pretrainer(Learner):
         super().resume(folder)
         if together():
             # The checkpoint holds the leader's random state; the others must not draw what it draws.
-            self.generator.manual_seed(self.seed + 1_000_003 * self.progress.step)
+            self.generator.manual_seed(self.seed + self.progress.step)
 
 
 class Validation:

@@ -1,4 +1,4 @@
-"""An endless stream of scenes to learn from: procedural tidal flats and clutter, and real ones.
+"""An endless stream of scenes to learn from: procedural tidal flats, and real ones.
 
 Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
 next, which another process has made meanwhile.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -22,25 +23,21 @@ from tidefield.data.batches import Surfaces
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.data.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
-from tidefield.data.synthetic.clutter import Rig, make_clutter
 from tidefield.geometry.cameras import Cameras
 
 AT_HAND = 6
 """Procedural scenes at a time."""
 STEPS_EACH = 250
 """Steps after which the oldest makes room."""
-CLUTTER_SHARE = 0.4
-"""Of the procedural scenes that are no tidal flats, so that depth is learned, too."""
-RIGS: tuple[Rig, ...] = ("front", "around", "above")
-REAL_SHARE = 0.3
+REAL_SHARE = 0.5
 """Of the steps that learn from a real scene, where there are some."""
 WIDTHS = (256, 400)
 """Of real scenes' photographs: each is there at both."""
 MISPOSED_DEG = 0.6
-BLIND_SHARE = 0.25
-"""Of the steps that do without sparse points, as many scenes that are not surveys have none."""
-BLIND_NEAR, BLIND_FAR = (0.3, 0.95), (1.05, 3.0)
-"""Factors of the scene's near and far that they are given instead."""
+SPARSE_SHARE = 0.5
+"""Of the steps that know few of their scene's points, so that depth is learned from what the views see, too."""
+SPARSE_POINTS = 0.01, 0.3
+"""Shares of the points that they know: one for each scene."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +58,6 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Clutter:
-    """What a scene that is no survey is made of: see `make_clutter`."""
-
-    rig: Rig
-    seed: int
-    views: int
-    width: int
-    white: bool
-
-
-@dataclass(frozen=True)
 class Drawn:
     """A scene with what training asks of it; cameras are where the network is."""
 
@@ -80,14 +66,9 @@ class Drawn:
     cameras: Cameras
 
 
-def recipe(seed: int, number: int) -> Recipe | Clutter:
+def recipe(seed: int, number: int) -> Recipe:
     """Scene `number` of a seed: all that deployment may meet, drawn at random."""
     random = np.random.default_rng([seed, number, 77])
-    if random.random() < CLUTTER_SHARE:
-        rig: Rig = RIGS[int(random.integers(len(RIGS)))]
-        white = rig == "around" and bool(random.random() < 0.6)
-        width = int(random.choice([224, 288]))
-        return Clutter(rig, int(random.integers(1 << 31)), int(random.integers(14, 24)), width, white)
     views = int(random.integers(18, 32))
     flight = Flight(
         altitude_m=float(math.exp(random.uniform(math.log(18), math.log(110)))),
@@ -130,6 +111,11 @@ def misposed(survey: Survey, given: Recipe) -> Survey:
     return replace(survey, cameras=replace(survey.cameras, T_world_camera=pose))
 
 
+def _end_quietly() -> None:
+    """A process that is told to end ends; imported libraries would print where it stood."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 @runtime_checkable
 class Source(Protocol):
     """Where scenes to learn from come from."""
@@ -153,11 +139,10 @@ class Stream:
         self.folder, self.seed, self.device = folder, seed, device
         loaded = [load_scene(path, width=width) for path in real for width in WIDTHS]
         self.real = [self._both(scene) for scene in loaded]
-        self.pictures = tuple(scene.photographs[i] for scene in loaded for i in scene.train)
         self.pool: dict[int, tuple[Drawn, Drawn]] = {}
         self.coming: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
-        self.maker = get_context("spawn").Pool(1)
+        self.maker = get_context("spawn").Pool(1, _end_quietly)
         folder.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Stream:
@@ -170,9 +155,9 @@ class Stream:
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step; the same for the same step, seed and state of the generator."""
         first = step // STEPS_EACH
-        blind = bool(torch.rand((), generator=generator) < BLIND_SHARE)
+        sparse = bool(torch.rand((), generator=generator) < SPARSE_SHARE)
         if self.real and torch.rand((), generator=generator) < REAL_SHARE:
-            return self.real[int(torch.randint(len(self.real), (), generator=generator))][blind]
+            return self.real[int(torch.randint(len(self.real), (), generator=generator))][sparse]
         number = first + int(torch.randint(AT_HAND, (), generator=generator))
         for gone in [k for k in self.pool if k < first]:
             del self.pool[gone]
@@ -181,32 +166,28 @@ class Stream:
             self._order(soon)
         if number not in self.pool:
             self.pool[number] = self._both(self._made(number))
-        return self.pool[number][blind]
+        return self.pool[number][sparse]
 
     def _made(self, number: int) -> Scene:
-        given = recipe(self.seed, number)
-        if isinstance(given, Clutter):
-            return make_clutter(given.seed, given.views, given.width, given.rig, self.pictures, given.white)
         if number in self.coming:
             self.coming.pop(number).get()
         return load_scene(self._path(number), cache=self._path(number) / "decoded")  # forgotten with the scene
 
     def _order(self, number: int) -> None:
-        """Have a survey made, unless it is there or coming; clutter is made when it is wanted."""
-        given = recipe(self.seed, number)
-        if isinstance(given, Recipe) and number not in self.coming and not self._path(number).exists():
-            self.coming[number] = self.maker.apply_async(make, (given, self._path(number)))
+        """Have a scene made, unless it is there or coming."""
+        if number not in self.coming and not self._path(number).exists():
+            self.coming[number] = self.maker.apply_async(make, (recipe(self.seed, number), self._path(number)))
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
 
     def _both(self, scene: Scene) -> tuple[Drawn, Drawn]:
-        """A scene with its sparse points, and without; what is known of its depths is told to the loss in any case."""
-        random = np.random.default_rng([self.seed, len(scene.names), int(scene.cameras.size_px[0, 0])])
-        factors = torch.tensor([random.uniform(*BLIND_NEAR), random.uniform(*BLIND_FAR)]).float()
-        cameras = replace(scene.cameras, near_far=scene.cameras.near_far * factors)
-        blind = replace(scene, points=None, cameras=cameras)
-        return (
-            Drawn(scene, Surfaces(scene), scene.cameras.to(self.device)),
-            Drawn(blind, Surfaces(blind, scene.points), cameras.to(self.device)),
-        )
+        """A scene with its sparse points, and with few of them; all that were observed are told to the loss."""
+        cameras, whole = scene.cameras.to(self.device), Surfaces(scene)
+        if scene.points is None:
+            return (Drawn(scene, whole, cameras),) * 2
+        random = np.random.default_rng([self.seed, len(scene.names), len(scene.points.xyz_world)])
+        share = math.exp(random.uniform(*np.log(SPARSE_POINTS)))
+        kept = torch.from_numpy(random.random(len(scene.points.xyz_world)) < share)
+        sparse = replace(scene, points=scene.points.subset(kept))
+        return Drawn(scene, whole, cameras), Drawn(sparse, Surfaces(sparse, scene.points), cameras)
