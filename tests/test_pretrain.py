@@ -83,25 +83,33 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
 
 
-def test_scenes_come_with_their_points_and_with_few_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "recipe", small_recipe)
-    monkeypatch.setattr(stream, "AT_HAND", 1)
-    generator = torch.Generator().manual_seed(0)
+def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
+    every = [stream.slot(3, number, 0.5) for number in range(100)]
+    assert every[5] == stream.slot(3, 5, 0.5)
+    assert 30 < sum(own.recipe is None for own in every) < 70
+    assert all(own.recipe is not None for own in [stream.slot(3, number, 0.0) for number in range(20)])
+    for hard in ([own.points_share < 1 for own in every], [own.shift_px > 0 for own in every]):
+        assert 30 < sum(hard) < 70
+    assert len({own.points_share for own in every}) > 30
+    assert len({own.shift_px for own in every}) > 30
+
+
+def test_hardships_are_few_points_and_photographs_that_are_off(tmp_path: Path) -> None:
+    at = wall.scene(wall.cameras(6))
+    easy, hard = stream.Slot(None, 0.0, 1.0, 0.0, 7), stream.Slot(None, 0.0, 0.2, 0.5, 7)
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
-        drawn = [scenes.draw(0, generator) for _ in range(40)]
-    count = [len(one.scene.points.xyz_world) for one in drawn if one.scene.points is not None]
-    assert len(count) == 40
-    assert len(set(count)) == 2
-    assert min(count) < 0.4 * max(count)
-    assert 10 < count.count(min(count)) < 30
-    few, whole = drawn[count.index(min(count))], drawn[count.index(max(count))]
+        whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
+    assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
+    assert 0.2 < float((few.cameras.principal_px - at.cameras.principal_px).std()) < 1
+    assert torch.equal(few.cameras.principal_px, few.scene.cameras.principal_px)
+    assert at.points is not None
+    assert few.scene.points is not None
+    assert 0.1 < len(few.scene.points.xyz_world) / len(at.points.xyz_world) < 0.3
     assert len(few.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px) > 0
-    assert not torch.equal(few.surfaces[0], whole.surfaces[0])
     points = few.scene.points
-    assert points is not None
     assert len(points.error_px) == len(points.xyz_world) == len(points.point_index.unique())
-    seen_at = few.scene.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
-    assert (seen_at - points.uv_px).norm(dim=-1).median() < 1, "every observation is still of its point"
+    seen_at = at.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
+    assert (seen_at - points.uv_px).norm(dim=-1).max() < 1e-3, "every observation is still of its point"
 
 
 def test_a_photograph_is_told_a_wrong_attitude(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """An endless stream of scenes to learn from: procedural tidal flats, and real ones.
 
 Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
-next, which another process has made meanwhile.
+next, which another process has made meanwhile. Procedural or real, a scene comes with hardships of its own: photographs
+that are a little off, and few sparse points.
 """
 
 from __future__ import annotations
@@ -25,19 +26,23 @@ from tidefield.data.scene import Scene
 from tidefield.data.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 from tidefield.geometry.cameras import Cameras
 
-AT_HAND = 6
-"""Procedural scenes at a time."""
-STEPS_EACH = 250
+AT_HAND = 8
+"""Scenes at a time."""
+STEPS_EACH = 200
 """Steps after which the oldest makes room."""
 REAL_SHARE = 0.5
-"""Of the steps that learn from a real scene, where there are some."""
+"""Of the scenes, where there are real ones."""
 WIDTHS = (256, 400)
 """Of real scenes' photographs: each is there at both."""
 MISPOSED_DEG = 0.6
 SPARSE_SHARE = 0.5
-"""Of the steps that know few of their scene's points, so that depth is learned from what the views see, too."""
+"""Of the scenes with few points, so that depth is learned from what the views see, too."""
 SPARSE_POINTS = 0.01, 0.3
-"""Shares of the points that they know: one for each scene."""
+"""Shares of the points that these have."""
+SHIFTED_SHARE = 0.5
+"""Of the scenes whose photographs are off, so that views are averaged where they do not quite fit."""
+SHIFT_PX = 0.2, 1.0
+"""Standard deviations of that, pixels: one for each of these scenes."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,25 @@ class Recipe:
 
 
 @dataclass(frozen=True)
+class Slot:
+    """What is at hand under a number.
+
+    Attributes:
+        recipe: of a procedural scene; None for a real one.
+        choice: which of the real ones, 0 to 1.
+        points_share: of the sparse points that are known.
+        shift_px: standard deviation of how far its photographs are off.
+        seed: of what is random in this.
+    """
+
+    recipe: Recipe | None
+    choice: float
+    points_share: float
+    shift_px: float
+    seed: int
+
+
+@dataclass(frozen=True)
 class Drawn:
     """A scene with what training asks of it; cameras are where the network is."""
 
@@ -66,8 +90,22 @@ class Drawn:
     cameras: Cameras
 
 
+def slot(seed: int, number: int, real_share: float) -> Slot:
+    """Scene `number` of a seed, and its hardships."""
+    random = np.random.default_rng([seed, number, 78])
+    made = recipe(seed, number) if random.random() >= real_share else None
+    sparse, shifted = random.random() < SPARSE_SHARE, random.random() < SHIFTED_SHARE
+    return Slot(
+        recipe=made,
+        choice=float(random.random()),
+        points_share=math.exp(random.uniform(*np.log(SPARSE_POINTS))) if sparse else 1.0,
+        shift_px=float(random.uniform(*SHIFT_PX)) if shifted else 0.0,
+        seed=int(random.integers(1 << 31)),
+    )
+
+
 def recipe(seed: int, number: int) -> Recipe:
-    """Scene `number` of a seed: all that deployment may meet, drawn at random."""
+    """Procedural scene `number` of a seed: all that deployment may meet, drawn at random."""
     random = np.random.default_rng([seed, number, 77])
     views = int(random.integers(18, 32))
     flight = Flight(
@@ -137,9 +175,8 @@ class Stream:
 
     def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
         self.folder, self.seed, self.device = folder, seed, device
-        loaded = [load_scene(path, width=width) for path in real for width in WIDTHS]
-        self.real = [self._both(scene) for scene in loaded]
-        self.pool: dict[int, tuple[Drawn, Drawn]] = {}
+        self.real = [load_scene(path, width=width) for path in real for width in WIDTHS]
+        self.pool: dict[int, Drawn] = {}
         self.coming: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
         self.maker = get_context("spawn").Pool(1, _end_quietly)
@@ -155,9 +192,6 @@ class Stream:
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step; the same for the same step, seed and state of the generator."""
         first = step // STEPS_EACH
-        sparse = bool(torch.rand((), generator=generator) < SPARSE_SHARE)
-        if self.real and torch.rand((), generator=generator) < REAL_SHARE:
-            return self.real[int(torch.randint(len(self.real), (), generator=generator))][sparse]
         number = first + int(torch.randint(AT_HAND, (), generator=generator))
         for gone in [k for k in self.pool if k < first]:
             del self.pool[gone]
@@ -165,8 +199,13 @@ class Stream:
         for soon in range(first, first + AT_HAND + 1):
             self._order(soon)
         if number not in self.pool:
-            self.pool[number] = self._both(self._made(number))
-        return self.pool[number][sparse]
+            own = self._slot(number)
+            scene = self.real[int(own.choice * len(self.real))] if own.recipe is None else self._made(number)
+            self.pool[number] = self._with_hardships(scene, own)
+        return self.pool[number]
+
+    def _slot(self, number: int) -> Slot:
+        return slot(self.seed, number, REAL_SHARE if self.real else 0.0)
 
     def _made(self, number: int) -> Scene:
         if number in self.coming:
@@ -174,20 +213,21 @@ class Stream:
         return load_scene(self._path(number), cache=self._path(number) / "decoded")  # forgotten with the scene
 
     def _order(self, number: int) -> None:
-        """Have a scene made, unless it is there or coming."""
-        if number not in self.coming and not self._path(number).exists():
-            self.coming[number] = self.maker.apply_async(make, (recipe(self.seed, number), self._path(number)))
+        """Have a procedural scene made, unless it is there or coming."""
+        wanted = self._slot(number).recipe
+        if wanted is not None and number not in self.coming and not self._path(number).exists():
+            self.coming[number] = self.maker.apply_async(make, (wanted, self._path(number)))
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
 
-    def _both(self, scene: Scene) -> tuple[Drawn, Drawn]:
-        """A scene with its sparse points, and with few of them; all that were observed are told to the loss."""
-        cameras, whole = scene.cameras.to(self.device), Surfaces(scene)
-        if scene.points is None:
-            return (Drawn(scene, whole, cameras),) * 2
-        random = np.random.default_rng([self.seed, len(scene.names), len(scene.points.xyz_world)])
-        share = math.exp(random.uniform(*np.log(SPARSE_POINTS)))
-        kept = torch.from_numpy(random.random(len(scene.points.xyz_world)) < share)
-        sparse = replace(scene, points=scene.points.subset(kept))
-        return Drawn(scene, whole, cameras), Drawn(sparse, Surfaces(sparse, scene.points), cameras)
+    def _with_hardships(self, scene: Scene, own: Slot) -> Drawn:
+        """A scene whose photographs are off, of which few points are known; the loss is told of all observed ones."""
+        random = np.random.default_rng(own.seed)
+        off = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
+        cameras = replace(scene.cameras, principal_px=scene.cameras.principal_px + off)
+        known = scene.points
+        if known is not None and own.points_share < 1:
+            known = known.subset(torch.from_numpy(random.random(len(known.xyz_world)) < own.points_share))
+        hard = replace(scene, cameras=cameras, points=known)
+        return Drawn(hard, Surfaces(hard, scene.points), cameras.to(self.device))
