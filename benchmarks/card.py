@@ -13,7 +13,7 @@ from tidefield.compare.table import Table, shown
 from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
 from tidefield.files import completed_file
-from tidefield.train.stream import SHIFT_PX, SHIFTED_SHARE, SPARSE_POINTS, SPARSE_SHARE
+from tidefield.train.stream import SHIFT_PX, SHIFTED_SHARE, SPARSE_POINTS, SPARSE_SHARE, UNEVEN, UNEVEN_SHARE
 from tidefield.train.weights import about, sha256
 
 METHODS = (ZERO_SHOT, "nerfacto", *UNTRAINED)
@@ -57,6 +57,8 @@ def card(weights: Path, results: Results) -> str:
     real = "".join(f"\n- {name}: the training photographs ({LICENCES[name]})" for name in told["real"])
     machine, preset = told["machine"], told["config"]["preset"]
     named = f" --real {' '.join(told['real'])}" if told["real"] else ""
+    count = told["processes"]
+    launch = "tidefield" if count == 1 else f"torchrun --nproc-per-node {count} -m tidefield.cli"
     parts = [
         f"# Weights of the preset {preset}",
         f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, SHA-256 `{sha256(weights)}`. "
@@ -69,10 +71,11 @@ def card(weights: Path, results: Results) -> str:
         "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
         f"moving water and wrong poses{real}",
         f"{SPARSE_SHARE:.0%} of the scenes came with {SPARSE_POINTS[0]:.0%} to {SPARSE_POINTS[1]:.0%} of their sparse "
-        f"points, and of {SHIFTED_SHARE:.0%} the photographs were off by {SHIFT_PX[0]} to {SHIFT_PX[1]} px.",
+        f"points, and of {SHIFTED_SHARE:.0%} the photographs were off by {SHIFT_PX[0]} to {SHIFT_PX[1]} px, of "
+        f"{UNEVEN_SHARE:.0%} the exposures by {UNEVEN[0]:.0%} to {UNEVEN[1]:.0%}.",
         f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
         f"cores, {told['date']}, Tidefield {told['version']}:",
-        f"    tidefield pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
+        f"    {launch} pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
         "PSNR in dB on scenes that nothing is learned from (of the real ones, their held-out photographs), two small "
         "views of each:",
         _curve(told["validation"]).markdown(),

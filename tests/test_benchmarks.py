@@ -317,7 +317,14 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
 def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
     small, file = tiny("swift"), tmp_path / "swift.safetensors"
     points = [{"step": 1000, "seconds": 60.0, "psnr": {"vegetation": 25.5, "brighton_beach": 20.25}}]
-    told = {"steps": 1000, "seconds": 7200.0, "seed": 3, "real": ["brighton_beach"], "validation": points}
+    told = {
+        "steps": 1000,
+        "seconds": 7200.0,
+        "seed": 3,
+        "processes": 2,
+        "real": ["brighton_beach"],
+        "validation": points,
+    }
     write_weights(file, Network(small.network), small, {**told, **record.stamp()})
     with pytest.raises(RunError, match="no zero-shot results"):
         card.write_card(file, tmp_path / "comparison")
@@ -325,7 +332,8 @@ def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
     keep_result(tmp_path / "comparison", "swindale", "nerfacto", 21.25)
     text = card.write_card(file, tmp_path / "comparison").read_text()
     for line in (
-        "    tidefield pretrain OUT --real brighton_beach --preset swift --steps 1000 --seed 3",
+        "    torchrun --nproc-per-node 2 -m tidefield.cli pretrain OUT --real brighton_beach --preset swift "
+        "--steps 1000 --seed 3",
         "- brighton_beach: the training photographs (BSD-2-Clause, (c) 2017 Piero Toffanin)",
         "| 1,000 | 25.50 | 20.25 |",
         "| swindale | 24.50 | 21.25 | - | - | - |",

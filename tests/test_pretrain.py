@@ -88,20 +88,24 @@ def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
     assert every[5] == stream.slot(3, 5, 0.5)
     assert 30 < sum(own.recipe is None for own in every) < 70
     assert all(own.recipe is not None for own in [stream.slot(3, number, 0.0) for number in range(20)])
-    for hard in ([own.points_share < 1 for own in every], [own.shift_px > 0 for own in every]):
+    for hard in zip(*[(own.points_share < 1, own.shift_px > 0, own.uneven > 0) for own in every], strict=True):
         assert 30 < sum(hard) < 70
     assert len({own.points_share for own in every}) > 30
     assert len({own.shift_px for own in every}) > 30
+    assert len({own.uneven for own in every}) > 30
 
 
-def test_hardships_are_few_points_and_photographs_that_are_off(tmp_path: Path) -> None:
+def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
     at = wall.scene(wall.cameras(6))
-    easy, hard = stream.Slot(None, 0.0, 1.0, 0.0, 7), stream.Slot(None, 0.0, 0.2, 0.5, 7)
+    easy, hard = stream.Slot(None, 0.0, 1.0, 0.0, 0.0, 7), stream.Slot(None, 0.0, 0.2, 0.5, 0.05, 7)
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
         whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
     assert 0.2 < float((few.cameras.principal_px - at.cameras.principal_px).std()) < 1
     assert torch.equal(few.cameras.principal_px, few.scene.cameras.principal_px)
+    assert torch.equal(whole.cameras.gain, at.cameras.gain)
+    assert 0.02 < float((few.cameras.gain / at.cameras.gain).log()[:, 0].std()) < 0.1
+    assert torch.equal(few.cameras.gain, few.scene.cameras.gain)
     assert at.points is not None
     assert few.scene.points is not None
     assert 0.1 < len(few.scene.points.xyz_world) / len(at.points.xyz_world) < 0.3

@@ -1,8 +1,8 @@
 """An endless stream of scenes to learn from: procedural tidal flats, and real ones.
 
 Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
-next, which another process has made meanwhile. Procedural or real, a scene comes with hardships of its own: photographs
-that are a little off, and few sparse points.
+next, which another process has made meanwhile. Procedural or real, a scene comes with hardships of its own: few sparse
+points, photographs that are a little off, and exposures that are not quite evened out.
 """
 
 from __future__ import annotations
@@ -43,6 +43,10 @@ SHIFTED_SHARE = 0.5
 """Of the scenes whose photographs are off, so that views are averaged where they do not quite fit."""
 SHIFT_PX = 0.2, 1.0
 """Standard deviations of that, pixels: one for each of these scenes."""
+UNEVEN_SHARE = 0.5
+"""Of the scenes whose exposures are told wrong, so that no view is preferred for its colours."""
+UNEVEN = 0.01, 0.08
+"""Standard deviations of the logarithms of these: one for each of these scenes."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ class Slot:
         choice: which of the real ones, 0 to 1.
         points_share: of the sparse points that are known.
         shift_px: standard deviation of how far its photographs are off.
+        uneven: standard deviation of the logarithms of its exposures' errors.
         seed: of what is random in this.
     """
 
@@ -78,6 +83,7 @@ class Slot:
     choice: float
     points_share: float
     shift_px: float
+    uneven: float
     seed: int
 
 
@@ -94,12 +100,13 @@ def slot(seed: int, number: int, real_share: float) -> Slot:
     """Scene `number` of a seed, and its hardships."""
     random = np.random.default_rng([seed, number, 78])
     made = recipe(seed, number) if random.random() >= real_share else None
-    sparse, shifted = random.random() < SPARSE_SHARE, random.random() < SHIFTED_SHARE
+    sparse, shifted, uneven = (random.random() < s for s in (SPARSE_SHARE, SHIFTED_SHARE, UNEVEN_SHARE))
     return Slot(
         recipe=made,
         choice=float(random.random()),
         points_share=math.exp(random.uniform(*np.log(SPARSE_POINTS))) if sparse else 1.0,
         shift_px=float(random.uniform(*SHIFT_PX)) if shifted else 0.0,
+        uneven=float(random.uniform(*UNEVEN)) if uneven else 0.0,
         seed=int(random.integers(1 << 31)),
     )
 
@@ -222,10 +229,12 @@ class Stream:
         return self.folder / f"{self.seed}-{number:06d}"
 
     def _with_hardships(self, scene: Scene, own: Slot) -> Drawn:
-        """A scene whose photographs are off, of which few points are known; the loss is told of all observed ones."""
+        """A scene with photographs that are off and few known points; the loss is told of all that were observed."""
         random = np.random.default_rng(own.seed)
         off = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
-        cameras = replace(scene.cameras, principal_px=scene.cameras.principal_px + off)
+        light = torch.from_numpy(np.exp(random.normal(scale=own.uneven, size=(len(scene.names), 1)))).float()
+        principal, gain = scene.cameras.principal_px + off, scene.cameras.gain * light
+        cameras = replace(scene.cameras, principal_px=principal, gain=gain)
         known = scene.points
         if known is not None and own.points_share < 1:
             known = known.subset(torch.from_numpy(random.random(len(known.xyz_world)) < own.points_share))
