@@ -130,8 +130,9 @@ class Stage(nn.Module):
             rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
             x = self.transformer(*rays).unflatten(0, shape[:2])
         delta = samples.delta
-        length = unit
-        if unit is None:
+        if unit is not None:
+            length = unit
+        else:
             length = delta.mean(-1, keepdim=True) if self.as_printed else delta.clamp(min=1e-9)
         sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
         if opaque:
