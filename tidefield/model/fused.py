@@ -23,8 +23,15 @@ BLOCK = 64
 
 
 @triton.jit
-def _corners(uv, first, size, origin, image, sample, inside, stride, reach):
-    """Rows of the four texels around each sample, their shares, and whether the sample lies on the map."""
+def _corners(uv, first, size, origin, stride, reach, count, C: tl.constexpr, CP: tl.constexpr, B: tl.constexpr):
+    """A program's samples: which, which of them there are, the same with their channels; the rows of the four texels
+    around each, their shares, and whether the sample lies on the map."""
+    image = tl.program_id(0)
+    place = tl.program_id(1) * B + tl.arange(0, B)
+    inside = place < count
+    sample = image * count + place
+    channel = tl.arange(0, CP)[None, :]
+    there = inside[:, None] & (channel < C)
     width = tl.load(size + image * 2)
     height = tl.load(size + image * 2 + 1)
     x = (tl.load(uv + sample * 2, mask=inside, other=0.0) - tl.load(origin + image * 2)) / stride
@@ -42,27 +49,22 @@ def _corners(uv, first, size, origin, image, sample, inside, stride, reach):
     top = tl.minimum(tl.maximum(top, 0), height - 1)
     base = tl.load(first + image)
     upper, lower = base + top * width, base + low * width
-    return upper + left, upper + right, lower + left, lower + right, right_share, low_share, on_map
+    a, b, c, d = upper + left, upper + right, lower + left, lower + right
+    return sample, inside, channel, there, a, b, c, d, right_share, low_share, on_map
 
 
 @triton.jit
 def _read_forward(
     rows, uv, first, size, origin, values, on, stride, reach, count, C: tl.constexpr, CP: tl.constexpr, B: tl.constexpr
 ):
-    image = tl.program_id(0)
-    place = tl.program_id(1) * B + tl.arange(0, B)
-    inside = place < count
-    sample = image * count + place
-    a, b, c, d, right, low, on_map = _corners(uv, first, size, origin, image, sample, inside, stride, reach)
-    channel = tl.arange(0, CP)
-    there = inside[:, None] & (channel < C)[None, :]
-    total = (
-        tl.load(rows + a[:, None] * C + channel[None, :], mask=there, other=0.0) * ((1 - low) * (1 - right))[:, None]
+    sample, inside, channel, there, a, b, c, d, right, low, on_map = _corners(
+        uv, first, size, origin, stride, reach, count, C, CP, B
     )
-    total += tl.load(rows + b[:, None] * C + channel[None, :], mask=there, other=0.0) * ((1 - low) * right)[:, None]
-    total += tl.load(rows + c[:, None] * C + channel[None, :], mask=there, other=0.0) * (low * (1 - right))[:, None]
-    total += tl.load(rows + d[:, None] * C + channel[None, :], mask=there, other=0.0) * (low * right)[:, None]
-    tl.store(values + sample[:, None] * C + channel[None, :], total, mask=there)
+    total = tl.load(rows + a[:, None] * C + channel, mask=there, other=0.0) * ((1 - low) * (1 - right))[:, None]
+    total += tl.load(rows + b[:, None] * C + channel, mask=there, other=0.0) * ((1 - low) * right)[:, None]
+    total += tl.load(rows + c[:, None] * C + channel, mask=there, other=0.0) * (low * (1 - right))[:, None]
+    total += tl.load(rows + d[:, None] * C + channel, mask=there, other=0.0) * (low * right)[:, None]
+    tl.store(values + sample[:, None] * C + channel, total, mask=there)
     tl.store(on + sample, on_map, mask=inside)
 
 
@@ -70,18 +72,14 @@ def _read_forward(
 def _read_backward(
     uv, first, size, origin, grad, out, stride, reach, count, C: tl.constexpr, CP: tl.constexpr, B: tl.constexpr
 ):
-    image = tl.program_id(0)
-    place = tl.program_id(1) * B + tl.arange(0, B)
-    inside = place < count
-    sample = image * count + place
-    a, b, c, d, right, low, _ = _corners(uv, first, size, origin, image, sample, inside, stride, reach)
-    channel = tl.arange(0, CP)
-    there = inside[:, None] & (channel < C)[None, :]
-    g = tl.load(grad + sample[:, None] * C + channel[None, :], mask=there, other=0.0)
-    tl.atomic_add(out + a[:, None] * C + channel[None, :], g * ((1 - low) * (1 - right))[:, None], mask=there)
-    tl.atomic_add(out + b[:, None] * C + channel[None, :], g * ((1 - low) * right)[:, None], mask=there)
-    tl.atomic_add(out + c[:, None] * C + channel[None, :], g * (low * (1 - right))[:, None], mask=there)
-    tl.atomic_add(out + d[:, None] * C + channel[None, :], g * (low * right)[:, None], mask=there)
+    sample, _, channel, there, a, b, c, d, right, low, _ = _corners(
+        uv, first, size, origin, stride, reach, count, C, CP, B
+    )
+    g = tl.load(grad + sample[:, None] * C + channel, mask=there, other=0.0)
+    tl.atomic_add(out + a[:, None] * C + channel, g * ((1 - low) * (1 - right))[:, None], mask=there)
+    tl.atomic_add(out + b[:, None] * C + channel, g * ((1 - low) * right)[:, None], mask=there)
+    tl.atomic_add(out + c[:, None] * C + channel, g * (low * (1 - right))[:, None], mask=there)
+    tl.atomic_add(out + d[:, None] * C + channel, g * (low * right)[:, None], mask=there)
 
 
 class _Read(torch.autograd.Function):

@@ -130,10 +130,8 @@ class Stage(nn.Module):
             rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
             x = self.transformer(*rays).unflatten(0, shape[:2])
         delta = samples.delta
-        if unit is not None:
-            length = unit
-        else:
-            length = delta.mean(-1, keepdim=True) if self.as_printed else delta.clamp(min=1e-9)
+        own = delta.mean(-1, keepdim=True) if self.as_printed else delta.clamp(min=1e-9)
+        length = own if unit is None else unit
         sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
         if opaque:
             delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)

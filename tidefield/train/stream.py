@@ -12,6 +12,7 @@ import shutil
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from multiprocessing import get_context
 from multiprocessing.pool import AsyncResult
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from tidefield.data.batches import Surfaces
 from tidefield.data.load import load_scene
@@ -96,6 +98,7 @@ class Drawn:
     cameras: Cameras
 
 
+@cache  # asked for several at every step
 def slot(seed: int, number: int, real_share: float) -> Slot:
     """Scene `number` of a seed, and its hardships."""
     random = np.random.default_rng([seed, number, 78])
@@ -148,11 +151,9 @@ def misposed(survey: Survey, given: Recipe) -> Survey:
     pose = survey.cameras.T_world_camera.clone()
     random = np.random.default_rng([given.seed, 5])
     for index in given.misposed:
-        axis = torch.from_numpy(random.normal(size=3)).float()
-        angle = math.radians(MISPOSED_DEG)
-        skew = torch.tensor([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]]) / axis.norm()
-        turn = torch.linalg.matrix_exp(angle * skew)
-        pose[index, :, :3] = pose[index, :, :3] @ turn
+        axis = random.normal(size=3)
+        turn = Rotation.from_rotvec(math.radians(MISPOSED_DEG) * axis / np.linalg.norm(axis))
+        pose[index, :, :3] = pose[index, :, :3] @ torch.from_numpy(turn.as_matrix()).to(pose)
     return replace(survey, cameras=replace(survey.cameras, T_world_camera=pose))
 
 

@@ -112,7 +112,7 @@ def make_survey(
     tasks = [partial(_photograph, flat, cameras[i], supersample, i * flight.water_motion) for i in range(views)]
     photographs, depth = (torch.stack(parts) for parts in zip(*in_parallel(tasks, device), strict=True))
     cameras = replace(cameras, near_far=_near_far(depth))
-    points = sparse_points(cameras, photographs, depth, random, flat)
+    points = sparse_points(flat, cameras, photographs, depth, random)
     return Survey(category, seed, flat, cameras, photographs, depth, points)
 
 

@@ -25,21 +25,16 @@ _DEEP_M = 0.1
 
 
 def sparse_points(
+    flat: TidalFlat,
     cameras: Cameras,
     photographs: UInt8[Tensor, "V H W 3"],
     depth: Float[Tensor, "V H W"],
     random: np.random.Generator,
-    flat: TidalFlat | None = None,
 ) -> SparsePoints:
-    """Pick corners, find them in the other photographs by their true depth, add noise and triangulate.
-
-    Args:
-        flat: whose deep water has no points.
-    """
+    """Pick corners, find them in the other photographs by their true depth, add noise and triangulate."""
     device = depth.device
     true = torch.cat([_corners(cameras[i], photographs[i], depth[i], random) for i in range(len(cameras))])
-    if flat is not None:
-        true = true[flat.water_depth(true.T) < _DEEP_M]
+    true = true[flat.water_depth(true.T) < _DEEP_M]
     seen = _seen(cameras, depth, true)
     seen &= torch.from_numpy(random.random(seen.shape) < _FOUND).to(device)
     camera, point = torch.nonzero(seen, as_tuple=True)
