@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.model.compositing import composite, surface_logits, weights
+from tidefield.model.compositing import composite, surface_logits, surface_shares, weights
 
 
 def random_ray(rays: int = 20, samples: int = 9, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -97,6 +97,7 @@ def test_surface_logits_weigh_samples_by_the_softmax_of_their_scores(opaque: boo
     sigma = F.softplus(surface_logits(score, opaque)) / delta
     candidates = score if opaque else F.pad(score, (0, 1))
     expected = torch.softmax(candidates, -1)[..., : score.shape[-1]]
+    torch.testing.assert_close(surface_shares(score, opaque), expected)
     torch.testing.assert_close(weights(sigma, endless(delta) if opaque else delta), expected, rtol=1e-4, atol=1e-6)
 
 

@@ -44,6 +44,7 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         colour=uniform(TILES, pixels, 3),
         depth=torch.ones(TILES, pixels),
         opacity=torch.ones(TILES, pixels),
+        shown=torch.ones(TILES, pixels),
         expected=(0.2 + 0.01 * uniform(TILES, coarse), 0.2 + 0.01 * uniform(TILES, pixels)),
         glimpses=(uniform(TILES, coarse, 3),),
     )

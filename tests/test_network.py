@@ -141,7 +141,7 @@ def test_a_view_that_is_hardly_there_may_be_any_other():
         tiles, views, start = looking(own, scene())
         assert views is not None
         presence = views.presence.clone()
-        presence[:, 0] = 1e-3
+        presence[:, 0] = 1e-4
         rows, which = torch.arange(len(views.cameras)).reshape(views.which.shape), views.which.clone()
         rows[:, 0], which[:, 0] = rows[:, 3], which[:, 3]
         another = Views(views.cameras[rows.reshape(-1)], which, presence, views.encoded)
@@ -192,6 +192,34 @@ def test_an_untrained_network_renders_the_wall_from_its_neighbours():
     truth = at.photographs[TARGET].float() / 255
     error = (rendering.colour - truth)[4:-4, 8:-8].square().mean()
     assert -10 * error.log10() > 25
+
+
+def test_what_one_view_alone_sees_is_not_smeared_over_the_depths_it_might_have():
+    at = wall.scene(wall.cameras(7, 96, 72, step=0.5), (TARGET,))
+    own = network(SWIFT.network).eval()
+    with torch.inference_mode():
+        tiles, _, start = looking(own, at, 16, ((40, 28),))
+        wide = replace(start, near=start.expected * 1.5, far=start.expected / 1.5)
+        views = FeatureShelf(own, at, CPU).views(torch.tensor([[0]]), torch.ones(1, 1), torch.zeros(1, 3))
+        found = own(tiles, views, wide, True).colour.reshape(16, 16, 3)
+    truth = at.photographs[TARGET][28:44, 40:56] / 255
+    assert -10 * (found - truth).square().mean().log10() > 42
+
+
+def test_a_surface_that_no_view_sees_is_not_sought_where_they_see():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 3.0  # the others see nothing of the wall, but what may lie behind it
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose))
+    own = network(SWIFT.network).eval()
+    with torch.inference_mode():
+        tiles, views, start = looking(own, at, 16, ((40, 16),))
+        deep = replace(start, near=start.expected * 1.2, far=start.expected / 3)
+        found = own(tiles, views, deep, True)
+        farther = own(tiles, views, replace(deep, expected=deep.far * 1.2), True)
+    assert found.shown.max() < 0.1
+    assert (found.depth - wall.DEPTH).abs().max() < 0.1
+    assert farther.shown.reshape(16, 16)[:, :6].min() > 0.9, "there they see"
 
 
 def test_what_no_neighbour_sees_is_continued_from_beside_it():

@@ -29,6 +29,12 @@ def weights(sigma: Float[Tensor, "*R M"], delta: Float[Tensor, "*R M"]) -> Float
     return torch.exp(-before) * alpha
 
 
+def surface_shares(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
+    """The weights that `surface_logits` aims at: softmax(score), with the score 0 for what lies behind the last sample
+    unless nothing does."""
+    return torch.softmax(score if opaque else F.pad(score, (0, 1)), dim=-1)[..., : score.shape[-1]]
+
+
 def surface_logits(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
     """Logits of the opacities 1 - exp(-sigma_i delta_i) with which samples get the weights softmax(score).
 

@@ -22,7 +22,7 @@ from tidefield.model.encoder import Encoder
 from tidefield.model.field import Field
 from tidefield.model.gather import doubled, maps_from_images
 from tidefield.model.intervals import Intervals, histogram, refined, sample
-from tidefield.model.stage import Samples, Stage, place_samples
+from tidefield.model.stage import Samples, Stage, Weights, place_samples
 from tidefield.model.views import Encoded, Gathered, Views
 
 
@@ -55,6 +55,7 @@ class TileRendering:
         colour: without what lies behind the scene; add (1 - opacity) times the background.
         depth: expected z-depth.
         opacity: sum of the weights.
+        shown: how likely a view sees the surface.
         expected: per stage, the mean inverse depth of its rays, margin included.
         glimpses: per stage but the last, colours of its rays (margin included) as far as it can tell: the neighbours'
             mean colours under its weights.
@@ -63,6 +64,7 @@ class TileRendering:
     colour: Float[Tensor, "T R 3"]
     depth: Float[Tensor, "T R"]
     opacity: Float[Tensor, "T R"]
+    shown: Float[Tensor, "T R"]
     expected: tuple[Float[Tensor, "T _"], ...]
     glimpses: tuple[Float[Tensor, "T _ 3"], ...]
 
@@ -74,8 +76,11 @@ class _Look:
     samples: Samples
     gathered: Gathered | None
     evidence: Evidence
-    weights: Float[Tensor, "T R M"]
+    weights: Weights
     expected: Float[Tensor, "T R"]
+
+    def composite(self, colours: Float[Tensor, "T P 3"]) -> Float[Tensor, "T R 3"]:
+        return composite(self.weights.colour, colours.unflatten(1, self.weights.colour.shape[1:]))
 
 
 class Network(nn.Module):
@@ -121,16 +126,17 @@ class Network(nn.Module):
         for k in range(last):
             look = self._look(k, tiles, views, intervals, density, opaque, generator)
             expected.append(look.expected)
-            glimpses.append(composite(look.weights, look.evidence.mean_colour.unflatten(1, look.weights.shape[1:])))
+            glimpses.append(look.composite(look.evidence.mean_colour))
             this, following = self.config.stages[k : k + 2]
-            density = histogram(look.weights.detach(), look.samples.place, this.samples, self.config.doubt)
+            density = histogram(look.weights.surface.detach(), look.samples.place, this.samples, self.config.doubt)
             intervals, density = refined(intervals, density, this.stride // following.stride, self.margin(k + 1))
         look = self._look(last, tiles, views, intervals, density, opaque, generator)
         colours = self.colour(look.evidence, look.gathered, look.samples.directions)
         return TileRendering(
-            colour=composite(look.weights, colours.unflatten(1, look.weights.shape[1:])),
+            colour=look.composite(colours),
             depth=1 / look.expected,
-            opacity=look.weights.sum(-1),
+            opacity=look.weights.colour.sum(-1),
+            shown=look.weights.shown,
             expected=(*expected, look.expected),
             glimpses=tuple(glimpses),
         )
@@ -155,7 +161,7 @@ class Network(nn.Module):
         unit = self.field.unit if self.field and not views else None
         weights = stage.weights(evidence, samples, intervals, opaque, unit)
         # A ray that nothing stops is said to end in the middle of its samples.
-        known = weights + 1e-6 / weights.shape[-1]
+        known = weights.surface + 1e-6 / config.samples
         expected = (known * samples.inverse_depth).sum(-1) / known.sum(-1)
         return _Look(samples, gathered, evidence, weights, expected)
 

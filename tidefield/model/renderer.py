@@ -7,15 +7,14 @@ continued from beside it, unless the preset is to do as printed, a field knows t
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tidefield.config import Config
 from tidefield.data.batches import choose_neighbours, even, tile_surface
 from tidefield.data.prior import read_prior, surface_prior
 from tidefield.data.scene import Scene
-from tidefield.data.surface import in_frame
-from tidefield.geometry.cameras import Cameras, pixel_grid, project
+from tidefield.geometry.cameras import Cameras
 from tidefield.model.fill import fill_unseen
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, Tiles
@@ -70,19 +69,19 @@ class Renderer:
                 height, width = block.shape[:2]
                 at = (top * TILE_PX, left * TILE_PX)
                 picture[at[0] : at[0] + height, at[1] : at[1] + width] = block
-        colour, opacity, depth, seen = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
+        colour, opacity, depth, shown = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
         white = scene.background_rgb
         behind = self.fallback * camera.gain[0] if white is None else torch.tensor(white)
         colour = colour * camera.gain[0] + (1 - opacity) * behind
         if self.fills:
-            colour = fill_unseen(colour, seen[..., 0] > 0)
+            colour = fill_unseen(colour, shown[..., 0] > 0.5)
         colour = colour.clamp(0, 1)
         return Rendering(colour=colour, depth=depth[..., 0].clone(), opacity=opacity[..., 0].clamp(0, 1))
 
     def _block(
         self, camera: Cameras, prior: Float[Tensor, "3 h w"], corner: tuple[int, int], size: tuple[int, int]
     ) -> Float[Tensor, "H W 6"]:
-        """Colour, opacity, depth of a block of tiles, and whether a neighbour sees it; corner and size in tiles."""
+        """Colour, opacity, depth of a block of tiles, and how likely a neighbour sees it; corner and size in tiles."""
         (left, top), (columns, rows) = corner, size
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
@@ -95,35 +94,8 @@ class Renderer:
         for some in torch.arange(len(corners)).split(self.tiles_at_once):
             chosen = None if neighbours is None or presence is None else (neighbours[some], presence[some])
             parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
-        found = torch.cat(parts)
-        seen = torch.ones_like(found[..., 0])
-        if self.fills and neighbours is not None:
-            shown, z = self._shown(camera, prior, corners, neighbours, found[..., 4])
-            found[..., 4], seen = torch.where(shown, found[..., 4], z), shown.to(found)
-        stacked = torch.cat([found, seen[..., None]], dim=-1).reshape(rows, columns, TILE_PX, TILE_PX, 6)
+        stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 6)
         return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
-
-    def _shown(
-        self,
-        camera: Cameras,
-        prior: Float[Tensor, "3 h w"],
-        corners: Float[Tensor, "T 2"],
-        neighbours: Int[Tensor, "T N"],
-        depth: Float[Tensor, "T R"],
-    ) -> tuple[Bool[Tensor, "T R"], Float[Tensor, "T R"]]:
-        """Whether the surface may lie in a neighbour's frame, and its likeliest depth: by the sparse points around a
-        pixel if there are some, else by what the network sees."""
-        uv = (corners[:, None] + pixel_grid(TILE_PX, TILE_PX)).reshape(1, -1, 2)
-        directions = camera.directions_world(uv).reshape(*depth.shape, 3)
-        each = self.scene.cameras[neighbours.reshape(-1)]
-        inverse = torch.stack([known.reshape(depth.shape) for known in read_prior(prior[None], uv)])
-        likeliest_and_ends = torch.where(inverse[0].isnan(), depth, 1 / inverse)
-        seen = torch.zeros_like(depth, dtype=torch.bool)
-        for at in likeliest_and_ends:
-            points = camera.position_world[:, None] + directions * at[..., None]
-            shown = in_frame(each, *project(each, points.repeat_interleave(neighbours.shape[1], 0)))
-            seen |= shown.reshape(*neighbours.shape, -1).any(1)
-        return seen, likeliest_and_ends[0]
 
     def _tiles(
         self,
@@ -132,7 +104,7 @@ class Renderer:
         corners: Float[Tensor, "T 2"],
         neighbours: tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]] | None,
         middle_world: Float[Tensor, "T 3"],
-    ) -> Float[Tensor, "T R 5"]:
+    ) -> Float[Tensor, "T R 6"]:
         views = None
         if neighbours is not None:
             assert self.shelf is not None
@@ -152,7 +124,8 @@ class Renderer:
         tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
         start = start_intervals(self.network, tiles, prior[None].to(self.device))
         found = self.network(tiles, views, start, self.scene.background_rgb is None)
-        return torch.cat([found.colour, found.opacity[..., None], found.depth[..., None]], dim=-1).cpu()
+        single = torch.stack([found.opacity, found.depth, found.shown], dim=-1)
+        return torch.cat([found.colour, single], dim=-1).cpu()
 
 
 def start_intervals(network: Network, tiles: Tiles, priors: Float[Tensor, "_ 3 h w"]) -> Intervals:

@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tidefield.config import NetworkConfig, StageConfig
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.aggregate import Aggregate, Evidence
-from tidefield.model.compositing import surface_logits, weights
+from tidefield.model.compositing import surface_logits, surface_shares, weights
 from tidefield.model.intervals import Intervals
 from tidefield.model.ray_transformer import RayTransformer
 from tidefield.model.views import Gathered
@@ -59,6 +59,21 @@ def place_samples(
     return Samples(place, inverse_depth, points.flatten(1, 2), unit.flatten(1, 2), ends.diff(dim=-1).clamp(min=0))
 
 
+@dataclass(frozen=True)
+class Weights:
+    """What the samples of a ray contribute.
+
+    Attributes:
+        colour: to its colour: volume rendering of densities, which are 0 where no view sees.
+        surface: how likely the surface is at each sample, those included that no view sees.
+        shown: how likely a view sees it.
+    """
+
+    colour: Float[Tensor, "T R M"]
+    surface: Float[Tensor, "T R M"]
+    shown: Float[Tensor, "T R"]
+
+
 class Stage(nn.Module):
     """Evidence, ray transformer and density of one pass.
 
@@ -87,6 +102,7 @@ class Stage(nn.Module):
             self.match = nn.Parameter(torch.tensor(3.0))
             self.guide_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
             self.guide_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
+            self.lone_steepness = nn.Parameter(torch.tensor(10.0 if first else 0.0))
             nn.init.zeros_(self.density.weight)
             nn.init.zeros_(self.density.bias)
 
@@ -110,7 +126,7 @@ class Stage(nn.Module):
 
     def weights(
         self, evidence: Evidence, samples: Samples, intervals: Intervals, opaque: bool, unit: Float[Tensor, ""] | None
-    ) -> Float[Tensor, "T R M"]:
+    ) -> Weights:
         """How much each sample contributes to its ray.
 
         Density is predicted per unit of length. With views the unit is a length that their features resolve, whatever
@@ -121,11 +137,14 @@ class Stage(nn.Module):
         x = evidence.density.unflatten(1, shape[1:])
         valid = evidence.valid.unflatten(1, shape[1:])
         bias: Tensor | float = 0.0
+        likely: Tensor | None = None
         if not self.as_printed:
-            x, bias = self._guide(x, samples, intervals)
+            freedom = (evidence.count.unflatten(1, shape[1:]) - 1).clamp(min=0) * valid
+            x, bias = self._guide(x, samples, intervals, freedom)
             if unit is None:
-                score = (bias + self._agreement(evidence, valid)).masked_fill(~valid, UNLIKELY)
-                bias = surface_logits(score, opaque)
+                score = bias + self._agreement(evidence, freedom)
+                likely = surface_shares(score, opaque)
+                bias = surface_logits(score.masked_fill(~valid, UNLIKELY), opaque)
         if hasattr(self, "transformer"):
             rays = (t.flatten(0, 1) for t in (x, samples.place, valid))
             x = self.transformer(*rays).unflatten(0, shape[:2])
@@ -135,22 +154,26 @@ class Stage(nn.Module):
         sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / length
         if opaque:
             delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)
-        return weights(sigma, delta)
+        found = weights(sigma, delta)
+        if likely is None:
+            return Weights(found, found, torch.ones_like(found[..., 0]))
+        hidden = likely * ~valid
+        shown = 1 - hidden.sum(-1)
+        return Weights(found, hidden + found * shown[..., None], shown)
 
-    def _agreement(self, evidence: Evidence, valid: Bool[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
+    def _agreement(self, evidence: Evidence, freedom: Float[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
         """How much likelier the surface is at each sample than at the ray's usual one, from how well the views agree.
 
         As if what k views see were normal: of one surface with a small variance, of k different things with a large
         one. The logarithm of the ratio of the two likelihoods grows with k - 1, so a lone view, which always agrees
         with itself, says nothing.
         """
-        freedom = (evidence.count.unflatten(1, valid.shape[1:]) - 1).clamp(min=0) * valid
-        unlike = torch.log(evidence.disagreement.unflatten(1, valid.shape[1:]) + NOISE)
+        unlike = torch.log(evidence.disagreement.unflatten(1, freedom.shape[1:]) + NOISE)
         usual = (freedom * unlike).sum(-1, keepdim=True) / freedom.sum(-1, keepdim=True).clamp(min=1e-3)
         return self.match * freedom * (usual - unlike)
 
     def _guide(
-        self, x: Float[Tensor, "T R M H"], samples: Samples, intervals: Intervals
+        self, x: Float[Tensor, "T R M H"], samples: Samples, intervals: Intervals, freedom: Float[Tensor, "T R M"]
     ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
         """Tell the samples where the surface is expected: as a feature, and as a score."""
         expected = intervals.expected_place
@@ -159,6 +182,8 @@ class Stage(nn.Module):
         offset = (samples.place - expected[..., None]) * samples.place.shape[-1]
         offset = torch.where(known, offset, 0.0)
         features = torch.stack([offset / 4, torch.exp(-((offset / 2) ** 2)), torch.exp(-((offset / 8) ** 2))], dim=-1)
+        # Where no two views see it, samples around where it is expected would only smear what one of them sees.
+        steepness = self.guide_steepness + self.lone_steepness * torch.exp(-freedom)
         # Beyond the floor it would shut off, for good, samples that the views may yet find to be the surface.
-        bias = (self.guide_height - self.guide_steepness * offset.square()).clamp(min=-4)
+        bias = (self.guide_height - steepness * offset.square()).clamp(min=-4)
         return x + self.guide(features) * known[..., None], torch.where(known, bias, self.guide_height)

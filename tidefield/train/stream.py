@@ -20,7 +20,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from tidefield.data.batches import Surfaces
 from tidefield.data.load import load_scene
@@ -37,18 +39,20 @@ REAL_SHARE = 0.5
 WIDTHS = (256, 400)
 """Of real scenes' photographs: each is there at both."""
 MISPOSED_DEG = 0.6
-SPARSE_SHARE = 0.5
+SPARSE_SHARE = 0.25
 """Of the scenes with few points, so that depth is learned from what the views see, too."""
 SPARSE_POINTS = 0.01, 0.3
 """Shares of the points that these have."""
-SHIFTED_SHARE = 0.5
+SHIFTED_SHARE = 0.25
 """Of the scenes whose photographs are off, so that views are averaged where they do not quite fit."""
 SHIFT_PX = 0.2, 1.0
 """Standard deviations of that, pixels: one for each of these scenes."""
-UNEVEN_SHARE = 0.5
+UNEVEN_SHARE = 0.25
 """Of the scenes whose exposures are told wrong, so that no view is preferred for its colours."""
 UNEVEN = 0.01, 0.08
 """Standard deviations of the logarithms of these: one for each of these scenes."""
+RECOLOURED_SHARE = 0.5
+"""Of the scenes with their colours' channels in another order, so that little is learned of mud being brown."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ class Slot:
         points_share: of the sparse points that are known.
         shift_px: standard deviation of how far its photographs are off.
         uneven: standard deviation of the logarithms of its exposures' errors.
+        channels: the order of its colours' channels.
         seed: of what is random in this.
     """
 
@@ -86,6 +91,7 @@ class Slot:
     points_share: float
     shift_px: float
     uneven: float
+    channels: tuple[int, ...]
     seed: int
 
 
@@ -103,13 +109,15 @@ def slot(seed: int, number: int, real_share: float) -> Slot:
     """Scene `number` of a seed, and its hardships."""
     random = np.random.default_rng([seed, number, 78])
     made = recipe(seed, number) if random.random() >= real_share else None
-    sparse, shifted, uneven = (random.random() < s for s in (SPARSE_SHARE, SHIFTED_SHARE, UNEVEN_SHARE))
+    shares = (SPARSE_SHARE, SHIFTED_SHARE, UNEVEN_SHARE, RECOLOURED_SHARE)
+    sparse, shifted, uneven, recoloured = (random.random() < share for share in shares)
     return Slot(
         recipe=made,
         choice=float(random.random()),
         points_share=math.exp(random.uniform(*np.log(SPARSE_POINTS))) if sparse else 1.0,
         shift_px=float(random.uniform(*SHIFT_PX)) if shifted else 0.0,
         uneven=float(random.uniform(*UNEVEN)) if uneven else 0.0,
+        channels=tuple(random.permutation(3).tolist()) if recoloured else (0, 1, 2),
         seed=int(random.integers(1 << 31)),
     )
 
@@ -171,6 +179,13 @@ class Source(Protocol):
         ...
 
 
+def turned(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
+    """The same scene with other axes for the network; the quaternion need not be of unit length."""
+    turn = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
+    pose = drawn.cameras.T_world_camera
+    return replace(drawn, cameras=replace(drawn.cameras, T_world_camera=turn.to(pose) @ pose))
+
+
 class Stream:
     """Draws scenes.
 
@@ -198,7 +213,10 @@ class Stream:
         self.maker.join()
 
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
-        """A scene for a step; the same for the same step, seed and state of the generator."""
+        """A scene for a step, the same for the same step, seed and state of the generator.
+
+        It is turned at random: directions are the world's, and nothing may be learned of where north is.
+        """
         first = step // STEPS_EACH
         number = first + int(torch.randint(AT_HAND, (), generator=generator))
         for gone in [k for k in self.pool if k < first]:
@@ -210,7 +228,7 @@ class Stream:
             own = self._slot(number)
             scene = self.real[int(own.choice * len(self.real))] if own.recipe is None else self._made(number)
             self.pool[number] = self._with_hardships(scene, own)
-        return self.pool[number]
+        return turned(self.pool[number], torch.randn(4, generator=generator))
 
     def _slot(self, number: int) -> Slot:
         return slot(self.seed, number, REAL_SHARE if self.real else 0.0)
@@ -230,14 +248,17 @@ class Stream:
         return self.folder / f"{self.seed}-{number:06d}"
 
     def _with_hardships(self, scene: Scene, own: Slot) -> Drawn:
-        """A scene with photographs that are off and few known points; the loss is told of all that were observed."""
+        """A scene with what makes it harder; the loss is told of all points that were observed."""
         random = np.random.default_rng(own.seed)
         off = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
         light = torch.from_numpy(np.exp(random.normal(scale=own.uneven, size=(len(scene.names), 1)))).float()
-        principal, gain = scene.cameras.principal_px + off, scene.cameras.gain * light
+        principal, gain = scene.cameras.principal_px + off, scene.cameras.gain[:, own.channels] * light
         cameras = replace(scene.cameras, principal_px=principal, gain=gain)
         known = scene.points
         if known is not None and own.points_share < 1:
             known = known.subset(torch.from_numpy(random.random(len(known.xyz_world)) < own.points_share))
-        hard = replace(scene, cameras=cameras, points=known)
+        photographs = scene.photographs
+        if own.channels != (0, 1, 2):
+            photographs = replace(photographs, colours=tuple(c[..., own.channels] for c in photographs.colours))
+        hard = replace(scene, cameras=cameras, photographs=photographs, points=known)
         return Drawn(hard, Surfaces(hard, scene.points), cameras.to(self.device))
