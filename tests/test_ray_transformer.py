@@ -5,7 +5,7 @@ import torch
 from random_weights import randomise
 from torch import Tensor
 
-from tidefield.model.ray_transformer import RayTransformer, positional_encoding
+from tidefield.model.ray_transformer import RayTransformer, attend, attend_to_few, positional_encoding
 
 R, M, H = 5, 8, 12
 
@@ -92,3 +92,16 @@ def test_a_ray_that_nothing_is_known_of_stays_finite_in_value_and_gradient():
     assert features.grad is not None
     assert features.grad.isfinite().all()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in own.parameters())
+
+
+def test_few_samples_attend_to_each_other_as_many_do():
+    random = torch.Generator().manual_seed(5)
+    qkv = torch.randn(40, 6, 3, 2, 4, generator=random, dtype=torch.float64)
+    keys = torch.rand(40, 6, generator=random) < 0.6
+    keys |= ~keys.any(-1, keepdim=True)
+    whole, few = qkv.clone().requires_grad_(), qkv.clone().requires_grad_()
+    expected, found = attend(whole, keys), attend_to_few(few, keys)
+    torch.testing.assert_close(found, expected)
+    for result in (expected, found):
+        result.square().sum().backward()
+    torch.testing.assert_close(few.grad, whole.grad)

@@ -14,6 +14,9 @@ from torch.nn import functional as F
 
 FREQUENCIES = 4
 """Octaves of the positional encoding, from half a period over the ray's range."""
+FEW = 8
+"""Samples of a ray up to which all pairs are written out: PyTorch's attention is made for long sequences, and takes
+several times as long for thousands of short ones."""
 
 
 def positional_encoding(position: Float[Tensor, "*B"]) -> Float[Tensor, "*B 8"]:
@@ -50,12 +53,25 @@ class RayTransformer(nn.Module):
         position: Float[Tensor, "R M"],
         valid: Bool[Tensor, "R M"],
     ) -> Float[Tensor, "R M H"]:
-        rays, samples, hidden = features.shape
         x = features + self.place(positional_encoding(position))
-        qkv = self.query_key_value(self.before_attention(x)).reshape(rays, samples, 3, self.heads, hidden // self.heads)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        qkv = self.query_key_value(self.before_attention(x)).unflatten(-1, (3, self.heads, -1))
         # A ray without any valid sample attends to all: an empty softmax is NaN, and its densities are 0 anyway.
         keys = valid | ~valid.any(-1, keepdim=True)
-        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=keys[:, None, None, :])
-        x = x + self.after_attention(attended.transpose(1, 2).reshape(rays, samples, hidden))
+        attended = attend_to_few(qkv, keys) if features.shape[1] <= FEW else attend(qkv, keys)
+        x = x + self.after_attention(attended.flatten(2))
         return x + self.feed_forward(x)
+
+
+def attend(qkv: Float[Tensor, "R M 3 A D"], keys: Bool[Tensor, "R M"]) -> Float[Tensor, "R M A D"]:
+    """Scaled dot-product attention of queries, keys and values of A heads with D channels each."""
+    query, key, value = qkv.permute(2, 0, 3, 1, 4)
+    return F.scaled_dot_product_attention(query, key, value, attn_mask=keys[:, None, None, :]).transpose(1, 2)
+
+
+def attend_to_few(qkv: Float[Tensor, "R M 3 A D"], keys: Bool[Tensor, "R M"]) -> Float[Tensor, "R M A D"]:
+    """The same, for rays of a few samples."""
+    # The rays come last, so that every operation runs along many of them.
+    query, key, value = qkv.permute(2, 3, 1, 4, 0).contiguous()
+    score = (query[:, :, None] * key[:, None]).sum(3) / math.sqrt(query.shape[2])
+    share = score.masked_fill(~keys.T, -math.inf).softmax(2)
+    return (share[:, :, :, None] * value[:, None]).sum(2).permute(3, 1, 0, 2)
