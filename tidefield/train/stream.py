@@ -52,7 +52,7 @@ UNEVEN_SHARE = 0.25
 UNEVEN = 0.01, 0.08
 """Standard deviations of the logarithms of these: one for each of these scenes."""
 RECOLOURED_SHARE = 0.5
-"""Of the scenes with their colours' channels in another order, so that little is learned of mud being brown."""
+"""Of the scenes with their colours' channels in a random order, so that little is learned of mud being brown."""
 
 
 @dataclass(frozen=True)
