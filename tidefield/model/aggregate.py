@@ -80,9 +80,19 @@ def weighted_moments(
         from tidefield.model import fused
 
         return fused.moments(values.float(), weight)
-    w = weight[..., None]
-    mean = (w * values).sum(1)
-    return mean, (w * (values - mean[:, None]).square()).sum(1)
+    mean = weighted_sum(values, weight)
+    variance = torch.zeros_like(mean)
+    for value, share in zip(values.unbind(1), weight[..., None].unbind(1), strict=True):
+        variance = variance.addcmul_(share, (value - mean).square_())
+    return mean, variance
+
+
+def weighted_sum(values: Float[Tensor, "T N P C"], weight: Float[Tensor, "T N P"]) -> Float[Tensor, "T P C"]:
+    """Sum over the views, one view after the other: several times as fast on a CPU as all their products at once."""
+    total = torch.zeros_like(values[:, 0])
+    for value, share in zip(values.unbind(1), weight[..., None].unbind(1), strict=True):
+        total = total.addcmul_(share, value)
+    return total
 
 
 class Aggregate(nn.Module):
@@ -124,7 +134,8 @@ class Aggregate(nn.Module):
         mean, variance = weighted_moments(features, weight)
         # A linear layer of [F_i, mu, v] is a sum of linear layers; the shared part is computed once for all views.
         shared = self.shared(torch.cat([mean, variance], dim=-1))
-        per_view = F.relu(self.second(F.relu(self.own(features) + shared[:, None])))
+        first = F.relu(self.own(features) + shared[:, None], inplace=True)
+        per_view = F.relu(self.second(first), inplace=True)
         trust = torch.sigmoid(self.trust(per_view)[..., 0]) * valid
         if presence is not None:
             trust = trust * presence[..., None]
@@ -135,7 +146,7 @@ class Aggregate(nn.Module):
             density=self.density(torch.cat(pooled, dim=-1)),
             per_view=per_view,
             view_weight=trust,
-            mean_colour=(weight[..., None] * colours).sum(1) + 0.5 * ~seen[..., None],
+            mean_colour=weighted_sum(colours, weight) + 0.5 * ~seen[..., None],
             disagreement=torch.zeros_like(weight[:, 0]) if self.metric is None else variance @ self.metric.exp(),
             count=seen / weight.square().sum(1).clamp(min=1e-6),
             valid=seen,

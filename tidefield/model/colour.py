@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tidefield.model.aggregate import Evidence
+from tidefield.model.aggregate import Evidence, weighted_sum
 from tidefield.model.harmonics import basis, expand
 from tidefield.model.views import Gathered
 
@@ -61,7 +61,7 @@ class ColourBlend(nn.Module):
             # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
             own = own + torch.where(seen, logits.masked_fill(~gathered.valid, -1e4).logsumexp(1), 0.0)
         share = torch.softmax(torch.cat([logits, own[:, None]], dim=1), dim=1)
-        return (share[:, :-1, :, None] * gathered.colours).sum(1) + share[:, -1, :, None] * target
+        return weighted_sum(gathered.colours, share[:, :-1]) + share[:, -1, :, None] * target
 
     def _view_logits(
         self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
@@ -73,7 +73,8 @@ class ColourBlend(nn.Module):
         near = [(direction[:, None] - gathered.directions) * 5, apart * -20, evidence.view_weight[..., None]]
         if self.angle is not None:
             near.append(closeness / 4)
-        logits = self.logit(F.relu(self.view(evidence.per_view) + self.direction(torch.cat(near, dim=-1))))
+        hidden = self.view(evidence.per_view) + self.direction(torch.cat(near, dim=-1))
+        logits = self.logit(F.relu(hidden, inplace=True))
         if self.angle is not None:
             logits = logits + self.angle * closeness + gathered.presence.log()[..., None, None]
         return logits[..., 0].masked_fill(~gathered.valid, -torch.inf)
