@@ -18,11 +18,14 @@ import tyro
 from tidefield.cores import spin_briefly
 from tidefield.errors import RunError, TidefieldError
 
+MEASURED = Path("docs/measured")
+COMPARISON = (MEASURED / "comparison.json",)
+BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "scratch"))
 DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
 a name, it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
 
-A figure is worth something only on a machine that does nothing else meanwhile. The whole page takes six commands:
-`tidefield compare`, `tidefield ablate`, speed, frames and memory with the same --runs, then table."""
+A figure is worth something only on a machine that does nothing else meanwhile. The whole page is made of what
+`tidefield compare` and `tidefield ablate` left and of what speed, frames and memory kept with --runs."""
 
 
 def speed(
@@ -168,27 +171,34 @@ def surveys(
     print(out)
 
 
-def table(comparison: Path, ablation: Path, runs: Path, out: Path = Path("docs/results.md")) -> None:
+def table(
+    comparison: tuple[Path, ...] = COMPARISON,
+    ablation: tuple[Path, ...] = (MEASURED / "ablation.json",),
+    begun: tuple[Path, ...] = BEGUN,
+    runs: Path = MEASURED,
+    out: Path = Path("docs/results.md"),
+) -> None:
     """Write the page of results from what was measured; what is missing is said to be.
 
     Args:
-        comparison: Folder of `tidefield compare`.
-        ablation: Folder of `tidefield ablate`.
+        comparison: What `tidefield compare` left; of what several files tell, the last one counts.
+        ablation: What `tidefield ablate` left, likewise.
+        begun: What `tidefield compare` left with other lengths of training, and from scratch.
         runs: Folder of speed, frames and memory.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
 
-    write_page(comparison, ablation, runs, out)
+    write_page(comparison, ablation, begun, runs, out)
     print(out)
 
 
-def card(weights: Path, comparison: Path) -> None:
+def card(weights: Path, comparison: tuple[Path, ...] = COMPARISON) -> None:
     """Write the card that lies beside weights, from the file itself and from what was measured.
 
     Args:
         weights: Of `tidefield pretrain`.
-        comparison: Folder of a `tidefield compare` with the method zero-shot.
+        comparison: What `tidefield compare` left, with the method zero-shot.
     """
     from benchmarks.card import write_card
 

@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks.begun import FROM_SCRATCH, MINUTE, SECONDS, ByLength
 from tidefield.compare.published import TABLE_3
 from tidefield.compare.results import Results
+from tidefield.compare.run import ZERO_SHOT
 
 SURVEYS = ("caliterra", "swindale", "turin_lot", "brighton_beach")
 """Where we are compared with blending, which is good there."""
@@ -16,6 +18,8 @@ SCENES = (*TABLE_3, *SURVEYS, "fern", "lego")
 FLOORS = ("plane-sweep", "sparse-depth")
 UNSEEN = ("caliterra", "swindale")
 """Which the shipped weights have never learned from."""
+BEGUN = (*UNSEEN, "turin_lot", "fern")
+"""On which lengths of training are compared."""
 MINUTES, WIDTH, DEVICE = 10.0, 400, "cpu"
 GAIN_DB, AHEAD_DB = 1.5, 3.0
 TIMES_AS_FAST = {"nerfacto": 10.0, "paper": 20.0}
@@ -44,7 +48,7 @@ class Kept:
 Gains = Mapping[str, float | None]
 
 
-def judge(results: Results, kept: Kept) -> list[Bar]:
+def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
     """Every bar. Results of other settings than those aimed at count as not measured."""
 
     def gain(
@@ -83,6 +87,7 @@ def judge(results: Results, kept: Kept) -> list[Bar]:
             "{:+.2f} dB",
             lambda x: x > 0,
         ),
+        *_of_lengths(lengths),
         *(_as_fast(results, kept.speed, other) for other in TIMES_AS_FAST),
         *_frame_times(kept.frames),
         _training_memory(results),
@@ -95,6 +100,38 @@ def _gain(results: Results, scene: str, name: str, own: str, others: tuple[str, 
     values = [_aimed(results, scene, method, name) for method in (own, *others)]
     known = [value if more else -value for value in values if value is not None]
     return known[0] - max(known[1:]) if len(known) == len(values) else None
+
+
+def _of_lengths(lengths: ByLength) -> list[Bar]:
+    """Ten seconds are not worse than none, as far as the tables show, and a minute better than ten without weights."""
+
+    def gains(metric: str, sign: int, length: str, other: str) -> Gains:
+        pairs = {scene: [lengths.get(name, {}).get(scene) for name in (length, other)] for scene in BEGUN}
+        values = {scene: [result and result.metric(metric) for result in pair] for scene, pair in pairs.items()}
+        return {s: None if a is None or b is None else sign * (a - b) for s, (a, b) in values.items()}
+
+    kinds = (("psnr", 1, "PSNR", "{:+.2f} dB", 0.005), ("ssim", 1, "SSIM", "{:+.3f}", 0.0005))
+    kinds += (("lpips_vgg", -1, "LPIPS (VGG)", "{:+.3f}", 0.0005),)
+    return [
+        *(
+            _on_each(
+                f"Ten seconds of training, {title} not worse than zero-shot's",
+                gains(metric, sign, SECONDS, ZERO_SHOT),
+                style,
+                lambda gain, visible=visible: gain > -visible,
+            )
+            for metric, sign, title, style, visible in kinds
+        ),
+        *(
+            _on_each(
+                f"One minute of training, {title} better than after ten from scratch",
+                gains(metric, sign, MINUTE, FROM_SCRATCH),
+                style,
+                lambda gain: gain > 0,
+            )
+            for metric, sign, title, style, _ in kinds
+        ),
+    ]
 
 
 def _aimed(results: Results, scene: str, method: str, name: str) -> float | None:

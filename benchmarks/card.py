@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bars import UNSEEN
-from tidefield.compare.results import Results, read_results
-from tidefield.compare.run import RUNS, UNTRAINED, ZERO_SHOT
+from benchmarks.bars import SCENES, UNSEEN
+from tidefield.compare.results import Results, read_figures
+from tidefield.compare.run import UNTRAINED, ZERO_SHOT
 from tidefield.compare.table import Table, shown
 from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
@@ -32,12 +32,12 @@ LICENCES = {
 """Of the photographs of real scenes that may be learned from."""
 
 
-def write_card(weights: Path, comparison: Path) -> Path:
+def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     """Write PRESET.md beside the weights.
 
     Args:
         weights: of `tidefield pretrain`.
-        comparison: of `tidefield compare` with the method zero-shot.
+        comparison: files of `tidefield compare` with the method zero-shot.
 
     Returns:
         The card.
@@ -45,11 +45,10 @@ def write_card(weights: Path, comparison: Path) -> Path:
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
     """
-    folder = comparison / RUNS
-    scenes = sorted(path.parent.name for path in folder.glob(f"*/{ZERO_SHOT}"))
-    results = read_results(comparison, scenes, METHODS)
+    results = read_figures(comparison, SCENES, METHODS)
     if not any(method == ZERO_SHOT for _, method in results.by):
-        raise RunError(f"{comparison} holds no zero-shot results: expected some; run `tidefield compare` with them")
+        named = ", ".join(map(str, comparison))
+        raise RunError(f"{named} hold no zero-shot results: expected some; run `tidefield compare` with them")
     out = weights.with_suffix(".md")
     with completed_file(out, overwrite=True) as partial:
         partial.write_text(card(weights, results), encoding="utf-8")

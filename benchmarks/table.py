@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.bars import SCENES, Bar, Kept, judge
+from benchmarks.begun import by_length, length_tables
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_table, variants
 from tidefield.compare.record import read_json, stamp
-from tidefield.compare.results import Results, read_results
-from tidefield.compare.run import METHODS, RUNS
+from tidefield.compare.results import Results, read_figures
+from tidefield.compare.run import METHODS, WHOLE
 from tidefield.compare.table import NOTHING, Table, shown
 from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
 from tidefield.errors import RunError
@@ -21,53 +22,53 @@ from tidefield.files import completed_file
 SPEED_FILE = "speed.json"
 
 
-def write_page(comparison: Path, ablation: Path, runs: Path, out: Path) -> None:
+def write_page(
+    comparison: Sequence[Path], ablation: Sequence[Path], begun: Sequence[Path], runs: Path, out: Path
+) -> None:
     """Read what is there and write it as Markdown.
 
     Args:
-        comparison: of `tidefield compare`.
-        ablation: of `tidefield ablate`.
-        runs: of the benchmarks.
+        comparison: files of `tidefield compare`.
+        ablation: files of `tidefield ablate`.
+        begun: files of `tidefield compare` with other lengths of training, and from scratch.
+        runs: folder of the benchmarks.
         out: the file.
 
     Raises:
         RunError: when there is nothing.
     """
-    compared = read_results(comparison, _scenes(comparison), METHODS)
-    ablated = read_results(ablation, _scenes(ablation), variants(()))
+    compared, ablated = read_figures(comparison, SCENES, METHODS), read_figures(ablation, SCENES, variants(()))
+    shorter = [read_figures([file], SCENES, (WHOLE,)) for file in begun]
     kept = Kept(*(read_json(runs / file) for file in (SPEED_FILE, MEMORY_FILE, FRAMES_FILE)))
     if not (compared.by or ablated.by or kept.speed or kept.memory or kept.frames):
+        named = ", ".join(map(str, (*comparison, *ablation, runs)))
         raise RunError(
-            f"{comparison}, {ablation} and {runs} hold no results: expected what `tidefield compare`, `tidefield "
-            "ablate` and the benchmarks leave there; run them"
+            f"{named} hold no results: expected what `tidefield compare`, `tidefield ablate` and the benchmarks leave "
+            "there; run them"
         )
     with completed_file(out, overwrite=True) as partial:
-        partial.write_text(page(compared, ablated, kept), encoding="utf-8")
+        partial.write_text(page(compared, ablated, shorter, kept), encoding="utf-8")
 
 
-def _scenes(folder: Path) -> tuple[str, ...]:
-    """Those that are there; those of the aims first."""
-    there = {path.name for path in (folder / RUNS).glob("*") if path.is_dir()}
-    return (*(scene for scene in SCENES if scene in there), *sorted(there - set(SCENES)))
-
-
-def page(compared: Results, ablated: Results, kept: Kept) -> str:
+def page(compared: Results, ablated: Results, begun: Sequence[Results], kept: Kept) -> str:
     """The whole page."""
+    trainings, lengths = (compared, ablated, *begun), by_length(compared, begun)
     return (
         "\n\n".join(
             [
                 "# Results",
-                '`make bench ARGS="table --comparison COMPARISON --ablation ABLATION --runs RUNS"` wrote this page '
-                "from what `tidefield compare`, `tidefield ablate`, `speed`, `frames` and `memory` left in these "
-                "folders; nothing is typed by hand.",
-                "\n".join(f"- {line}" for line in _circumstances(compared, ablated, kept)),
+                "`make bench ARGS=table` wrote this page from what `tidefield compare`, `tidefield ablate`, `speed`, "
+                "`frames` and `memory` left in [docs/measured](measured); nothing is typed by hand.",
+                "\n".join(f"- {line}" for line in _circumstances(trainings, kept)),
                 "## What was aimed at",
-                _bar_table(judge(compared, kept)).markdown(),
+                _bar_table(judge(compared, kept, lengths)).markdown(),
                 "## Methods on the same photographs, split, resolution, machine and budget",
                 "Means over the held-out photographs.",
                 *(table.markdown() for table in (all_tables(_narrowed(compared)) if compared.by else ())),
                 *lpips_weights(compared),
                 *missing_metrics(compared),
+                "## What trained weights bring",
+                *([table.markdown() for table in length_tables(lengths)] or ["Not measured."]),
                 "## What each part brings",
                 *([ablation_table(ablated).markdown()] if ablated.by else ["Not measured."]),
                 "## Speed",
@@ -77,7 +78,7 @@ def page(compared: Results, ablated: Results, kept: Kept) -> str:
                 "## A large frame",
                 _frame(kept.memory),
                 "## Commands",
-                "\n".join(f"    {command}" for command in _commands(compared, ablated, kept)),
+                "\n".join(f"    {command}" for command in _commands(trainings, kept)),
             ]
         )
         + "\n"
@@ -90,11 +91,11 @@ def _narrowed(results: Results) -> Results:
     return Results(results.scenes, there, results.by)
 
 
-def _records(compared: Results, ablated: Results, kept: Kept) -> list[Mapping[str, Any]]:
+def _records(trainings: Sequence[Results], kept: Kept) -> list[Mapping[str, Any]]:
     """Everything with a date, a machine and a command."""
     processes = [
         result.process[step]
-        for results in (compared, ablated)
+        for results in trainings
         for result in results.by.values()
         for step in ("train", "evaluate")
         if step in result.process
@@ -102,8 +103,8 @@ def _records(compared: Results, ablated: Results, kept: Kept) -> list[Mapping[st
     return [record for record in (*processes, *vars(kept).values()) if record]
 
 
-def _circumstances(compared: Results, ablated: Results, kept: Kept) -> list[str]:
-    records = _records(compared, ablated, kept)
+def _circumstances(trainings: Sequence[Results], kept: Kept) -> list[str]:
+    records = _records(trainings, kept)
     machines, dates = [], sorted({record["date"] for record in records})
     for machine in (record["machine"] for record in records):
         text = (
@@ -216,10 +217,10 @@ def _frame(memory: Mapping[str, Any] | None) -> str:
     )
 
 
-def _commands(compared: Results, ablated: Results, kept: Kept) -> list[str]:
+def _commands(trainings: Sequence[Results], kept: Kept) -> list[str]:
     """Each once."""
     found = [record["command"] for record in vars(kept).values() if record]
-    for results in (compared, ablated):
+    for results in trainings:
         for result in results.by.values():
             for step in ("train", "evaluate"):
                 found += [result.process[step]["command"]] if step in result.process else []

@@ -53,7 +53,7 @@ def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
     write_colmap(tmp_path / "flats", survey(PINHOLE))
     scene = load_scene(tmp_path / "flats", width=48)
     psnr = {"tidefield": 30.0, OTHER_SEED: 30.2, "views-2": 27.0, "degree-0": 29.85}
-    by = {("flats", name): Result(tmp_path, evaluation(scene, value), {}, []) for name, value in psnr.items()}
+    by = {("flats", name): Result(evaluation(scene, value)) for name, value in psnr.items()}
     table = ablation_table(Results(("flats",), (*psnr, "field"), by))
     assert [row[-1] for row in table.rows] == ["-", "+0.20", "-3.00", "-0.15, within the noise", "-"]
     assert table.rows[2][:2] == ["views-2", "27.00"]

@@ -19,8 +19,8 @@ from tidefield import cli
 from tidefield.compare import published
 from tidefield.compare.figures import most_different, side_by_side, write_curves
 from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
-from tidefield.compare.record import Took
-from tidefield.compare.results import read_results
+from tidefield.compare.record import Took, write_json
+from tidefield.compare.results import figures_of, read_figures, read_results
 from tidefield.compare.run import METHODS, Settings, commands, compare
 from tidefield.compare.table import Table
 from tidefield.compare.tables import cost_table, paper_table, quality_tables
@@ -152,6 +152,10 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     numbers = json.loads((out / "comparison.json").read_text())
     assert numbers["settings"]["minutes"] == 10
     assert numbers["results"][0]["curve"] == [[10.0, 20.5], [600.0, 25.0]]
+    assert str(tmp_path) not in (out / "comparison.json").read_text(), "where things lie here is nobody's business"
+    again = read_figures([out / "comparison.json", tmp_path / "none.json"], ["other"], results.methods)
+    assert quality_tables(again) == quality_tables(results)
+    assert cost_table(again) == cost_table(results)
     with Image.open(out / "figures" / "flats.png") as figure:
         assert figure.width == 3 * 320 + 2 * 4
 
@@ -168,6 +172,19 @@ def test_the_best_stands_out_and_means_need_every_scene(disk: Path, tmp_path: Pa
     (ssim,) = (t for t in quality_tables(results) if t.title.startswith("LPIPS, VGG, all pixels ("))
     assert "less is better" in ssim.title
     assert len(cost_table(results).rows) == 3
+
+
+def test_the_last_of_several_comparisons_counts(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    for out, methods in (("one", ("tidefield", "nearest")), ("two", ("tidefield",))):
+        compare({"a": disk}, methods, SETTINGS, tmp_path / out, run, quiet)
+        results = read_results(tmp_path / out, ["a"], methods)
+        results.by["a", "tidefield"].evaluation["mean"]["psnr"] = {"one": 21.0, "two": 22.0}[out]
+        write_json(tmp_path / f"{out}.json", {"results": figures_of(results)})
+    found = read_figures([tmp_path / "one.json", tmp_path / "two.json"], ["b", "a"], ("tidefield", "nearest"))
+    assert found.scenes == ("a",)
+    assert found.metric("a", "tidefield", "psnr") == 22.0
+    assert found.metric("a", "nearest", "psnr") == 28.0
 
 
 def test_published_figures_stand_beside_measured_ones(disk: Path, tmp_path: Path):

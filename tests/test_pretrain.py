@@ -81,7 +81,10 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
         for _ in range(8):
             scenes.draw(0, again)  # the first is made once more, ...
         assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
-    assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
+        assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
+        scenes.draw(16, again)
+        left = {path.name for path in (tmp_path / "scenes").iterdir()}
+        assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
 
 
 def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:

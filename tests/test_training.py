@@ -7,18 +7,24 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import textured_wall as wall
 import torch
 from rich.console import Console
+from scenes_on_disk import PINHOLE, survey, write_colmap
 
+from tidefield.commands import training
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig, FieldConfig, config_from_json, config_to_json
 from tidefield.data.scene import Scene
 from tidefield.errors import DeviceError, RunError
+from tidefield.model.network import Network
+from tidefield.options import Length, Train
 from tidefield.train.checkpoint import CHECKPOINT_FILE, Run, load_network, read_run, write_run
 from tidefield.train.display import Display
 from tidefield.train.loop import Budget, Trainer, train
+from tidefield.train.weights import sha256, write_weights
 
 CPU = torch.device("cpu")
 SMALL = replace(
@@ -54,6 +60,38 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: S
         assert torch.equal(value, weights(second)[name]), name
     assert second.progress.step == 6
     assert second.progress.losses == unbroken.progress.losses
+
+
+def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(training, "PRESETS", {"swift": SMALL})
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    torch.manual_seed(5)
+    shipped = Network(SMALL.network).half().float()
+    write_weights(tmp_path / "swift.safetensors", shipped, SMALL, {})
+    monkeypatch.setattr(training, "shipped", lambda preset: tmp_path / f"{preset}.safetensors")
+
+    def moved(name: str, **options: Any) -> tuple[Run, float]:
+        """The run, and how far two steps took the widest-moving number from what was shipped."""
+        one = Train(tmp_path / "flats", tmp_path / name, width=48, length=Length(steps=2), device="cpu", **options)
+        training.train(one, Console(quiet=True))
+        network = Network(SMALL.network)
+        load_network(tmp_path / name, network)
+        pairs = zip(network.parameters(), shipped.parameters(), strict=True)
+        return read_run(tmp_path / name), max((a - b).abs().max().item() for a, b in pairs)
+
+    begun, far = moved("begun")
+    assert begun.weights == sha256(tmp_path / "swift.safetensors")
+    assert isinstance(begun.config, Config)
+    assert begun.config.train.warm_up == 200
+    assert far < 1e-4, "two steps of a two-hundred-step rise"
+    fresh, far = moved("fresh", from_scratch=True)
+    assert (fresh.weights, fresh.config) == (None, SMALL)
+    assert far > 1e-2
+    given, _ = moved("given", weights=tmp_path / "swift.safetensors")
+    assert given.weights == begun.weights
+    with pytest.raises(RunError, match="begins without them"):
+        moved("both", weights=tmp_path / "swift.safetensors", from_scratch=True)
 
 
 def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path: Path) -> None:

@@ -184,6 +184,16 @@ SWIFT = Config(
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 
 
+def going_on(config: Config) -> Config:
+    """The same from trained weights on: the learning rate rises four times as slowly.
+
+    Adam's steps are too large until its averages mean something, which takes 2 / (1 - beta2) = 200 steps (Ma and
+    Yarats, 2021, "On the adequacy of untuned warmup for adaptive optimization"). Random weights do not mind.
+    """
+    train = dataclasses.replace(config.train, warm_up=4 * config.train.warm_up)
+    return dataclasses.replace(config, train=train)
+
+
 def config_to_json(config: AnyConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 

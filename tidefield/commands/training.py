@@ -12,7 +12,7 @@ from rich.console import Console
 from tidefield.baselines.nerfstudio import driver, environment
 from tidefield.commands.opening import budget_of, load
 from tidefield.compare.record import stamp
-from tidefield.config import PRESETS, AnyConfig, FieldConfig, NerfConfig, NerfstudioConfig
+from tidefield.config import PRESETS, AnyConfig, Config, FieldConfig, NerfConfig, NerfstudioConfig, going_on
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
@@ -115,8 +115,11 @@ def _new_run(options: Train) -> Run:
     """A run of what is asked for, in a folder that may be one."""
     _refuse_run(options.run, options.overwrite)
     weights = _begun_with(options)
-    digest = None if weights is None else sha256(weights)
-    return Run(options.scene.resolve(), options.width, options.seed, _config(options), digest)
+    config, digest = _config(options), None
+    if weights is not None:
+        assert isinstance(config, Config), "only our network begins with weights"
+        config, digest = going_on(config), sha256(weights)
+    return Run(options.scene.resolve(), options.width, options.seed, config, digest)
 
 
 def _begun_with(options: Train) -> Path | None:

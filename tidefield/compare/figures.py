@@ -39,7 +39,9 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     )
     pictures = {"ground truth": truth}
     for method in methods:
-        with Image.open(results.by[name, method].folder / "renderings" / files[chosen]) as picture:
+        folder = results.by[name, method].folder
+        assert folder is not None, "figures are made where the pictures are"
+        with Image.open(folder / "renderings" / files[chosen]) as picture:
             pictures[method] = np.asarray(picture.convert("RGB"))
     corners = most_different(truth, [pictures[method] for method in methods], truth.shape[1] // SHARE)
     columns = []

@@ -1,9 +1,9 @@
-"""What a comparison has measured so far, read from its folder."""
+"""What a comparison has measured so far, read from its folder or from the JSON that it left."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,16 @@ class Result:
     """One method on one scene.
 
     Attributes:
-        folder: of the run.
         evaluation: its evaluation.json.
         process: its process.json: what training and evaluation took.
         curve: (seconds of training, PSNR) of a few small views; empty where none was asked for.
+        folder: of the run, with its pictures; None where only the figures are left.
     """
 
-    folder: Path
     evaluation: dict[str, Any]
-    process: dict[str, Any]
-    curve: list[tuple[float, float]]
+    process: dict[str, Any] = field(default_factory=dict)
+    curve: list[tuple[float, float]] = field(default_factory=list)
+    folder: Path | None = None
 
     def metric(self, name: str) -> float | None:
         """A mean over the held-out photographs."""
@@ -81,5 +81,43 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
             evaluation = read_json(folder / EVALUATION_FILE)
             if evaluation is not None:
                 curve = [(float(x), float(y)) for x, y in read_json(folder / CURVE_FILE) or ()]
-                found[scene, method] = Result(folder, evaluation, read_json(folder / PROCESS_FILE) or {}, curve)
+                found[scene, method] = Result(evaluation, read_json(folder / PROCESS_FILE) or {}, curve, folder)
     return Results(tuple(scenes), tuple(methods), found)
+
+
+def figures_of(results: Results) -> list[dict[str, Any]]:
+    """All results as JSON, but for those of single photographs and for where the scenes lie on this machine."""
+    return [
+        {
+            "scene": scene,
+            "method": method,
+            "evaluation": {key: value for key, value in result.evaluation.items() if key != "per_photograph"},
+            "process": result.process | {"settings": _portable(result.process.get("settings", {}))},
+            "curve": result.curve,
+        }
+        for (scene, method), result in results.by.items()
+    ]
+
+
+def _portable(settings: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key != "scene"}
+
+
+def read_figures(files: Sequence[Path], scenes: Sequence[str], methods: Sequence[str]) -> Results:
+    """What comparisons left as JSON (`figures_of`), all together; of what several have measured, the last one counts.
+
+    Args:
+        files: comparison.json or ablation.json; those that are not there hold nothing.
+        scenes: that come first, if they are there.
+        methods: that are wanted.
+    """
+    found = {}
+    for file in files:
+        for one in (read_json(file) or {"results": []})["results"]:
+            if one["method"] in methods:
+                curve = [(float(x), float(y)) for x, y in one["curve"]]
+                found[one["scene"], one["method"]] = Result(one["evaluation"], one["process"], curve)
+    there = {scene for scene, _ in found}
+    order = (*(scene for scene in scenes if scene in there), *sorted(there - set(scenes)))
+    pairs = [(scene, method) for scene in order for method in methods]
+    return Results(order, tuple(methods), {pair: found[pair] for pair in pairs if pair in found})

@@ -10,7 +10,7 @@ from typing import Any
 from tidefield.compare.ablation import ablation_table
 from tidefield.compare.figures import side_by_side, write_curves
 from tidefield.compare.record import stamp, write_json
-from tidefield.compare.results import Results
+from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
 from tidefield.compare.table import Table
 from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
@@ -30,7 +30,7 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
         _write(out / "tables.tex", "\n\n".join(table.latex() for table in tables) + "\n"),
         _write(out / "tables.csv", "\n".join(f"{table.title}\n{table.csv()}" for table in tables)),
     ]
-    write_json(out / "comparison.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
+    write_json(out / "comparison.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     files.append(out / "comparison.json")
     for name, path in scenes.items():
         figure = side_by_side(results, name, load_scene(path, width=settings.width))
@@ -56,7 +56,7 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
         The files.
     """
     table, made = ablation_table(results), stamp()
-    write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": _numbers(results)})
+    write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     return [
         _write(out / "ablation.md", _page("Ablation", [table], _remarks(results), settings, made)),
         _write(out / "ablation.tex", table.latex() + "\n"),
@@ -83,23 +83,6 @@ def _page(title: str, tables: list[Table], remarks: list[str], settings: Setting
         *(table.markdown() for table in tables),
     ]
     return "\n\n".join(lines) + "\n"
-
-
-def _numbers(results: Results) -> list[dict[str, Any]]:
-    return [
-        {
-            "scene": scene,
-            "method": method,
-            "mean": result.evaluation["mean"],
-            "seconds_per_frame": result.evaluation["seconds_per_frame"],
-            "rays_per_second": result.evaluation["rays_per_second"],
-            "configuration": result.evaluation["configuration"],
-            "split": result.evaluation["split"],
-            "process": result.process,
-            "curve": result.curve,
-        }
-        for (scene, method), result in results.by.items()
-    ]
 
 
 def _write(path: Path, text: str) -> Path:

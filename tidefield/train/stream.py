@@ -219,8 +219,10 @@ class Stream:
         """
         first = step // STEPS_EACH
         number = first + int(torch.randint(AT_HAND, (), generator=generator))
-        for gone in [k for k in self.pool if k < first]:
-            del self.pool[gone]
+        for gone in [k for k in {*self.pool, *self.coming} if k < first]:
+            self.pool.pop(gone, None)
+            if gone in self.coming:  # nobody drew it
+                self.coming.pop(gone).get()
             shutil.rmtree(self._path(gone), ignore_errors=True)
         for soon in range(first, first + AT_HAND + 1):
             self._order(soon)
