@@ -14,6 +14,7 @@ from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.train.stream import (
+    POINTLESS_SHARE,
     RECOLOURED_SHARE,
     SHIFT_PX,
     SHIFTED_SHARE,
@@ -78,9 +79,10 @@ def card(weights: Path, results: Results) -> str:
         "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
         f"moving water and wrong poses{real}",
         f"{SPARSE_SHARE:.0%} of the scenes came with {SPARSE_POINTS[0]:.0%} to {SPARSE_POINTS[1]:.0%} of their sparse "
-        f"points, and of {SHIFTED_SHARE:.0%} the photographs were off by {SHIFT_PX[0]} to {SHIFT_PX[1]} px, of "
-        f"{UNEVEN_SHARE:.0%} the exposures by {UNEVEN[0]:.0%} to {UNEVEN[1]:.0%}; {RECOLOURED_SHARE:.0%} had the "
-        "channels of their colours in a random order, and all were turned at random.",
+        f"points and {POINTLESS_SHARE:.0%} without any; of {SHIFTED_SHARE:.0%} the photographs were off by "
+        f"{SHIFT_PX[0]} to {SHIFT_PX[1]} px, of {UNEVEN_SHARE:.0%} the exposures by {UNEVEN[0]:.0%} to "
+        f"{UNEVEN[1]:.0%}; {RECOLOURED_SHARE:.0%} had the channels of their colours in a random order, and all were "
+        "turned at random.",
         f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
         f"cores, {told['date']}, Tidefield {told['version']}:",
         f"    {launch} pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",

@@ -92,9 +92,10 @@ def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
     assert every[5] == stream.slot(3, 5, 0.5)
     assert 30 < sum(own.recipe is None for own in every) < 70
     assert all(own.recipe is not None for own in [stream.slot(3, number, 0.0) for number in range(20)])
-    for hard in zip(*[(own.points_share < 1, own.shift_px > 0, own.uneven > 0) for own in every], strict=True):
+    for hard in zip(*[(0 < own.points_share < 1, own.shift_px > 0, own.uneven > 0) for own in every], strict=True):
         assert 10 < sum(hard) < 40
     assert len({own.points_share for own in every}) > 10
+    assert 4 < sum(own.points_share == 0 for own in every) < 25
     assert len({own.shift_px for own in every}) > 10
     assert len({own.uneven for own in every}) > 10
     assert 30 < sum(own.channels != (0, 1, 2) for own in every) < 60
@@ -109,6 +110,7 @@ def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp
     )
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
         whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
+        none = scenes._with_hardships(at, replace(easy, points_share=0.0))
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
     assert 0.2 < float((few.cameras.principal_px - at.cameras.principal_px).std()) < 1
     assert torch.equal(few.cameras.principal_px, few.scene.cameras.principal_px)
@@ -119,6 +121,8 @@ def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp
     assert torch.equal(few.cameras.gain, few.scene.cameras.gain)
     assert at.points is not None
     assert few.scene.points is not None
+    assert none.scene.points is None
+    assert len(none.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px)
     assert 0.1 < len(few.scene.points.xyz_world) / len(at.points.xyz_world) < 0.3
     assert len(few.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px) > 0
     points = few.scene.points

@@ -43,6 +43,8 @@ SPARSE_SHARE = 0.25
 """Of the scenes with few points, so that depth is learned from what the views see, too."""
 SPARSE_POINTS = 0.01, 0.3
 """Shares of the points that these have."""
+POINTLESS_SHARE = 0.12
+"""Of the scenes without any points, as some arrive: what the views see must do."""
 SHIFTED_SHARE = 0.25
 """Of the scenes whose photographs are off, so that views are averaged where they do not quite fit."""
 SHIFT_PX = 0.2, 1.0
@@ -109,12 +111,14 @@ def slot(seed: int, number: int, real_share: float) -> Slot:
     """Scene `number` of a seed, and its hardships."""
     random = np.random.default_rng([seed, number, 78])
     made = recipe(seed, number) if random.random() >= real_share else None
-    shares = (SPARSE_SHARE, SHIFTED_SHARE, UNEVEN_SHARE, RECOLOURED_SHARE)
-    sparse, shifted, uneven, recoloured = (random.random() < share for share in shares)
+    shares = (SHIFTED_SHARE, UNEVEN_SHARE, RECOLOURED_SHARE)
+    shifted, uneven, recoloured = (random.random() < share for share in shares)
+    kind, few = random.random(), math.exp(random.uniform(*np.log(SPARSE_POINTS)))
+    points_share = 0.0 if kind < POINTLESS_SHARE else few if kind < POINTLESS_SHARE + SPARSE_SHARE else 1.0
     return Slot(
         recipe=made,
         choice=float(random.random()),
-        points_share=math.exp(random.uniform(*np.log(SPARSE_POINTS))) if sparse else 1.0,
+        points_share=points_share,
         shift_px=float(random.uniform(*SHIFT_PX)) if shifted else 0.0,
         uneven=float(random.uniform(*UNEVEN)) if uneven else 0.0,
         channels=tuple(random.permutation(3).tolist()) if recoloured else (0, 1, 2),
@@ -256,7 +260,7 @@ class Stream:
         light = torch.from_numpy(np.exp(random.normal(scale=own.uneven, size=(len(scene.names), 1)))).float()
         principal, gain = scene.cameras.principal_px + off, scene.cameras.gain[:, own.channels] * light
         cameras = replace(scene.cameras, principal_px=principal, gain=gain)
-        known = scene.points
+        known = scene.points if own.points_share else None
         if known is not None and own.points_share < 1:
             known = known.subset(torch.from_numpy(random.random(len(known.xyz_world)) < own.points_share))
         photographs = scene.photographs
