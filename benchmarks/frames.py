@@ -21,7 +21,6 @@ from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
@@ -29,6 +28,7 @@ from tidefield.config import PRESETS
 from tidefield.data.batches import choose_neighbours
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
+from tidefield.data.neighbours import Neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import surface_points
 from tidefield.geometry.cameras import Cameras
@@ -195,9 +195,9 @@ def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator
 def _without_fading() -> Iterator[None]:
     """Neighbours count in full until they are left out."""
 
-    def full(*words: Any) -> tuple[Tensor, Tensor]:
-        neighbours, presence = choose_neighbours(*words)
-        return neighbours, torch.ones_like(presence)
+    def full(*words: Any) -> Neighbours:
+        found = choose_neighbours(*words)
+        return replace(found, presence=torch.ones_like(found.presence))
 
     with patch("tidefield.model.renderer.choose_neighbours", full):
         yield

@@ -117,7 +117,7 @@ def inputs(channels: int = C) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def test_a_view_counts_as_much_as_it_is_there():
     features, colours, cosine, valid = inputs()
-    presence = torch.ones(T, N).double()
+    presence = torch.ones(T, N, P).double()
     own = box()
     same = own(features, colours, cosine, valid, presence)
     for name, value in vars(own(features, colours, cosine, valid)).items():

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from tidefield.config import PAPER, SWIFT, TrainConfig
-from tidefield.data.batches import Batch, Surfaces, choose_neighbours, draw_batch, even, tile_surface
+from tidefield.data.batches import SPARE, Batch, Surfaces, choose_neighbours, draw_batch, even, surface_at
 from tidefield.data.images import Photographs
+from tidefield.data.neighbours import Neighbours
 from tidefield.data.scene import Scene
 
 CROPS = replace(SWIFT.train, tile_px=8, tiles=6, crop_px=20)
@@ -41,7 +42,7 @@ def test_a_target_is_never_its_own_neighbour_and_test_photographs_take_no_part(c
     for drawn in seeds(scene(), config):
         assert not (drawn.neighbours == drawn.targets[:, None]).any()
         assert not torch.isin(torch.cat([drawn.targets, drawn.neighbours.flatten()]), torch.tensor(TEST)).any()
-        assert all(len(set(row.tolist())) == 3 for row in drawn.neighbours)
+        assert all(len(set(row.tolist())) == len(row) == 3 + SPARE for row in drawn.neighbours)
 
 
 @pytest.mark.parametrize("config", [CROPS, WHOLE])
@@ -137,33 +138,47 @@ def test_evened_photographs_are_at_the_common_exposure():
     torch.testing.assert_close(even(own, 2, slice(3, 9), slice(5, 6)), even(own, 2)[3:9, 5:6])
 
 
-def test_a_tiles_surface_lies_on_the_wall_behind_it():
+def test_the_surface_behind_pixels_lies_on_the_wall():
     own = scene()
-    camera, corner = own.cameras[2], torch.tensor([[0.0, 0.0], [40.0, 28.0], [46.0, 34.0]])
-    points = tile_surface(camera, Surfaces(own)[2], corner, 8)
-    torch.testing.assert_close(points[..., 2], torch.full((3, 5), wall.DEPTH), rtol=1e-3, atol=0)
-    uv, _ = camera.project(points.reshape(-1, 3))
-    uv = uv.reshape(3, 5, 2)
-    torch.testing.assert_close(uv[:2, 0], corner[:2] + 4, atol=1e-3, rtol=0)
-    assert ((uv >= -1e-3) & (uv <= torch.tensor([48.0, 36.0]) + 1e-3)).all()
+    camera, asked = own.cameras[2], torch.tensor([[4.0, 4.0], [44.0, 32.0], [50.0, -3.0]])
+    points = surface_at(camera, Surfaces(own)[2], asked)
+    torch.testing.assert_close(points[:, 2], torch.full((3,), wall.DEPTH), rtol=1e-3, atol=0)
+    uv = camera.project(points)[0][0]
+    torch.testing.assert_close(uv[:2], asked[:2], atol=1e-3, rtol=0)
+    torch.testing.assert_close(uv[2], torch.tensor([48.0, 0.0]), atol=1e-3, rtol=0)
 
 
 def test_without_points_the_surface_is_between_near_and_far():
     own = replace(scene(), points=None)
-    points = tile_surface(own.cameras[0], Surfaces(own)[0], torch.zeros(1, 2), 8)
-    torch.testing.assert_close(points[..., 2], torch.full((1, 5), 2 / (1 / 3 + 1 / 10)))
+    points = surface_at(own.cameras[0], Surfaces(own)[0], torch.full((1, 2), 4.0))
+    torch.testing.assert_close(points[:, 2], torch.full((1,), 2 / (1 / 3 + 1 / 10)))
 
 
 @pytest.mark.parametrize("strategy", ["seen", "direction"])
 def test_a_view_to_render_has_the_training_photographs_around_it(strategy: str):
     own = scene()
-    surface = tile_surface(own.cameras[1], Surfaces(own)[1], torch.zeros(1, 2), 32)
-    chosen, _ = choose_neighbours(own.cameras[1], surface, own, 100, strategy)
-    assert sorted(chosen[0].tolist()) == list(own.train)
-    fewer, _ = choose_neighbours(own.cameras[2], surface, own, 100, strategy, excluded=2)
-    assert sorted(fewer[0].tolist()) == [0, 3, 5, 6]
+
+    def neighbours(target: int, count: int, excluded: int | None = None) -> Neighbours:
+        prior = Surfaces(own)[target]
+        return choose_neighbours(own.cameras[target], prior, torch.zeros(2), (3, 2), 16, own, count, strategy, excluded)
+
+    everyone = neighbours(1, 100)
+    assert everyone.index.shape == (6, 5)
+    assert all(sorted(chosen) == list(own.train) for chosen in everyone.index.tolist())
+    assert sorted(neighbours(2, 100, 2).index[0].tolist()) == [0, 3, 5, 6]
     if strategy == "seen":
-        assert set(chosen[0, :2].tolist()) == {0, 2}
+        assert set(neighbours(1, 2).index[0, :2].tolist()) == {0, 2}
+
+
+def test_tiles_side_by_side_agree_about_who_is_there_between_them():
+    at = wall.scene(wall.cameras(12, 96, 72, step=0.2), (6,))
+    found = choose_neighbours(at.cameras[6], Surfaces(at)[6], torch.zeros(2), (6, 4), 16, at, 4, "seen")
+    presence = torch.zeros(6 * 4, 12, 4).scatter_(1, found.index[..., None].expand(-1, -1, 4), found.presence)
+    grid = presence.reshape(4, 6, 12, 4)
+    beside = (grid[:, :-1, :, [1, 3]] - grid[:, 1:, :, [0, 2]]).abs()
+    under = (grid[:-1, :, :, [2, 3]] - grid[1:, :, :, [0, 1]]).abs()
+    assert len({tuple(sorted(index)) for index in found.index.tolist()}) > 2, "neighbours change"
+    assert max(beside.max(), under.max()) < 0.1, "and those that change are hardly there where they do"
 
 
 def test_a_batch_for_a_network_without_views_has_nothing_to_encode():

@@ -32,7 +32,7 @@ def scene() -> tuple[Evidence, Gathered, Tensor]:
     cosine = (theirs * direction[:, None]).sum(-1)
     agreement = draw(T, P), valid.sum(1).double()
     evidence = Evidence(draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), *agreement, valid.any(1))
-    there = torch.ones(T, N).double()
+    there = torch.ones(T, N, P).double()
     return evidence, Gathered(draw(T, N, P, 3), draw(T, N, P, 4), theirs, cosine, valid, there), direction
 
 

@@ -5,7 +5,15 @@ import textured_wall as wall
 import torch
 from torch import Tensor
 
-from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER, FADE, nearest, rank_by_direction, rank_by_view
+from tidefield.data.neighbours import (
+    ANGLE_SCALE_RAD,
+    BORDER,
+    FADE,
+    from_border,
+    nearest,
+    rank_by_direction,
+    rank_by_view,
+)
 from tidefield.geometry.cameras import Cameras
 
 HEIGHT = 30.0
@@ -135,9 +143,15 @@ def test_a_view_fades_before_it_is_left_out():
     chosen, presence = nearest(rank, torch.zeros(4, 4, dtype=torch.bool), 3)
     assert chosen[:, :2].tolist() == [[1, 3]] * 4
     assert presence[:, :2].tolist() == [[1, 1]] * 4
-    assert presence[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 1e-3, 1], abs=1e-4)
+    assert presence[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 0, 1], abs=1e-4)
 
 
 def test_where_no_view_is_left_out_all_are_there():
     chosen, presence = nearest(torch.tensor([[0.5, 0.2]]), torch.zeros(1, 2, dtype=torch.bool), 3)
     assert (chosen.tolist(), presence.tolist()) == ([[0, 1]], [[1, 1]])
+
+
+def test_views_fade_towards_the_border_of_their_frame():
+    size = torch.tensor([400, 300])
+    uv = torch.tensor([[200.0, 150.0], [20.0, 150.0], [5.0, 150.0], [398.0, 150.0], [200.0, 299.0], [-3.0, 20.0]])
+    assert from_border(uv, size, 0.05).tolist() == pytest.approx([1, 1, 0.25, 0.1, 0.05, 0])

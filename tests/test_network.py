@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig, FieldConfig, NetworkConfig, StageConfig
+from tidefield.data.neighbours import Neighbours
 from tidefield.data.prior import surface_prior
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
@@ -35,6 +36,7 @@ NETWORKS = {
     "swift's stages on a field alone": replace(SWIFT.network, views=0, field=FIELD),
 }
 TARGET = 3
+MIDDLE = torch.full((2, 1, 2), 0.5)
 
 
 def network(config: NetworkConfig, seed: int = 0, stir: float = 0.0) -> Network:
@@ -64,8 +66,8 @@ def looking(
     if not own.config.views:
         return tiles, None, start
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
-    presence, middle = torch.ones(neighbours.shape), torch.zeros(len(corners), 3)
-    return tiles, FeatureShelf(own, at, CPU).views(neighbours, presence, middle), start
+    presence, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
+    return tiles, FeatureShelf(own, at, CPU).views(Neighbours(neighbours, presence), middle), start
 
 
 def outputs(rendering: TileRendering) -> list[Tensor]:
@@ -141,7 +143,7 @@ def test_a_view_that_is_hardly_there_may_be_any_other():
         tiles, views, start = looking(own, scene())
         assert views is not None
         presence = views.presence.clone()
-        presence[:, 0] = 1e-4
+        presence[:, 0] = 0
         rows, which = torch.arange(len(views.cameras)).reshape(views.which.shape), views.which.clone()
         rows[:, 0], which[:, 0] = rows[:, 3], which[:, 3]
         another = Views(views.cameras[rows.reshape(-1)], which, presence, views.encoded)
@@ -150,6 +152,26 @@ def test_a_view_that_is_hardly_there_may_be_any_other():
             own(tiles, replace(v, presence=views.presence), start, True).colour for v in (views, another)
         )
     assert (one - other).abs().max() < 0.1 * (there - not_there).abs().max()
+
+
+def test_views_fade_within_a_tile():
+    own = network(NETWORKS["swift"], stir=0.05).eval()
+    with torch.inference_mode():
+        tiles, views, start = looking(own, scene())
+        assert views is not None
+        here, gone, fading = (views.presence.clone() for _ in range(3))
+        gone[:, 0] = 0
+        fading[:, 0] = torch.tensor([1.0, 0.0, 1.0, 0.0])
+        full, none, between = (own(tiles, replace(views, presence=p), start, True).colour for p in (here, gone, fading))
+    middles = (torch.arange(16) + 0.5) / 16
+    corner = replace(views, presence=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 5, 4))
+    rays = torch.stack([middles, middles**2], -1).expand(2, -1, -1)
+    shown = corner._presence(rays, 32, torch.full((2, 5, 32), 0.5))
+    torch.testing.assert_close(shown[1, 2], (0.5 * (1 - middles) * (1 - middles**2)).repeat_interleave(2))
+    full, none, between = (x.reshape(2, 16, 16, 3) for x in (full, none, between))
+    left, right = ((full - between).abs().mean((0, 1, 3)), (none - between).abs().mean((0, 1, 3)))
+    assert left[0] < 0.2 * left[-1]
+    assert right[-1] < 0.2 * right[0]
 
 
 def test_a_scene_a_thousand_times_as_large_has_the_same_colours():
@@ -200,7 +222,9 @@ def test_what_one_view_alone_sees_is_not_smeared_over_the_depths_it_might_have()
     with torch.inference_mode():
         tiles, _, start = looking(own, at, 16, ((40, 28),))
         wide = replace(start, near=start.expected * 1.5, far=start.expected / 1.5)
-        views = FeatureShelf(own, at, CPU).views(torch.tensor([[0]]), torch.ones(1, 1), torch.zeros(1, 3))
+        views = FeatureShelf(own, at, CPU).views(
+            Neighbours(torch.tensor([[0]]), torch.ones(1, 1, 4)), torch.zeros(1, 3)
+        )
         found = own(tiles, views, wide, True).colour.reshape(16, 16, 3)
     truth = at.photographs[TARGET][28:44, 40:56] / 255
     assert -10 * (found - truth).square().mean().log10() > 42
@@ -318,7 +342,7 @@ def test_views_read_each_sample_where_it_projects():
         points = torch.cat([xy, torch.full((4, 1), wall.DEPTH)], -1)
         points = torch.cat([points, torch.tensor([[0.0, 0.0, -wall.DEPTH]])]).expand(2, 5, 3)
         towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-        gathered = views.read(1, points, towards, detail=True)
+        gathered = views.read(1, points, towards, MIDDLE, detail=True)
     for n, index in enumerate([2, 4, 1, 5, 0]):
         camera = at.cameras[index]
         uv, z = camera.project(points[0])
@@ -341,7 +365,9 @@ def test_what_lies_behind_a_view_is_not_seen_by_it_wherever_its_pixels_would_be(
     with torch.inference_mode():
         _, views, _ = looking(own, at)
         assert views is not None
-        gathered = [views.read(s, behind, nn.functional.normalize(behind, dim=-1), detail=False) for s in (1, 4)]
+        gathered = [
+            views.read(s, behind, nn.functional.normalize(behind, dim=-1), MIDDLE, detail=False) for s in (1, 4)
+        ]
     for each in gathered:
         assert not each.valid.any()
         assert each.features.isfinite().all()
@@ -385,7 +411,7 @@ def test_colours_come_from_the_photographs_at_full_resolution_whatever_the_featu
     assert views is not None
     points = torch.tensor([[0.1, -0.2, wall.DEPTH], [0.7, 0.3, wall.DEPTH]]).expand(2, 2, 3)
     towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-    colours = views.read(4, points, towards, detail=True).colours
+    colours = views.read(4, points, towards, MIDDLE, detail=True).colours
     assert (colours - wall.texture(points[:, None, :, :2])).abs().max() < 0.08
 
 

@@ -5,6 +5,8 @@ import textured_wall as wall
 import torch
 
 from tidefield.config import SWIFT
+from tidefield.data.batches import SPARE
+from tidefield.data.neighbours import Neighbours
 from tidefield.model import shelf
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
@@ -38,11 +40,13 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     view = at.cameras[1]
     middle = view.position_world + 5 * view.directions_world(seen_uv[None])[0]
     neighbours = torch.full((len(seen_uv), 1), 1)
-    views = FeatureShelf(network, at, CPU).views(neighbours, torch.ones_like(neighbours).float(), middle)
+    views = FeatureShelf(network, at, CPU).views(Neighbours(neighbours, torch.ones(4, 1, 4)), middle)
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
-    found = views.read(1, view.position_world[None] + 5 * directions, directions, detail=True)
+    found = views.read(
+        1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5), detail=True
+    )
     assert found.valid.all()
     assert len(views.which.unique()) == 4
     column, row = around.reshape(-1, 2).long().unbind(-1)
@@ -57,7 +61,7 @@ def test_what_was_forgotten_is_encoded_again_alike(network: Network):
     roomy, cramped = (Renderer(network, at, SWIFT, CPU) for _ in range(2))
     cramped.shelf = FeatureShelf(network, at, CPU, budget_bytes=1)
     assert roomy.shelf is not None
-    assert cramped.shelf.slots == SWIFT.network.views < roomy.shelf.slots
+    assert cramped.shelf.slots == SWIFT.network.views + SPARE < roomy.shelf.slots
     one, other = (renderer(at.cameras[TARGET]) for renderer in (roomy, cramped))
     torch.testing.assert_close(one.colour, other.colour, atol=1e-4, rtol=0)
 
@@ -65,6 +69,6 @@ def test_what_was_forgotten_is_encoded_again_alike(network: Network):
 @pytest.mark.usefixtures("small_blocks")
 def test_more_blocks_than_slots_are_refused(network: Network):
     cramped = FeatureShelf(network, scene(), CPU, budget_bytes=1)
-    neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 5]])
+    neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 3]])
     with pytest.raises(NoRoom):
-        cramped.views(neighbours, torch.ones_like(neighbours).float(), torch.zeros(2, 3))
+        cramped.views(Neighbours(neighbours, torch.ones(2, 5, 4)), torch.zeros(2, 3))

@@ -12,15 +12,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tidefield.config import TrainConfig
-from tidefield.data.neighbours import nearest, rank_by_direction, rank_by_view
+from tidefield.data.neighbours import Neighbours, nearest, of_tiles, rank_by_direction, rank_by_view
 from tidefield.data.prior import STRIDE, Observed, observed_depths, read_prior, surface_prior
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, pixel_grid, project
 
 FEW = 64
-"""Photographs that are ranked for every tile; of more, only those that every so many tiles see best."""
+"""Photographs that are ranked for every place; of more, only those that every so many places see best."""
 EVERY = 7
+SPARE = 1
+"""Views that a tile has beyond those of each corner: room for others to take over within the tile."""
+SPOTS = ((0.0, 0.0), (-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4))
+"""Around each corner of a tile, in its sides, where it is asked who sees the surface."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Batch:
         inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
         depth_weight: how far to trust these, 0 to 1; 0 where there is none.
         neighbours: photographs serving as the tiles' neighbouring views.
-        presence: of these, how far each is there.
+        presence: of these, how far each is there at the tiles' corners.
         which: for each neighbour, the image of `images` to read.
         images: what to encode, in groups of one size: crops of, or whole, photographs.
         image_corner_px: where in their photographs the images' upper left corners lie.
@@ -49,7 +53,7 @@ class Batch:
     inverse_depth: Float[Tensor, "T R"]
     depth_weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
-    presence: Float[Tensor, "T N"]
+    presence: Float[Tensor, "T N 4"]
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
@@ -92,13 +96,39 @@ def even(scene: Scene, index: int, rows: slice = slice(None), columns: slice = s
     return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])
 
 
-def tile_surface(
-    camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "T 2"], side_px: int
-) -> Float[Tensor, "T 5 3"]:
-    """Surface points that a tile shows: its middle and four points towards its corners."""
-    spots = corner_px.new_tensor([[0.5, 0.5], [0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]])
-    uv = corner_px[:, None] + spots * side_px
-    return _surface(camera, prior, uv.reshape(-1, 2)).reshape(-1, 5, 3)
+def choose_neighbours(
+    camera: Cameras,
+    prior: Float[Tensor, "3 h w"],
+    corner_px: Float[Tensor, "2"],
+    grid: tuple[int, int],
+    side_px: int,
+    scene: Scene,
+    count: int,
+    strategy: str,
+    excluded: int | None = None,
+) -> Neighbours:
+    """Training photographs that serve as neighbouring views of a grid of tiles, row by row.
+
+    Args:
+        camera: that shows the tiles.
+        prior: its surface.
+        corner_px: the grid's upper left corner.
+        grid: columns and rows of tiles.
+        side_px: of a tile.
+        scene: whose photographs.
+        count: of views at each corner; the tiles have `SPARE` more.
+        strategy: `TrainConfig.neighbours`.
+        excluded: a photograph that may not serve.
+    """
+    columns, rows = grid
+    places = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
+    uv = places[:, None] + corner_px.new_tensor(SPOTS) * side_px
+    surface = surface_at(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
+    spare = SPARE if count else 0
+    chosen, presence = _ranked(camera, surface, scene, count, spare, strategy, excluded)
+    first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
+    corners = first + torch.tensor([0, 1, columns + 1, columns + 2])
+    return of_tiles(chosen, presence, corners)
 
 
 def tile_doubly_seen(
@@ -107,13 +137,13 @@ def tile_doubly_seen(
     """Which pixels of a tile show surface that two or more other cameras see, as the prior's cells tell it."""
     cells = max(1, side_px // STRIDE)
     middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
-    uv, z = others.project(_surface(camera, prior, middles))
+    uv, z = others.project(surface_at(camera, prior, middles))
     seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
     near = torch.arange(side_px) * cells // side_px
     return seen[near][:, near].reshape(-1)
 
 
-def _surface(camera: Cameras, prior: Float[Tensor, "3 h w"], uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+def surface_at(camera: Cameras, prior: Float[Tensor, "3 h w"], uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
     """Surface points at pixels of one camera; beyond the image they are those at its border."""
     uv = torch.minimum(uv_px.clamp(min=0), camera.size_px[0].to(uv_px))[None]
     expected, near, far = read_prior(prior[None], uv)
@@ -121,29 +151,29 @@ def _surface(camera: Cameras, prior: Float[Tensor, "3 h w"], uv_px: Float[Tensor
     return (camera.position_world[:, None] + camera.directions_world(uv) / inverse[..., None])[0]
 
 
-def choose_neighbours(
+def _ranked(
     camera: Cameras,
-    surface_world: Float[Tensor, "T 5 3"],
+    surface_world: Float[Tensor, "K S 3"],
     scene: Scene,
     count: int,
+    spare: int,
     strategy: str,
-    excluded: int | None = None,
-) -> tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]]:
-    """Training photographs that serve as neighbouring views of one camera's tiles, best first, and how far each is
-    there (`nearest`)."""
+    excluded: int | None,
+) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """Training photographs that show some places best, and how far each is there (`nearest`)."""
     train = torch.tensor(scene.train)
     if strategy != "direction" and len(train) > FEW and len(surface_world) > EVERY:
-        # What some tiles see best, all of them see best that lie between: the work of ranking stays small, however
-        # many photographs there are.
+        # What is best at some places is best at all that lie between: the work of ranking stays small, however many
+        # photographs there are.
         some = rank_by_view(camera, surface_world[::EVERY], scene.cameras[train])
-        train = train[some.topk(min(2 * count + 2, len(train)), dim=1).indices.unique()]
+        train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
     candidates = scene.cameras[train]
     if strategy == "direction":
         rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
     else:
         rank = rank_by_view(camera, surface_world, candidates)
     out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
-    chosen, presence = nearest(rank, out, count)
+    chosen, presence = nearest(rank, out, count, spare)
     return train[chosen], presence
 
 
@@ -167,14 +197,13 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     size = scene.cameras.size_px[targets]
     room = (size - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
-    surfaces_world, neighbours, presences, weights, depths = [], [], [], [], []
+    middles_world, neighbours, presences, weights, depths = [], [], [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], surfaces[target]
-        surface = tile_surface(camera, prior, at[None], side)
-        surfaces_world.append(surface[0, 0])
-        found, presence = choose_neighbours(camera, surface, scene, views, config.neighbours, target)
-        neighbours.append(found[0])
-        presences.append(presence[0])
+        middles_world.append(surface_at(camera, prior, at[None] + side / 2)[0])
+        found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours, target)
+        neighbours.append(found.index[0])
+        presences.append(found.presence[0])
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
             others = scene.cameras[train[train != target]]
@@ -191,7 +220,7 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     elif config.crop_px is None:
         which, images, corners = _whole(scene, chosen)
     else:
-        which, images, corners = _crops(scene, chosen, torch.stack(surfaces_world), config.crop_px)
+        which, images, corners = _crops(scene, chosen, torch.stack(middles_world), config.crop_px)
     return Batch(targets, corner, colours, weight, inverse_depth, depth_weight, chosen, present, which, images, corners)
 
 

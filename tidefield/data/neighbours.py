@@ -1,9 +1,14 @@
 """Which photographs are a tile's neighbouring views (paper, "System overview"; method.md, section 1).
 
-Alphabet: T tiles, V candidate photographs, S points of the visible surface per tile, N neighbours.
+They are chosen where tiles meet, at their corners, and fade in between: tiles side by side, which may read different
+photographs, then show the same along their border.
+
+Alphabet: K places, T tiles, V candidate photographs, S points of the visible surface per place, N neighbours.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,17 +25,31 @@ ANGLE_SCALE_RAD = 0.35
 """Angle at which a view that sees the whole tile is worth as much as one straight on that sees 1 / e of it."""
 
 
-def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "T S 3"], candidates: Cameras) -> Float[Tensor, "T V"]:
+@dataclass(frozen=True)
+class Neighbours:
+    """The views of T tiles, best first.
+
+    Attributes:
+        index: photographs.
+        presence: how far each is there, 0 to 1, at the tile's corners: upper left and right, then lower left and right.
+    """
+
+    index: Int[Tensor, "T N"]
+    presence: Float[Tensor, "T N 4"]
+
+    def __getitem__(self, tiles: Tensor | slice) -> Neighbours:
+        return Neighbours(self.index[tiles], self.presence[tiles])
+
+
+def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "K S 3"], candidates: Cameras) -> Float[Tensor, "K V"]:
     """How well each candidate shows what a target sees: share of the surface points in its frame times closeness.
 
     Closeness falls with the mean angle subtended at the points between the target's and the candidate's rays, so it
     tells nadir photographs apart, which all look in the same direction.
     """
-    tiles, points = surface_world.shape[:2]
+    places, points = surface_world.shape[:2]
     uv, z = candidates.project(surface_world.reshape(-1, 3))
-    # Not a step at the border: views that come and go must do so gently, or pictures jump.
-    within = torch.minimum(uv, candidates.size_px[:, None] - uv).amin(-1) / (BORDER * candidates.size_px[:, None, 0])
-    share = (within.clamp(0, 1) * (z > 0)).reshape(-1, tiles, points).mean(-1).T
+    share = (from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)).reshape(-1, places, points).mean(-1).T
     ours = F.normalize(surface_world - targets.position_world[:, None], dim=-1)
     theirs = F.normalize(surface_world[:, None] - candidates.position_world[None, :, None], dim=-1)
     # From the chord: unlike the cosine it keeps small angles.
@@ -38,27 +57,56 @@ def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "T S 3"], candid
     return share * torch.exp(-angle.mean(-1) / ANGLE_SCALE_RAD)
 
 
-def rank_by_direction(targets: Cameras, candidates: Cameras) -> Float[Tensor, "T V"]:
+def from_border(uv_px: Float[Tensor, "*B 2"], size_px: Tensor, share: float) -> Float[Tensor, "*B"]:
+    """Where a view shows something: 1 inside, and falling to 0 towards the border of its frame and beyond.
+
+    Views come and go gently: otherwise pictures jump when they do, and show where a photograph ends.
+
+    Args:
+        size_px: width and height, to go with `uv_px`.
+        share: of its width over which it falls.
+    """
+    return (torch.minimum(uv_px, size_px - uv_px).amin(-1) / (share * size_px[..., 0])).clamp(0, 1)
+
+
+def rank_by_direction(targets: Cameras, candidates: Cameras) -> Float[Tensor, "K V"]:
     """The paper's ranking: cosine between the viewing directions, moved to [0, 1]."""
     return (targets.forward_world @ candidates.forward_world.T + 1) / 2
 
 
 def nearest(
-    rank: Float[Tensor, "T V"], excluded: Bool[Tensor, "T V"], count: int
-) -> tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]]:
-    """The `count` best-ranked candidates of each tile, best first; fewer where there are not as many.
+    rank: Float[Tensor, "K V"], excluded: Bool[Tensor, "K V"], count: int, spare: int = 0
+) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """The best-ranked candidates of each place, best first; fewer where there are not as many.
 
     Args:
         excluded: candidates that may not serve, such as the target photograph itself.
+        count: of them that are there.
+        spare: how many follow that are not there, but may be nearby.
 
     Returns:
-        The candidates, and how far each is there, in (0, 1]: one that is about to be left out for a better one
-        hardly counts any more, so that nothing jumps when it is.
+        The candidates, and how far each is there, 0 to 1: one that is about to be left out for a better one does not
+        count any more, so that nothing jumps when it is.
     """
     allowed = int((~excluded).sum(1).min())
-    found = rank.masked_fill(excluded, -1.0).topk(min(count + 1, allowed), dim=1)
-    best, left_out = found.values[:, :count], found.values[:, count:].clamp(min=0)
-    if not left_out.shape[1]:
-        return found.indices, torch.ones_like(best)
-    presence = (best - left_out) / (FADE * best).clamp(min=1e-9)
-    return found.indices[:, :count], presence.clamp(1e-3, 1)
+    found = rank.masked_fill(excluded, -1.0).topk(min(count + max(spare, 1), allowed), dim=1)
+    if allowed <= count:
+        return found.indices, torch.ones_like(found.values)
+    chosen, best, left_out = found.indices[:, : count + spare], found.values[:, : count + spare], found.values[:, count]
+    presence = (best - left_out[:, None].clamp(min=0)) / (FADE * best).clamp(min=1e-9)
+    return chosen, presence.clamp(0, 1)
+
+
+def of_tiles(chosen: Int[Tensor, "K N"], presence: Float[Tensor, "K N"], corners: Int[Tensor, "T 4"]) -> Neighbours:
+    """The neighbours of tiles from those of their corners, as many: those that are there most.
+
+    Args:
+        chosen, presence: as `nearest` gives them.
+        corners: each tile's, among the K places.
+    """
+    photographs, which = chosen.unique(return_inverse=True)
+    # A hardly visible presence of all that were chosen, so that they go before those that were not.
+    everyone = presence.new_zeros(len(chosen), len(photographs)).scatter_(1, which, presence.clamp(min=1e-6))
+    everyone = everyone[corners].transpose(1, 2)
+    best = everyone.sum(-1).topk(chosen.shape[1], dim=1).indices
+    return Neighbours(photographs[best], everyone.gather(1, best[..., None].expand(-1, -1, 4)))

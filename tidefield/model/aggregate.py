@@ -46,7 +46,7 @@ def direction_weights(
     cosine: Float[Tensor, "T N P"],
     valid: Bool[Tensor, "T N P"],
     sharpness: Float[Tensor, ""],
-    presence: Float[Tensor, "T N"] | None = None,
+    presence: Float[Tensor, "T N P"] | None = None,
 ) -> Float[Tensor, "T N P"]:
     """Eq. 6: w~_i = max(0, exp(s (d.d_i - 1)) - min_j exp(s (d.d_j - 1))), normalised over the views.
 
@@ -64,7 +64,7 @@ def direction_weights(
     raw = (closeness - least).clamp(min=0).masked_fill(~valid, 0.0)
     shared = valid.to(raw)
     if presence is not None:
-        raw, shared = raw * presence[..., None], shared * presence[..., None]
+        raw, shared = raw * presence, shared * presence
     total = raw.sum(1, keepdim=True)
     shared = shared / shared.sum(1, keepdim=True).clamp(min=1e-9)
     # Below 1e-6 the differences are rounding of equal angles, not a preference.
@@ -126,7 +126,7 @@ class Aggregate(nn.Module):
         colours: Float[Tensor, "T N P 3"],
         cosine: Float[Tensor, "T N P"],
         valid: Bool[Tensor, "T N P"],
-        presence: Float[Tensor, "T N"] | None = None,
+        presence: Float[Tensor, "T N P"] | None = None,
     ) -> Evidence:
         sharpness = self.log_sharpness.exp()
         # With a sharpness of 0 all directions are the same, and the views share equally.
@@ -138,7 +138,7 @@ class Aggregate(nn.Module):
         per_view = F.relu(self.second(first), inplace=True)
         trust = torch.sigmoid(self.trust(per_view)[..., 0]) * valid
         if presence is not None:
-            trust = trust * presence[..., None]
+            trust = trust * presence
         seen = valid.any(1)
         # Where no view is valid the sum is 0, and so are the pooled features.
         pooled = weighted_moments(per_view, trust / trust.sum(1, keepdim=True).clamp(min=1e-6))

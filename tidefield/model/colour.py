@@ -76,5 +76,5 @@ class ColourBlend(nn.Module):
         hidden = self.view(evidence.per_view) + self.direction(torch.cat(near, dim=-1))
         logits = self.logit(F.relu(hidden, inplace=True))
         if self.angle is not None:
-            logits = logits + self.angle * closeness + gathered.presence.log()[..., None, None]
+            logits = logits + self.angle * closeness + gathered.presence.log()[..., None]
         return logits[..., 0].masked_fill(~gathered.valid, -torch.inf)

@@ -156,7 +156,11 @@ class Network(nn.Module):
         uv = tiles.rays_px(config.stride, self.margin(k))
         samples = place_samples(tiles.cameras, uv, intervals, sample(density, config.samples, generator))
         points, directions = samples.points_world, samples.directions
-        gathered = views.read(config.feature_stride, points, directions, k + 1 == len(self.stages)) if views else None
+        gathered = None
+        if views:
+            within = ((uv - tiles.corner_px[:, None]) / tiles.side_px).clamp(0, 1)
+            detail = k + 1 == len(self.stages)
+            gathered = views.read(config.feature_stride, points, directions, within, detail)
         evidence = stage.evidence(gathered, self.field(points) if self.field else None)
         unit = self.field.unit if self.field and not views else None
         weights = stage.weights(evidence, samples, intervals, opaque, unit)

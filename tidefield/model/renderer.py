@@ -7,11 +7,12 @@ continued from beside it, unless the preset is to do as printed, a field knows t
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from tidefield.config import Config
-from tidefield.data.batches import choose_neighbours, even, tile_surface
+from tidefield.data.batches import SPARE, choose_neighbours, even, surface_at
+from tidefield.data.neighbours import Neighbours
 from tidefield.data.prior import read_prior, surface_prior
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
@@ -45,7 +46,7 @@ class Renderer:
     def __init__(self, network: Network, scene: Scene, config: Config, device: torch.device) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.shelf = FeatureShelf(network, scene, device) if network.config.views else None
-        stages, views = network.config.stages, max(1, network.config.views)
+        stages, views = network.config.stages, network.config.views + SPARE
         gathered = max((TILE_PX // s.stride) ** 2 * s.samples * views * s.feature_channels for s in stages)
         room = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, room // gathered)
@@ -85,15 +86,15 @@ class Renderer:
         (left, top), (columns, rows) = corner, size
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
-        surface = tile_surface(camera, prior, corners, TILE_PX)
+        middles = surface_at(camera, prior, corners + TILE_PX / 2)
         views, strategy = self.network.config.views, self.config.train.neighbours
-        neighbours = presence = None
+        neighbours = None
         if views:
-            neighbours, presence = choose_neighbours(camera, surface, self.scene, views, strategy)
+            neighbours = choose_neighbours(camera, prior, corners[0], size, TILE_PX, self.scene, views, strategy)
         parts = []
         for some in torch.arange(len(corners)).split(self.tiles_at_once):
-            chosen = None if neighbours is None or presence is None else (neighbours[some], presence[some])
-            parts.append(self._tiles(camera, prior, corners[some], chosen, surface[some, 0]))
+            chosen = None if neighbours is None else neighbours[some]
+            parts.append(self._tiles(camera, prior, corners[some], chosen, middles[some]))
         stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 6)
         return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
 
@@ -102,21 +103,21 @@ class Renderer:
         camera: Cameras,
         prior: Float[Tensor, "3 h w"],
         corners: Float[Tensor, "T 2"],
-        neighbours: tuple[Int[Tensor, "T N"], Float[Tensor, "T N"]] | None,
+        neighbours: Neighbours | None,
         middle_world: Float[Tensor, "T 3"],
     ) -> Float[Tensor, "T R 6"]:
         views = None
         if neighbours is not None:
             assert self.shelf is not None
             try:
-                views = self.shelf.views(*neighbours, middle_world)
+                views = self.shelf.views(neighbours, middle_world)
             except NoRoom:
                 if len(corners) == 1:
                     raise
                 half = len(corners) // 2
                 return torch.cat(
                     [
-                        self._tiles(camera, prior, corners[s], (neighbours[0][s], neighbours[1][s]), middle_world[s])
+                        self._tiles(camera, prior, corners[s], neighbours[s], middle_world[s])
                         for s in (slice(half), slice(half, None))
                     ]
                 )

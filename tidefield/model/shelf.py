@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tidefield.data.batches import even
+from tidefield.data.batches import SPARE, even
+from tidefield.data.neighbours import Neighbours
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import project
 from tidefield.model.gather import FeatureMaps
@@ -51,25 +52,22 @@ class FeatureShelf:
         with torch.no_grad():
             like = network.encode(patch)
         texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
-        self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views)
+        self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views + SPARE)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
         self._encoded = Encoded(features, self._empty(like.photographs))
         self._held: OrderedDict[tuple[int, int, int], int] = OrderedDict()
 
-    def views(
-        self, neighbours: Int[Tensor, "T N"], presence: Float[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]
-    ) -> Views:
+    def views(self, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
         """The neighbours of tiles, encoded around what each tile shows.
 
         Args:
-            neighbours: photographs.
-            presence: how far each of them is there.
+            neighbours: photographs, and how far each of them is there.
             middle_world: the surface in the middle of each tile.
 
         Raises:
             NoRoom: when these tiles need more blocks than there are slots.
         """
-        keys = self._blocks(neighbours, middle_world)
+        keys = self._blocks(neighbours.index, middle_world)
         wanted = dict.fromkeys(keys)
         if len(wanted) > self.slots:
             raise NoRoom
@@ -79,9 +77,9 @@ class FeatureShelf:
         for key in wanted:
             if key not in self._held:
                 self._encode(key)
-        which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.shape)
-        cameras = self.cameras[neighbours.reshape(-1).to(self.device)]
-        return Views(cameras, which, presence.to(self.device), self._encoded)
+        which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.index.shape)
+        cameras = self.cameras[neighbours.index.reshape(-1).to(self.device)]
+        return Views(cameras, which, neighbours.presence.to(self.device), self._encoded)
 
     def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
         """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""

@@ -11,8 +11,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tidefield.data.neighbours import from_border
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.gather import FeatureMaps, gather, joined
+
+FEATHER = 0.02
+"""Share of its width over which a view fades towards the border of its frame."""
+LEAST_PRESENCE = 1e-4
+"""Of a view that has faded out: its logarithm enters the blending, and where it alone sees, it must do."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,7 @@ class Gathered:
         directions: d_i, unit, from each view's camera to the sample.
         cosine: d.d_i with the target's direction.
         valid: whether the sample is in front of the camera and inside the encoded part of the photograph.
-        presence: how far each view is there (`data.neighbours.nearest`).
+        presence: how far each view is there (`data.neighbours`), above 0.
     """
 
     colours: Float[Tensor, "T N P 3"]
@@ -33,7 +39,7 @@ class Gathered:
     directions: Float[Tensor, "T N P 3"]
     cosine: Float[Tensor, "T N P"]
     valid: Bool[Tensor, "T N P"]
-    presence: Float[Tensor, "T N"]
+    presence: Float[Tensor, "T N P"]
 
 
 @dataclass(frozen=True)
@@ -63,22 +69,29 @@ class Views:
     Attributes:
         cameras: of the T N views, tile by tile.
         which: the map of each view.
-        presence: how far each view is there (`data.neighbours.nearest`).
+        presence: how far each view is there at its tile's corners (`data.neighbours`).
         encoded: all maps.
     """
 
     cameras: Cameras
     which: Int[Tensor, "T N"]
-    presence: Float[Tensor, "T N"]
+    presence: Float[Tensor, "T N 4"]
     encoded: Encoded
 
     def read(
-        self, stride: int, points_world: Float[Tensor, "T P 3"], directions: Float[Tensor, "T P 3"], detail: bool
+        self,
+        stride: int,
+        points_world: Float[Tensor, "T P 3"],
+        directions: Float[Tensor, "T P 3"],
+        within: Float[Tensor, "T R 2"],
+        detail: bool,
     ) -> Gathered:
         """Project samples into every view and read the maps of one stride there.
 
         Args:
+            points_world: of the samples of R rays, all rays' samples one after the other.
             directions: d, unit, from the target's camera to the samples.
+            within: where the rays pass their tile, 0 to 1 from its left and from its top.
             detail: read the photographs themselves, not their means over the stride.
         """
         tiles, count = self.which.shape
@@ -101,5 +114,14 @@ class Views:
             directions=theirs,
             cosine=(theirs * directions[:, None]).sum(-1),
             valid=inside & on_map,
-            presence=self.presence,
+            presence=self._presence(within, points_world.shape[1], from_border(uv, size, FEATHER)),
         )
+
+    def _presence(
+        self, within: Float[Tensor, "T R 2"], samples: int, from_border: Float[Tensor, "T N P"]
+    ) -> Float[Tensor, "T N P"]:
+        right, below = (x[:, None] for x in within.unbind(-1))
+        rows = self.presence.unflatten(-1, (2, 2)).unbind(2)
+        upper, lower = (torch.lerp(row[..., :1], row[..., 1:], right) for row in rows)
+        rays = torch.lerp(upper, lower, below).repeat_interleave(samples // within.shape[1], dim=-1)
+        return (rays * from_border).clamp(min=LEAST_PRESENCE)
