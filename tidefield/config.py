@@ -63,7 +63,7 @@ class NetworkConfig:
     encoder: EncoderConfig
     stages: tuple[StageConfig, ...]
     views: int
-    """N, neighbouring views; 0 leaves the per-scene field alone, a NeRF."""
+    """N, neighbouring views at each place; 0 leaves the per-scene field alone, a NeRF."""
     fold: bool
     """Apply the aggregation's first layer to the feature maps, once per photograph instead of once per sample."""
     heads: int = 4

@@ -116,7 +116,7 @@ def choose_neighbours(
         grid: columns and rows of tiles.
         side_px: of a tile.
         scene: whose photographs.
-        count: of views at each corner; the tiles have `SPARE` more.
+        count: of views at each corner; the tiles have `SPARE` more, unless all places have the same.
         strategy: `TrainConfig.neighbours`.
         excluded: a photograph that may not serve.
     """
@@ -124,7 +124,7 @@ def choose_neighbours(
     places = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
     uv = places[:, None] + corner_px.new_tensor(SPOTS) * side_px
     surface = surface_at(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
-    spare = SPARE if count else 0
+    spare = SPARE if count and strategy != "direction" else 0
     chosen, presence = _ranked(camera, surface, scene, count, spare, strategy, excluded)
     first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
     corners = first + torch.tensor([0, 1, columns + 1, columns + 2])
