@@ -102,6 +102,9 @@ def test_a_full_mask_gives_lpips_as_the_library_does(alexnet):
     everywhere = torch.ones(64, 80, dtype=torch.bool)
     assert network(image, truth, [everywhere])[0] == pytest.approx(expected, rel=1e-5)
     assert expected > 0
+    others = [network(image, noise(3), [everywhere])[0], network(image, truth, [everywhere])[0]]
+    assert others[1] == pytest.approx(expected, rel=1e-5)
+    assert others[0] != others[1], "of another truth, other features"
 
 
 @needs_torchvision

@@ -51,6 +51,8 @@ class Lpips:
         self.sha256 = file_sha256(weights)
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
+        self._truth: Tensor | None = None
+        self._expected: list[Tensor] = []
         features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
 
     @torch.no_grad()
@@ -61,14 +63,16 @@ class Lpips:
 
         In every layer the mean over its cells is weighted with the share of the mask in each cell.
         """
-        maps: list[Tensor] = []
-        hooks = [lin.register_forward_hook(lambda _m, _i, out: maps.append(out[0, 0])) for lin in self._network.lins]
-        try:
-            self._network(_batch(image), _batch(truth), normalize=True)
-        finally:
-            for hook in hooks:
-                hook.remove()
+        if truth is not self._truth:  # several images are compared with each
+            self._truth, self._expected = truth, self._features(truth)
+        layers = zip(self._network.lins, self._features(image), self._expected, strict=True)
+        maps = [lin((found - expected).square())[0, 0] for lin, found, expected in layers]
         return [sum(_weighted_mean(layer, mask) for layer in maps) for mask in masks]
+
+    def _features(self, image: UInt8[Tensor, "H W 3"]) -> list[Tensor]:
+        """Of each layer, every cell's of unit length."""
+        scaled = self._network.scaling_layer(2 * _batch(image) - 1)
+        return [x / torch.sqrt(1e-8 + x.square().sum(1, keepdim=True)) for x in self._network.net(scaled)]
 
 
 def load_lpips() -> dict[str, Lpips | str]:
