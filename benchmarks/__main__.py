@@ -89,7 +89,7 @@ def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> A
 
 
 def frames(
-    scene: Path,
+    scene: tyro.conf.Positional[Path],
     runs: Path,
     preset: Literal["swift", "paper"] = "swift",
     weights: Path | None = None,
