@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.begun import FROM_SCRATCH, MINUTE, SECONDS, ByLength
 from tidefield.compare.published import TABLE_3
-from tidefield.compare.results import Results
+from tidefield.compare.results import Result, Results
 from tidefield.compare.run import ZERO_SHOT
 
 SURVEYS = ("caliterra", "swindale", "turin_lot", "brighton_beach")
@@ -107,7 +107,12 @@ def _of_lengths(lengths: ByLength) -> list[Bar]:
 
     def gains(metric: str, sign: int, length: str, other: str) -> Gains:
         pairs = {scene: [lengths.get(name, {}).get(scene) for name in (length, other)] for scene in BEGUN}
-        values = {scene: [result and result.metric(metric) for result in pair] for scene, pair in pairs.items()}
+        values = {
+            scene: [
+                result.metric(metric) if result is not None and _measured_as_aimed(result) else None for result in pair
+            ]
+            for scene, pair in pairs.items()
+        }
         return {s: None if a is None or b is None else sign * (a - b) for s, (a, b) in values.items()}
 
     kinds = (("psnr", 1, "PSNR", "{:+.2f} dB", 0.005), ("ssim", 1, "SSIM", "{:+.3f}", 0.0005))
@@ -138,10 +143,14 @@ def _aimed(results: Results, scene: str, method: str, name: str) -> float | None
     result = results.by.get((scene, method))
     if result is None:
         return None
+    trained = "train" not in result.process or result.process.get("settings", {}).get("minutes") == MINUTES
+    return result.metric(name) if trained and _measured_as_aimed(result) else None
+
+
+def _measured_as_aimed(result: Result) -> bool:
+    """At the width and on the device that are aimed at, however long it was trained."""
     settings = result.process.get("settings", {})
-    trained = "train" not in result.process or settings.get("minutes") == MINUTES
-    as_aimed = trained and (settings.get("width"), settings.get("device")) == (WIDTH, DEVICE)
-    return result.metric(name) if as_aimed else None
+    return (settings.get("width"), settings.get("device")) == (WIDTH, DEVICE)
 
 
 def _unmeasured(aim: str, values: Gains) -> Bar | None:

@@ -118,10 +118,11 @@ class Views:
         )
 
     def _presence(
-        self, within: Float[Tensor, "T R 2"], samples: int, from_border: Float[Tensor, "T N P"]
+        self, within: Float[Tensor, "T R 2"], samples: int, inside: Float[Tensor, "T N P"]
     ) -> Float[Tensor, "T N P"]:
+        """How far each view is there at every sample: as far as at its ray, and as the sample is inside its frame."""
         right, below = (x[:, None] for x in within.unbind(-1))
         rows = self.presence.unflatten(-1, (2, 2)).unbind(2)
         upper, lower = (torch.lerp(row[..., :1], row[..., 1:], right) for row in rows)
         rays = torch.lerp(upper, lower, below).repeat_interleave(samples // within.shape[1], dim=-1)
-        return (rays * from_border).clamp(min=LEAST_PRESENCE)
+        return (rays * inside).clamp(min=LEAST_PRESENCE)

@@ -51,9 +51,9 @@ class Lpips:
         self.sha256 = file_sha256(weights)
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
+        features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
         self._truth: Tensor | None = None
         self._expected: list[Tensor] = []
-        features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
 
     @torch.no_grad()
     def __call__(
