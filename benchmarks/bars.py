@@ -56,15 +56,12 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
     ) -> Gains:
         return {scene: _gain(results, scene, name, own, others, more) for scene in scenes}
 
-    def ahead_of_nerfacto(own: str, scenes: tuple[str, ...], who: str, where: str) -> list[Bar]:
+    def ahead(own: str, others: tuple[str, ...], scenes: tuple[str, ...], aim: str) -> list[Bar]:
         kinds = (("psnr", "PSNR above", "{:+.2f} dB"), ("ssim", "SSIM above", "{:+.4f}"))
         kinds += (("lpips_vgg", "LPIPS (VGG) below", "{:+.4f}"),)
         return [
             _on_each(
-                f"{who}{title} Nerfacto's {where}",
-                gain(name, peer, scenes, not title.endswith("below"), own),
-                style,
-                lambda x: x > 0,
+                aim.format(title), gain(name, others, scenes, not title.endswith("below"), own), style, lambda x: x > 0
             )
             for name, title, style in kinds
         ]
@@ -78,15 +75,10 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
         _on_each("SSIM above the better floor on each survey", structure, "{:+.4f}", lambda x: x > 0),
         _in_the_mean("PSNR above the better floor", blending, GAIN_DB),
         _on_each("PSNR not below the preset paper's on any survey", paper, "{:+.2f} dB", lambda x: x >= 0),
-        *ahead_of_nerfacto("tidefield", SCENES, "", "on each scene"),
+        *ahead("tidefield", peer, SCENES, "{} Nerfacto's on each scene"),
         _in_the_mean("PSNR above Nerfacto's, doubly seen pixels", gain("psnr_seen", peer, SCENES), AHEAD_DB),
-        *ahead_of_nerfacto("zero-shot", UNSEEN, "Zero-shot, ", "where nothing was learned"),
-        _on_each(
-            "Zero-shot, PSNR above the better floor on each scene",
-            gain("psnr", FLOORS, SCENES, own="zero-shot"),
-            "{:+.2f} dB",
-            lambda x: x > 0,
-        ),
+        *ahead("zero-shot", peer, UNSEEN, "Zero-shot, {} Nerfacto's where nothing was learned"),
+        *ahead("zero-shot", FLOORS, SCENES, "Zero-shot, {} the better floor on each scene"),
         *_of_lengths(lengths),
         *(_as_fast(results, kept.speed, other) for other in TIMES_AS_FAST),
         *_frame_times(kept.frames),

@@ -3,7 +3,8 @@
 What is measured:
 - The first: a `tidefield render` of its own, from the scene on disk with nothing decoded before, to the written file.
 - The others: one after the other along a flight, in one process.
-- The same view of a survey that lies there once, and among more and more copies of itself.
+- The same view of a survey that lies there once, and among more and more copies of itself, in turns, so that a machine
+  that becomes slower or faster counts against none of them.
 - How much consecutive frames of a flight differ where they show the same: the second one's colours are read where the
   first one's depths say that its pixels lie, and pixels at which the two frames' depths disagree are left out.
 """
@@ -41,8 +42,8 @@ FRAMES_FILE = "frames.json"
 SIZE_PX = (800, 600)
 FURTHER = 5
 """Frames after the first whose median time is told."""
-COUNTS = (200, 2000)
-"""Photographs among which the survey's own are looked at again."""
+COUNTS, TURNS = (200, 2000), 7
+"""Photographs among which the survey's own are looked at again, and how often."""
 FLIGHT_FRAMES = 240
 """Of a flight past all photographs, ten seconds long."""
 STEADY_FRAMES, STEADY_WIDTH = 48, 320
@@ -88,9 +89,7 @@ def measure_frames(
         "photographs": len(scene.names),
         "first": first,
         "further_seconds": _further(view_of(scene), flight[middle : middle + FURTHER + 1]),
-        "by_photographs": {
-            str(count): _again(view_of(among_copies(scene, count)), shown) for count in (len(scene.names), *COUNTS)
-        },
+        "by_photographs": _by_photographs(view_of, scene, shown),
         "steadiness": _steadiness(view_of, scene),
         "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --device {device}",
         **stamp(),
@@ -113,10 +112,13 @@ def _further(view: Render, cameras: Cameras) -> float:
     return statistics.median(_seconds(view, cameras[k]) for k in range(1, len(cameras)))
 
 
-def _again(view: Render, camera: Cameras) -> float:
-    """Seconds of a frame whose photographs have been encoded."""
-    view(camera)
-    return statistics.median(_seconds(view, camera) for _ in range(3))
+def _by_photographs(view_of: Callable[[Scene], Render], scene: Scene, camera: Cameras) -> dict[str, float]:
+    """Median seconds of a frame whose photographs have been encoded, by how many photographs there are."""
+    views = {count: view_of(among_copies(scene, count)) for count in (len(scene.names), *COUNTS)}
+    for view in views.values():
+        view(camera)
+    turns = [{count: _seconds(view, camera) for count, view in views.items()} for _ in range(TURNS)]
+    return {str(count): statistics.median(turn[count] for turn in turns) for count in views}
 
 
 def _seconds(view: Render, camera: Cameras) -> float:
