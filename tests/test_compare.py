@@ -222,12 +222,16 @@ def test_crops_show_where_methods_differ_and_do_not_overlap():
     one, other = truth.copy(), truth.copy()
     one[20:26, 50:56] = 200
     other[40:44, 12:16] = 160
-    corners = most_different(truth, [one, other], 16)
+    everywhere = np.ones((60, 80), bool)
+    corners = most_different(truth, [one, other], everywhere, 16)
     middles = [(u + 8, v + 8) for u, v in corners]
     assert np.hypot(middles[0][0] - 53, middles[0][1] - 23) < 9
     assert np.hypot(middles[1][0] - 14, middles[1][1] - 42) < 9
-    (u, v), _ = most_different(truth, [other], 16)
+    (u, v), _ = most_different(truth, [other], everywhere, 16)
     assert np.hypot(u + 8 - 14, v + 8 - 42) < 9
+    left = everywhere & (np.arange(80) < 40)
+    (u, v), _ = most_different(truth, [one, other], left, 16)
+    assert np.hypot(u + 8 - 14, v + 8 - 42) < 9, "what does not count is not shown"
 
 
 def test_nothing_is_drawn_of_nothing(tmp_path: Path):

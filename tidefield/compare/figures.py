@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter
 
 from tidefield.compare.results import Results
 from tidefield.data.scene import Scene
+from tidefield.data.surface import doubly_seen
 from tidefield.train.evaluate import picture_names
 from tidefield.train.pictures import GAP_PX, PAPER, STRIP_PX, strip
 
@@ -25,7 +26,8 @@ _HARMLESS = 1e-6
 def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | None:
     """Ground truth and every method on one held-out photograph; None where no method has been there.
 
-    The photograph is the one whose PSNR is the middle one of the first method's. Crops are where methods differ most.
+    The photograph is the one whose PSNR is the middle one of the first method's. Crops are where methods differ most
+    about what at least two training photographs see: what none sees can only be guessed.
     """
     methods = [method for method in results.methods if (name, method) in results.by]
     if not methods:
@@ -33,7 +35,8 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     photographs = results.by[name, methods[0]].evaluation["per_photograph"]
     ranked = sorted(photographs, key=lambda photograph: photographs[photograph]["psnr"])
     chosen = ranked[len(ranked) // 2]
-    truth = scene.photographs[scene.index(chosen)].numpy()
+    index = scene.index(chosen)
+    truth, seen = scene.photographs[index].numpy(), doubly_seen(scene, scene.cameras[index]).numpy()
     files = dict(
         zip((scene.names[i] for i in scene.test), picture_names([scene.names[i] for i in scene.test]), strict=True)
     )
@@ -43,7 +46,7 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
         assert folder is not None, "figures are made where the pictures are"
         with Image.open(folder / "renderings" / files[chosen]) as picture:
             pictures[method] = np.asarray(picture.convert("RGB"))
-    corners = most_different(truth, [pictures[method] for method in methods], truth.shape[1] // SHARE)
+    corners = most_different(truth, [pictures[method] for method in methods], seen, truth.shape[1] // SHARE)
     columns = []
     for title, picture in pictures.items():
         psnr = "" if title == "ground truth" else f"  {photographs_psnr(results, name, title, chosen):.2f} dB"
@@ -59,11 +62,14 @@ def photographs_psnr(results: Results, scene: str, method: str, photograph: str)
 
 
 def most_different(
-    truth: UInt8[np.ndarray, "H W 3"], renderings: list[UInt8[np.ndarray, "H W 3"]], side: int
+    truth: UInt8[np.ndarray, "H W 3"],
+    renderings: list[UInt8[np.ndarray, "H W 3"]],
+    counted: Bool[np.ndarray, "H W"],
+    side: int,
 ) -> list[tuple[int, int]]:
-    """Upper left corners (u, v) of the squares in which the methods' errors differ most, or of one method are largest;
-    squares do not overlap."""
-    errors = [uniform_filter(((r.astype(np.float64) - truth) ** 2).mean(2), side) for r in renderings]
+    """Upper left corners (u, v) of the squares in which the methods' errors at the counted pixels differ most, or of
+    one method are largest; squares do not overlap."""
+    errors = [uniform_filter(((r.astype(np.float64) - truth) ** 2).mean(2) * counted, side) for r in renderings]
     spread: Float[np.ndarray, "H W"] = (np.std(errors, axis=0) if len(errors) > 1 else errors[0]) + _HARMLESS
     half, corners = side // 2, []
     height, width = spread.shape
@@ -101,6 +107,7 @@ def write_curves(results: Results, path: Path) -> bool:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     scenes = [
         s for s in results.scenes if any((s, m) in results.by and results.by[s, m].curve for m in results.methods)
@@ -121,6 +128,9 @@ def write_curves(results: Results, path: Path) -> bool:
                 seconds, psnr = zip(*result.curve, strict=True)
                 axis.plot(seconds, psnr, marker="o", markersize=3, color=f"C{k}", label=method)
         axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(ScalarFormatter())
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_title(scene, fontsize=10)
         axis.set_xlabel("seconds of training")
         axis.set_ylabel("PSNR, dB (two small views)")

@@ -1,4 +1,4 @@
-"""Quality against time: a few held-out views, rendered at a quarter of their size while a method trains."""
+"""Quality against time: a few held-out views, rendered small while a method trains."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Curve:
     """What is rendered, and what came out.
 
     Attributes:
-        cameras: of the first held-out photograph and of the middle one, `SMALLER` times as small.
-        truths: the photographs, averaged over `SMALLER` x `SMALLER` pixels.
+        cameras: of the first held-out photograph and of the middle one, some times as small.
+        truths: the photographs, averaged over the pixels' squares.
         points: (seconds of training, mean PSNR).
     """
 
@@ -70,14 +70,14 @@ class Curve:
             partial.write_text(json.dumps(self.points), encoding="utf-8")
 
 
-def make_curve(scene: Scene) -> Curve:
-    """For a scene that holds photographs out."""
+def make_curve(scene: Scene, smaller: int = SMALLER) -> Curve:
+    """For a scene that holds photographs out; views are `smaller` times as small as these."""
     test = scene.test
     chosen = sorted({test[0], test[len(test) // 2]})[:_VIEWS]
     cameras, truths = [], []
     for index in chosen:
         camera = scene.cameras[index]
-        small = camera.resized(max(1, camera.width // SMALLER), max(1, camera.height // SMALLER))
+        small = camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
         whole = scene.photographs[index].permute(2, 0, 1)[None].float()
         mean = F.interpolate(whole, size=(small.height, small.width), mode="area")
         cameras.append(small)

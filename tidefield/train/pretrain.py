@@ -156,7 +156,7 @@ class Validation:
 
     def __init__(self, scenes: Mapping[str, Scene], folder: Path) -> None:
         self.scenes, self.file = scenes, folder / VALIDATION_FILE
-        self.curves = {kind: make_curve(scene) for kind, scene in scenes.items()}
+        self.curves = {kind: make_curve(scene, smaller=1) for kind, scene in scenes.items()}
         self.points: list[dict] = json.loads(self.file.read_text(encoding="utf-8")) if self.file.is_file() else []
 
     def __call__(self, learner: Learner, share: float) -> None:
