@@ -57,13 +57,11 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
         return {scene: _gain(results, scene, name, own, others, more) for scene in scenes}
 
     def ahead(own: str, others: tuple[str, ...], scenes: tuple[str, ...], aim: str) -> list[Bar]:
-        kinds = (("psnr", "PSNR above", "{:+.2f} dB"), ("ssim", "SSIM above", "{:+.4f}"))
-        kinds += (("lpips_vgg", "LPIPS (VGG) below", "{:+.4f}"),)
+        kinds = (("psnr", "PSNR above", True, "{:+.2f} dB"), ("ssim", "SSIM above", True, "{:+.4f}"))
+        kinds += (("lpips_vgg", "LPIPS (VGG) below", False, "{:+.4f}"),)
         return [
-            _on_each(
-                aim.format(title), gain(name, others, scenes, not title.endswith("below"), own), style, lambda x: x > 0
-            )
-            for name, title, style in kinds
+            _on_each(aim.format(title), gain(name, others, scenes, more, own), style, lambda x: x > 0)
+            for name, title, more, style in kinds
         ]
 
     blending = gain("psnr_seen_cc", FLOORS, SURVEYS)
