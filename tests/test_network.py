@@ -5,73 +5,18 @@ from dataclasses import replace
 import pytest
 import textured_wall as wall
 import torch
+from networks import CPU, FIELD, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
 from torch import Tensor, nn
 
-from tidefield.config import PAPER, SWIFT, Config, EncoderConfig, FieldConfig, NetworkConfig, StageConfig
+from tidefield.config import PAPER, SWIFT, Config
 from tidefield.data.neighbours import Neighbours
-from tidefield.data.prior import surface_prior
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, TileRendering, Tiles
-from tidefield.model.renderer import Renderer, start_intervals
+from tidefield.model.renderer import Renderer
 from tidefield.model.shelf import FeatureShelf
 from tidefield.model.stage import place_samples
-from tidefield.model.views import Views
-
-CPU = torch.device("cpu")
-FIELD = FieldConfig(levels=4, log2_entries=10, coarsest=4, finest=64)
-SMALL_PAPER = replace(
-    PAPER.network,
-    encoder=EncoderConfig(widths=(8, 8, 12, 16), blocks=(1, 1, 1), instance_norm=True),
-    stages=(StageConfig(stride=1, samples=12, feature_stride=4, feature_channels=16, hidden=16),),
-    views=3,
-)
-NETWORKS = {
-    "swift": SWIFT.network,
-    "paper": SMALL_PAPER,
-    "swift and field": replace(SWIFT.network, field=FIELD),
-    "paper and field": replace(SMALL_PAPER, field=FIELD),
-    "field alone": replace(SMALL_PAPER, views=0, field=FIELD),
-    "swift's stages on a field alone": replace(SWIFT.network, views=0, field=FIELD),
-}
-TARGET = 3
-MIDDLE = torch.full((2, 1, 2), 0.5)
-
-
-def network(config: NetworkConfig, seed: int = 0, stir: float = 0.0) -> Network:
-    """As it begins; `stir` moves every weight, so that parts that begin at zero take part."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        own = Network(config)
-        with torch.no_grad():
-            for parameter in own.parameters():
-                parameter.add_(stir * torch.randn(parameter.shape))
-    if own.field:
-        own.field.cover(torch.tensor([0.0, 0.0, wall.DEPTH]), 3.0)
-    return own
-
-
-def scene(count: int = 7, width: int = 64, height: int = 48) -> Scene:
-    return wall.scene(wall.cameras(count, width, height, step=0.25), (TARGET,))
-
-
-def looking(
-    own: Network, at: Scene, side: int = 16, corners: tuple[tuple[int, int], ...] = ((16, 8), (40, 24))
-) -> tuple[Tiles, Views | None, Intervals]:
-    """What `forward` is given for tiles of the scene's held-out photograph."""
-    tiles = Tiles(at.cameras[[TARGET] * len(corners)], torch.tensor(corners).float(), side)
-    prior = surface_prior(at.cameras[TARGET], at.points, at.cameras)
-    start = start_intervals(own, tiles, prior.expand(len(corners), -1, -1, -1))
-    if not own.config.views:
-        return tiles, None, start
-    neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
-    presence, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
-    return tiles, FeatureShelf(own, at, CPU).views(Neighbours(neighbours, presence), middle), start
-
-
-def outputs(rendering: TileRendering) -> list[Tensor]:
-    return [rendering.colour, rendering.depth, rendering.opacity, *rendering.expected, *rendering.glimpses]
 
 
 def finite_forward_and_backward(own: Network, result: TileRendering) -> set[str]:
@@ -119,59 +64,6 @@ def test_where_views_see_an_opaque_scene_all_light_is_stopped(name: str):
     own = network(NETWORKS[name], stir=0.02)
     result = own(*looking(own, scene()), True)
     torch.testing.assert_close(result.opacity, torch.ones(2, 256), atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("name", ["swift", "paper", "swift and field"])
-def test_the_order_of_the_views_does_not_matter(name: str):
-    own = network(NETWORKS[name], stir=0.05).eval()
-    with torch.inference_mode():
-        tiles, views, start = looking(own, scene())
-        assert views is not None
-        count = own.config.views
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-        rows = (torch.arange(2)[:, None] * count + order).reshape(-1)
-        shuffled = Views(views.cameras[rows], views.which[:, order], views.presence[:, order], views.encoded)
-        before, after = own(tiles, views, start, True), own(tiles, shuffled, start, True)
-    for one, other in zip(outputs(before), outputs(after), strict=True):
-        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
-
-
-def test_a_view_that_is_hardly_there_may_be_any_other():
-    """Neighbours change from tile to tile and from frame to frame: where they do, nothing may jump."""
-    own = network(NETWORKS["swift"], stir=0.05).eval()
-    with torch.inference_mode():
-        tiles, views, start = looking(own, scene())
-        assert views is not None
-        presence = views.presence.clone()
-        presence[:, 0] = 0
-        rows, which = torch.arange(len(views.cameras)).reshape(views.which.shape), views.which.clone()
-        rows[:, 0], which[:, 0] = rows[:, 3], which[:, 3]
-        another = Views(views.cameras[rows.reshape(-1)], which, presence, views.encoded)
-        one, other = (own(tiles, v, start, True).colour for v in (replace(views, presence=presence), another))
-        there, not_there = (
-            own(tiles, replace(v, presence=views.presence), start, True).colour for v in (views, another)
-        )
-    assert (one - other).abs().max() < 0.1 * (there - not_there).abs().max()
-
-
-def test_views_fade_within_a_tile():
-    own = network(NETWORKS["swift"], stir=0.05).eval()
-    with torch.inference_mode():
-        tiles, views, start = looking(own, scene())
-        assert views is not None
-        here, gone, fading = (views.presence.clone() for _ in range(3))
-        gone[:, 0] = 0
-        fading[:, 0] = torch.tensor([1.0, 0.0, 1.0, 0.0])
-        full, none, between = (own(tiles, replace(views, presence=p), start, True).colour for p in (here, gone, fading))
-    middles = (torch.arange(16) + 0.5) / 16
-    corner = replace(views, presence=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 5, 4))
-    rays = torch.stack([middles, middles**2], -1).expand(2, -1, -1)
-    shown = corner._presence(rays, 32, torch.full((2, 5, 32), 0.5))
-    torch.testing.assert_close(shown[1, 2], (0.5 * (1 - middles) * (1 - middles**2)).repeat_interleave(2))
-    full, none, between = (x.reshape(2, 16, 16, 3) for x in (full, none, between))
-    left, right = ((full - between).abs().mean((0, 1, 3)), (none - between).abs().mean((0, 1, 3)))
-    assert left[0] < 0.2 * left[-1]
-    assert right[-1] < 0.2 * right[0]
 
 
 def test_a_scene_a_thousand_times_as_large_has_the_same_colours():
@@ -333,46 +225,6 @@ def test_samples_lie_on_their_pixels_rays_at_their_depths_and_their_lengths_add_
     torch.testing.assert_close(reach[:, 0] + samples.delta[0].sum(-1), torch.tensor([9.0, 5.0]) * ratio)
 
 
-def test_views_read_each_sample_where_it_projects():
-    own, at = network(SWIFT.network).eval(), scene()
-    with torch.inference_mode():
-        tiles, views, _ = looking(own, at)
-        assert views is not None
-        xy = torch.tensor([[0.1, -0.2], [0.7, 0.3], [-2.4, 0.0], [0.0, 40.0]])
-        points = torch.cat([xy, torch.full((4, 1), wall.DEPTH)], -1)
-        points = torch.cat([points, torch.tensor([[0.0, 0.0, -wall.DEPTH]])]).expand(2, 5, 3)
-        towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-        gathered = views.read(1, points, towards, MIDDLE, detail=True)
-    for n, index in enumerate([2, 4, 1, 5, 0]):
-        camera = at.cameras[index]
-        uv, z = camera.project(points[0])
-        inside = (z > 0) & (uv >= 0).all(-1) & (uv <= camera.size_px[0]).all(-1)
-        assert torch.equal(gathered.valid[0, n], inside[0])
-        offset = nn.functional.normalize(points[0] - camera.position_world, dim=-1)
-        torch.testing.assert_close(gathered.directions[0, n], offset)
-        torch.testing.assert_close(gathered.cosine[0, n], (offset * towards[0]).sum(-1))
-        seen = inside[0]
-        # Half a level of rounding, and what a cubic reading loses of a texture with waves a few pixels long.
-        assert (gathered.colours[0, n] - wall.texture(points[0, :, :2]))[seen].abs().max() < 0.05
-    assert gathered.valid[0, :, :2].all()
-    assert not gathered.valid[0, :, 3:].any()
-
-
-def test_what_lies_behind_a_view_is_not_seen_by_it_wherever_its_pixels_would_be():
-    own, at = network(SWIFT.network).eval(), scene()
-    spread = torch.rand(2, 500, 3, generator=torch.Generator().manual_seed(0))
-    behind = spread * torch.tensor([8.0, 8.0, -6.0]) - torch.tensor([4.0, 4.0, 0.1])
-    with torch.inference_mode():
-        _, views, _ = looking(own, at)
-        assert views is not None
-        gathered = [
-            views.read(s, behind, nn.functional.normalize(behind, dim=-1), MIDDLE, detail=False) for s in (1, 4)
-        ]
-    for each in gathered:
-        assert not each.valid.any()
-        assert each.features.isfinite().all()
-
-
 def test_a_crop_is_read_as_its_photograph_is():
     own, at = network(SWIFT.network).eval(), scene()
     photograph = at.photographs[0].permute(2, 0, 1)[None] / 255
@@ -399,20 +251,6 @@ def test_the_papers_network_has_nothing_that_the_paper_does_not_have():
     assert not [n for n, _ in network(SMALL_PAPER).named_parameters() if any(part in n for part in ours)]
     found = [n for n, _ in network(SWIFT.network).named_parameters()]
     assert all(any(part in n for n in found) for part in ours)
-
-
-def test_colours_come_from_the_photographs_at_full_resolution_whatever_the_features_stride():
-    own, at = network(SMALL_PAPER), scene()
-    photograph = at.photographs[0].permute(2, 0, 1)[None] / 255
-    encoded = own.encode(photograph)
-    assert set(encoded.features) == {4}
-    torch.testing.assert_close(encoded.photographs.rows, photograph[0].flatten(1).T)
-    tiles, views, _ = looking(own, at)
-    assert views is not None
-    points = torch.tensor([[0.1, -0.2, wall.DEPTH], [0.7, 0.3, wall.DEPTH]]).expand(2, 2, 3)
-    towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-    colours = views.read(4, points, towards, MIDDLE, detail=True).colours
-    assert (colours - wall.texture(points[:, None, :, :2])).abs().max() < 0.08
 
 
 def test_densities_come_from_each_sample_alone_without_the_ray_transformer():
