@@ -6,7 +6,9 @@ What is measured:
 - The same view of a survey that lies there once, and among more and more copies of itself, in turns, so that a machine
   that becomes slower or faster counts against none of them.
 - How much consecutive frames of a flight differ where they show the same: the second one's colours are read where the
-  first one's depths say that its pixels lie, and pixels at which the two frames' depths disagree are left out.
+  first one's depths say that its pixels lie, and pixels at which the two frames' depths disagree are left out. The
+  flight is so slow that the picture hardly moves from frame to frame: what resampling a moved picture makes different
+  is small then, and a jump is as large as in a fast one.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
@@ -46,8 +50,8 @@ COUNTS, TURNS = (200, 2000), 7
 """Photographs among which the survey's own are looked at again, and how often."""
 FLIGHT_FRAMES = 240
 """Of a flight past all photographs, ten seconds long."""
-STEADY_FRAMES, STEADY_WIDTH = 48, 320
-"""Of the flight's middle, whose steadiness is judged."""
+STEADY_FLIGHT_FRAMES, STEADY_FRAMES, STEADY_WIDTH, STEADY_TILE_PX = 9600, 48, 320, 32
+"""Of a slow flight, and of its middle, whose steadiness is judged, as a whole and by tiles."""
 SAME_DEPTH = 0.02
 """Share of the depth by which two frames may disagree about a point that both show."""
 
@@ -167,7 +171,7 @@ def among_copies(scene: Scene, count: int) -> Scene:
 def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, dict[str, float]]:
     own = scene.cameras[scene.train[0]]
     height = max(16, round(STEADY_WIDTH * own.height / own.width))
-    flight = make_trajectory("cameras", scene, frames=FLIGHT_FRAMES, width=STEADY_WIDTH, height=height).cameras
+    flight = make_trajectory("cameras", scene, frames=STEADY_FLIGHT_FRAMES, width=STEADY_WIDTH, height=height).cameras
     first = (len(flight) - STEADY_FRAMES) // 2
     cameras = [flight[k] for k in range(first, first + STEADY_FRAMES)]
     view = view_of(scene)
@@ -179,18 +183,32 @@ def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, d
 
 def _summary(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> dict[str, float]:
     found = list(changes(frames, cameras))
-    return {"mean_levels": statistics.mean(found), "greatest_levels": max(found)}
+    of_frames = [change.nanmean().item() for change in found]
+    return {
+        "mean_levels": statistics.mean(of_frames),
+        "greatest_levels": max(of_frames),
+        "greatest_of_a_tile_levels": max(_greatest_of_a_tile(change) for change in found),
+    }
 
 
-def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator[float]:
-    """Mean absolute difference, in levels of 255, of what each two consecutive frames both show."""
+def _greatest_of_a_tile(change: Float[Tensor, "h w"]) -> float:
+    """The greatest mean of a tile, of those at least half of which both frames show."""
+    side = min(STEADY_TILE_PX, *change.shape)
+    tiles = change.unfold(0, side, side).unfold(1, side, side).flatten(2)
+    shown = ~tiles.isnan()
+    return tiles.nan_to_num().sum(-1).div(shown.sum(-1))[shown.float().mean(-1) >= 0.5].max().item()
+
+
+def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator[Float[Tensor, "h w"]]:
+    """How much each two consecutive frames differ in what both show, in levels of 255; nan where they do not."""
     for this, other, camera, next_camera in zip(frames, frames[1:], cameras, cameras[1:], strict=False):
         uv, z = next_camera.project(surface_points(camera, this.depth))
         grid = (uv / next_camera.size_px[:, None] * 2 - 1)[:, :, None]
         maps = torch.cat([other.colour, other.depth[..., None]], -1).permute(2, 0, 1)[None]
         found = F.grid_sample(maps, grid, align_corners=False, padding_mode="border")[0, :, :, 0]
         same = (grid.abs() < 1).all(-1)[0, :, 0] & ((found[3] - z[0]).abs() < SAME_DEPTH * z[0])
-        yield 255 * (found[:3].T - this.colour.reshape(-1, 3)).abs().mean(-1)[same].mean().item()
+        change = 255 * (found[:3].T - this.colour.reshape(-1, 3)).abs().mean(-1)
+        yield change.masked_fill(~same, torch.nan).reshape(this.depth.shape)
 
 
 @contextmanager

@@ -191,16 +191,16 @@ def frame_tables(frames: Mapping[str, Any]) -> list[Table]:
         ),
     ]
     steady = [
-        (name, f"{found['mean_levels']:.2f}", f"{found['greatest_levels']:.2f}")
+        (name, *(f"{found[key]:.2f}" for key in ("mean_levels", "greatest_levels", "greatest_of_a_tile_levels")))
         for name, found in frames["steadiness"].items()
     ]
     title = f"Zero-shot views of {width} x {height} px, {frames['preset']}, {frames['device']}"
     return [
         Table(title, ["view", "seconds"], rows),
         Table(
-            "Neighbours that fade before they are left out: how much consecutive views of a flight differ where they "
-            "show the same, levels of 255",
-            ["neighbours", "mean", "the two that differ most"],
+            "Neighbours that fade before they are left out: how much consecutive views of a slow flight differ where "
+            "they show the same, levels of 255",
+            ["neighbours", "mean", "the two that differ most", "the tile that differs most"],
             steady,
         ),
     ]

@@ -171,13 +171,26 @@ def test_frames_that_show_the_same_differ_little_and_a_jump_is_seen() -> None:
     cameras = wall.cameras(4, 96, 72, step=0.02)
     each = [cameras[k] for k in range(4)]
     shown = [Rendering(wall.photograph(c).float() / 255, wall.true_depth(c), torch.ones(72, 96)) for c in each]
-    assert max(frames.changes(shown, each)) < 1.5
+    assert max(change.nanmean() for change in frames.changes(shown, each)) < 1.5
     brighter = replace(shown[2], colour=shown[2].colour + 0.1)
-    found = list(frames.changes([*shown[:2], brighter, shown[3]], each))
+    found = [change.nanmean().item() for change in frames.changes([*shown[:2], brighter, shown[3]], each)]
     assert found == [pytest.approx(value, abs=1.5) for value in (0, 25.5, 25.5)]
     elsewhere = replace(shown[1], depth=shown[1].depth * torch.where(torch.arange(96) < 48, 1.0, 1.1))
     jumping = replace(elsewhere, colour=torch.where((torch.arange(96) < 48)[:, None], elsewhere.colour, 0.0))
-    assert next(frames.changes([shown[0], jumping], each[:2])) < 1.5, "what disagrees in depth is left out"
+    change = next(frames.changes([shown[0], jumping], each[:2]))
+    assert change.nanmean() < 1.5, "what disagrees in depth is left out"
+    assert change[:, 60:].isnan().all()
+
+
+def test_a_jump_of_one_tile_is_told() -> None:
+    cameras = wall.cameras(2, 96, 72, step=0.0)
+    each = [cameras[k] for k in range(2)]
+    shown = [Rendering(torch.full((72, 96, 3), 0.5), wall.true_depth(c), torch.ones(72, 96)) for c in each]
+    colour = shown[1].colour.clone()
+    colour[32:64, 64:96] += 0.1
+    found = frames._summary([shown[0], replace(shown[1], colour=colour)], each)
+    assert found["greatest_of_a_tile_levels"] == pytest.approx(25.5, abs=1.5)
+    assert found["greatest_levels"] == found["mean_levels"] == pytest.approx(25.5 * 32 * 32 / (72 * 96), abs=0.2)
 
 
 def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,6 +202,8 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(frames, "SIZE_PX", (32, 24))
     monkeypatch.setattr(frames, "STEADY_FRAMES", 3)
     monkeypatch.setattr(frames, "STEADY_WIDTH", 32)
+    monkeypatch.setattr(frames, "STEADY_TILE_PX", 8)
+    monkeypatch.setattr(frames, "STEADY_FLIGHT_FRAMES", 48)
     write_weights(tmp_path / "w.safetensors", Network(small.network), small, {})
     asked = []
 
@@ -202,7 +217,8 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "--zero-shot" in asked
     assert record["first"]["seconds"] == 12.5
     assert list(record["by_photographs"]) == ["9", "12"]
-    assert all(0 < found["mean_levels"] <= found["greatest_levels"] for found in record["steadiness"].values())
+    steady = record["steadiness"].values()
+    assert all(0 < s["mean_levels"] <= s["greatest_levels"] <= s["greatest_of_a_tile_levels"] for s in steady)
     assert all(len(made.rows) > 1 for made in table.frame_tables(record))
 
 
