@@ -1,7 +1,8 @@
 """Where the time goes: the boxes of the network, timed from outside, without a line in the network for it.
 
 Modules by their forward hooks, methods and functions by a stand-in for as long as it is measured. Whatever is not
-named here (placing samples, choosing neighbours, the loss and so on) is "rest".
+named here (placing samples, choosing neighbours, the loss and so on) is "rest". The pieces that cores otherwise work on
+side by side are done one after the other here, by all cores together: a clock can follow only one thing at a time.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ def watched(network: Network, device: torch.device, optimizer: torch.optim.Optim
         return encode(photographs, *args, **kwargs)
 
     with ExitStack() as stack:
+        stack.enter_context(_in_turn())
         for module in network.modules():
             if stage := _BOXES.get(type(module)):
                 begin, end = _hooks(clock, stage)
@@ -118,6 +120,18 @@ def watched(network: Network, device: torch.device, optimizer: torch.optim.Optim
                 stands_in(holder, function.__name__, stage)
         yield clock
         clock.stop()
+
+
+@contextmanager
+def _in_turn() -> Iterator[None]:
+    def in_turn(tasks: list[Callable[[], Any]], _: torch.device) -> list[Any]:
+        return [task() for task in tasks]
+
+    places = ("model.renderer", "train.side_by_side")
+    with ExitStack() as stack:
+        for place in places:
+            stack.enter_context(patch(f"tidefield.{place}.in_parallel", in_turn))
+        yield
 
 
 def _hooks(clock: Clock, stage: str) -> tuple[Callable[..., None], Callable[..., None]]:
@@ -158,6 +172,6 @@ def _tensors(result: object) -> Iterator[Tensor]:
 def flops_of(action: Callable[[], object]) -> int:
     """Multiplications and additions of an action's matrix products, convolutions and attention; nothing else counts."""
     # The counter knows no attention on CPUs; in its plain form it is two matrix products.
-    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+    with _in_turn(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         action()
     return counter.get_total_flops()

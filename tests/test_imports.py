@@ -20,7 +20,7 @@ RANK = {
     "commands": 6,
     "cli": 7,
 }
-FOR_ALL = {"config", "cores", "device", "errors", "files", "meter", "options", "variants"}
+FOR_ALL = {"config", "cores", "device", "errors", "files", "meter", "options", "parallel", "variants"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -40,7 +40,10 @@ def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
         native = torch.cpu._is_avx512_bf16_supported()
     else:
         native = False
-    return torch.autocast(device.type, dtype=torch.bfloat16) if native else nullcontext()
+    if not native:
+        return nullcontext()
+    # On CPUs several threads may be at work, which would share the cache of converted weights.
+    return torch.autocast(device.type, dtype=torch.bfloat16, cache_enabled=device.type != "cpu")
 
 
 def fuses(values: torch.Tensor) -> bool:

@@ -64,6 +64,23 @@ class Batch:
 
         return Batch(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
 
+    def parts(self, count: int) -> list[Batch]:
+        """At most so many, of some of the tiles each; one where tiles share images."""
+        tiles, views = self.which.shape
+        if len(self.images) != 1 or len(self.images[0]) != tiles * views:
+            return [self]
+        size = -(-tiles // count)
+        return [self._part(slice(first, min(first + size, tiles))) for first in range(0, tiles, size)]
+
+    def _part(self, tiles: slice) -> Batch:
+        own = {f.name: getattr(self, f.name)[tiles] for f in fields(self) if not f.name.startswith("image")}
+        chosen = own["which"].reshape(-1)
+        return Batch(
+            **own | {"which": torch.arange(len(chosen), device=chosen.device).reshape(own["which"].shape)},
+            images=(self.images[0][chosen],),
+            image_corner_px=(self.image_corner_px[0][chosen],),
+        )
+
 
 class Surfaces:
     """What a scene's sparse points say of every camera's surface, made when first asked for.

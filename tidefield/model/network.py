@@ -68,6 +68,15 @@ class TileRendering:
     expected: tuple[Float[Tensor, "T _"], ...]
     glimpses: tuple[Float[Tensor, "T _ 3"], ...]
 
+    def pieces(self) -> tuple[Tensor, ...]:
+        """All of it, one after the other; `from_pieces` puts it together again."""
+        return (self.colour, self.depth, self.opacity, self.shown, *self.expected, *self.glimpses)
+
+    @staticmethod
+    def from_pieces(pieces: tuple[Tensor, ...]) -> TileRendering:
+        stages = (len(pieces) - 3) // 2
+        return TileRendering(*pieces[:4], expected=pieces[4 : 4 + stages], glimpses=pieces[4 + stages :])
+
 
 @dataclass(frozen=True)
 class _Look:

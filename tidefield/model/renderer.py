@@ -6,6 +6,8 @@ continued from beside it, unless the preset is to do as printed, a field knows t
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,11 +23,13 @@ from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, Tiles
 from tidefield.model.rendering import Rendering
 from tidefield.model.shelf import FeatureShelf, NoRoom
+from tidefield.model.views import Views
+from tidefield.parallel import in_parallel
 
 TILE_PX = 32
-VALUES_AT_ONCE = 5_000_000
-"""Values gathered at once by a stage: enough to keep a few cores busy, few enough for their cache ..."""
-GPU_FACTOR = 16
+VALUES_AT_ONCE = 1_250_000
+"""Values gathered at once by a stage on one core: few enough for its cache ..."""
+GPU_FACTOR = 64
 """... and so many times as many keep a GPU busy."""
 BEHIND_PHOTOGRAPHS, BEHIND_STEP = 32, 16
 """Photographs, and pixels between their pixels, whose mean colour lies behind what lets light through."""
@@ -50,6 +54,8 @@ class Renderer:
         gathered = max((TILE_PX // s.stride) ** 2 * s.samples * views * s.feature_channels for s in stages)
         room = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, room // gathered)
+        # Of tiles larger than that, one on each core would take too much memory: all cores share one.
+        self.side_by_side = gathered <= room
         net = network.config
         self.fills = bool(net.views) and not net.as_printed and net.field is None and scene.background_rgb is None
         few = scene.train[:: -(-len(scene.train) // BEHIND_PHOTOGRAPHS)]
@@ -91,11 +97,8 @@ class Renderer:
         neighbours = None
         if views:
             neighbours = choose_neighbours(camera, prior, corners[0], size, TILE_PX, self.scene, views, strategy)
-        parts = []
-        for some in torch.arange(len(corners)).split(self.tiles_at_once):
-            chosen = None if neighbours is None else neighbours[some]
-            parts.append(self._tiles(camera, prior, corners[some], chosen, middles[some]))
-        stacked = torch.cat(parts).reshape(rows, columns, TILE_PX, TILE_PX, 6)
+        found = self._tiles(camera, prior, corners, neighbours, middles)
+        stacked = found.reshape(rows, columns, TILE_PX, TILE_PX, 6)
         return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
 
     def _tiles(
@@ -121,6 +124,16 @@ class Renderer:
                         for s in (slice(half), slice(half, None))
                     ]
                 )
+        pieces = [
+            partial(self._piece, camera, prior, corners[some], None if views is None else views[some])
+            for some in torch.arange(len(corners)).split(self.tiles_at_once)
+        ]
+        return torch.cat(in_parallel(pieces, self.device) if self.side_by_side else [piece() for piece in pieces])
+
+    @torch.inference_mode()
+    def _piece(
+        self, camera: Cameras, prior: Float[Tensor, "3 h w"], corners: Float[Tensor, "T 2"], views: Views | None
+    ) -> Float[Tensor, "T R 6"]:
         index = torch.zeros(len(corners), dtype=torch.long)
         tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
         start = start_intervals(self.network, tiles, prior[None].to(self.device))

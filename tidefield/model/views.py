@@ -78,6 +78,10 @@ class Views:
     presence: Float[Tensor, "T N 4"]
     encoded: Encoded
 
+    def __getitem__(self, tiles: Int[Tensor, " t"]) -> Views:
+        rows = torch.arange(self.which.numel(), device=self.which.device).reshape(self.which.shape)[tiles].reshape(-1)
+        return Views(self.cameras[rows], self.which[tiles], self.presence[tiles], self.encoded)
+
     def read(
         self,
         stride: int,

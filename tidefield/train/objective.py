@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from tidefield.config import TrainConfig
-from tidefield.data.batches import Surfaces, draw_batch
+from tidefield.data.batches import Batch, Surfaces, draw_batch
 from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.network import Network, Tiles
+from tidefield.model.network import Network, TileRendering, Tiles
 from tidefield.model.renderer import start_intervals
 from tidefield.model.views import Encoded, Views
 from tidefield.train.losses import photometric, sparse_depth, structural
+from tidefield.train.side_by_side import side_by_side
 
 
 class Objective(nn.Module):
@@ -42,20 +47,41 @@ class Objective(nn.Module):
         """
         network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
         batch = draw_batch(scene, surfaces, config, views, generator).to(device)
-        seen = None
-        if batch.images:
-            parts = []
-            with mixed_precision(device):
-                for images, corner in zip(batch.images, batch.image_corner_px, strict=True):
-                    parts.append(network.encode(images, corner))
-            seen = Views(cameras[batch.neighbours.reshape(-1)], batch.which, batch.presence, Encoded.joined(parts))
-        tiles = Tiles(cameras[batch.targets], batch.corner_px, side)
         priors = torch.stack([surfaces[i] for i in batch.targets.tolist()]).to(device)
         opaque = scene.background_rgb is None
-        rendering = network(tiles, seen, start_intervals(network, tiles, priors), opaque, generator)
+        parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]
+        if len(parts) == 1:
+            rendering = self._rendered(batch, cameras, priors, opaque, generator)
+        else:
+            shares = priors.split([len(part.targets) for part in parts])
+            tasks = [
+                partial(self._in_pieces, part, cameras, prior, opaque, _another(generator))
+                for part, prior in zip(parts, shares, strict=True)
+            ]
+            learns = [parameter for parameter in network.parameters() if parameter.requires_grad]
+            rendering = TileRendering.from_pieces(side_by_side(tasks, learns, device))
         loss, error = photometric(rendering, batch, network, side)
         if config.structure_weight:
             loss = loss + config.structure_weight * structural(rendering, batch, side)
         if config.depth_weight:
             loss = loss + config.depth_weight * sparse_depth(rendering, batch, network, side)
         return loss, error
+
+    def _rendered(
+        self, batch: Batch, cameras: Cameras, priors: Float[Tensor, "T 3 h w"], opaque: bool, generator: torch.Generator
+    ) -> TileRendering:
+        network, seen = self.network, None
+        if batch.images:
+            with mixed_precision(priors.device):
+                encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
+            seen = Views(cameras[batch.neighbours.reshape(-1)], batch.which, batch.presence, Encoded.joined(encoded))
+        tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)
+        return network(tiles, seen, start_intervals(network, tiles, priors), opaque, generator)
+
+    def _in_pieces(self, *given: Any) -> tuple[Tensor, ...]:
+        return self._rendered(*given).pieces()
+
+
+def _another(generator: torch.Generator) -> torch.Generator:
+    """One that a thread can have for itself."""
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))

@@ -16,7 +16,6 @@ from tidefield.data.synthetic.ground import Ground, make_ground
 from tidefield.data.synthetic.light import Light, to_display
 from tidefield.data.synthetic.march import march
 from tidefield.data.synthetic.noise import Noise
-from tidefield.data.synthetic.parallel import in_parallel
 from tidefield.data.synthetic.plants import grow, marsh_map
 from tidefield.data.synthetic.primitives import Plants, dot
 from tidefield.data.synthetic.raster import Extent, Raster, blurred
@@ -25,6 +24,7 @@ from tidefield.data.synthetic.shading import ground_radiance
 from tidefield.data.synthetic.terrain import make_terrain
 from tidefield.data.synthetic.views import Pinhole, View, straight_down
 from tidefield.geometry.cameras import Cameras
+from tidefield.parallel import in_parallel
 
 _RAYS = 1 << 16
 """Rays shaded at once: bounds memory, and small enough for the cache."""

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from tidefield.data.scene import SparsePoints
 from tidefield.data.synthetic.flat import TidalFlat, make_flat, moved
-from tidefield.data.synthetic.parallel import in_parallel
 from tidefield.data.synthetic.raster import Extent
 from tidefield.data.synthetic.settings import settings_for
 from tidefield.data.synthetic.tracks import sparse_points
 from tidefield.geometry.cameras import Cameras
+from tidefield.parallel import in_parallel
 
 _CELL_PER_ALTITUDE = 0.0035
 """Spacing of the terrain's nodes: some two thirds of a pixel of a photograph 240 wide, whatever the altitude."""
