@@ -19,7 +19,8 @@ from torch import nn
 
 from benchmarks import frames, memory, speed, stages, table
 from benchmarks.__main__ import main
-from tidefield import cli, commands
+from tidefield import cli
+from tidefield.commands import views
 from tidefield.compare import record
 from tidefield.compare.record import Took
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig
@@ -140,7 +141,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         scene = load_scene(folder.parent / "scene")
         assert (scene.cameras.width, scene.cameras.height) == (96, 72)
         assert scene.names[scene.test[0]] == command[command.index("--camera") + 1]
-        monkeypatch.setattr(commands, "render", lambda options, console: asked.append(options.camera))
+        monkeypatch.setattr(views, "render", lambda options, console: asked.append(options.camera))
         monkeypatch.setattr(sys, "argv", ["tidefield", *command[3:]])
         cli.main()
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents

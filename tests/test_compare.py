@@ -14,7 +14,7 @@ from PIL import Image
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
-import tidefield.commands
+import tidefield.commands.peers
 from tidefield import cli
 from tidefield.compare import published
 from tidefield.compare.figures import most_different, side_by_side, write_curves
@@ -291,7 +291,9 @@ def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest
     called, asked = [], commands(Path("data"), Path("run"), method, SETTINGS)
     monkeypatch.setattr(cli, "_begin", lambda talk: None)
     for name, words in asked.items():
-        monkeypatch.setattr(tidefield.commands, name, lambda *args, name=name, **options: called.append(name))
+        _, module, function = cli.COMMANDS[name]
+        where = f"tidefield.commands.{module}.{function}"
+        monkeypatch.setattr(where, lambda *args, name=name, **options: called.append(name))
         monkeypatch.setattr(sys, "argv", ["tidefield", *words])
         cli.main()
     assert called == list(asked)
@@ -308,7 +310,7 @@ def test_what_is_missing_is_told_before_anything_is_trained(
     ):
         options = Compare((disk,), methods=("tidefield", method), out=tmp_path / "out", device="cpu")
         with pytest.raises(RunError, match=message):
-            tidefield.commands.compare(options, Console(quiet=True))
+            tidefield.commands.peers.compare(options, Console(quiet=True))
     monkeypatch.setattr("tidefield.commands.peers.find_spec", lambda name: None)
     with pytest.raises(RunError, match="matplotlib is not installed"):
-        tidefield.commands.compare(Compare((disk,)), Console(quiet=True))
+        tidefield.commands.peers.compare(Compare((disk,)), Console(quiet=True))

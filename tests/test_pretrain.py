@@ -17,7 +17,7 @@ from safetensors import safe_open
 from test_training import SMALL
 from torch.nn import functional as F
 
-from tidefield.commands import pretrain as pretrain_command
+from tidefield.commands.training import pretrain as pretrain_command
 from tidefield.config import SWIFT
 from tidefield.data.batches import Surfaces
 from tidefield.data.synthetic import Flight

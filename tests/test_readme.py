@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
-from tidefield import cli, commands
+from tidefield import cli
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -32,8 +32,8 @@ def command_lines(program: str) -> list[str]:
 @pytest.mark.parametrize("line", command_lines("tidefield"))
 def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words, called = shlex.split(line), []
-    function = {"import": "import_project"}.get(words[1], words[1])
-    monkeypatch.setattr(commands, function, lambda options, console: called.append(options))
+    _, module, function = cli.COMMANDS[words[1]]
+    monkeypatch.setattr(f"tidefield.commands.{module}.{function}", lambda options, console: called.append(options))
     monkeypatch.setattr(cli, "_begin", lambda talk: None)
     monkeypatch.setattr(sys, "argv", words)
     cli.main()
@@ -41,18 +41,7 @@ def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyP
 
 
 def test_every_command_is_shown() -> None:
-    assert {line.split()[1] for line in command_lines("tidefield")} == {
-        "prepare",
-        "import",
-        "train",
-        "pretrain",
-        "evaluate",
-        "render",
-        "compare",
-        "ablate",
-        "baselines",
-        "demo",
-    }
+    assert {line.split()[1] for line in command_lines("tidefield")} == set(cli.COMMANDS)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="there is no make on this machine")

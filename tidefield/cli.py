@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import tyro
@@ -18,6 +19,20 @@ from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+COMMANDS = {
+    "prepare": (Prepare, "surveys", "prepare"),
+    "import": (Import, "surveys", "import_project"),
+    "train": (Train, "training", "train"),
+    "pretrain": (Pretrain, "training", "pretrain"),
+    "evaluate": (Evaluate, "views", "evaluate"),
+    "render": (Render, "views", "render"),
+    "compare": (Compare, "peers", "compare"),
+    "ablate": (Ablate, "peers", "ablate"),
+    "baselines": (Baselines, "peers", "baselines"),
+    "demo": (Demo, "demonstration", "demo"),
+}
+"""By name: what can be asked, and module and function of `tidefield.commands`, imported only when it is asked for."""
 
 
 def main() -> None:
@@ -39,37 +54,13 @@ def main() -> None:
 def _run() -> None:
     """Understand the command line and do what it says."""
     options = tyro.extras.subcommand_cli_from_dict(
-        {
-            "prepare": Prepare,
-            "import": Import,
-            "train": Train,
-            "pretrain": Pretrain,
-            "evaluate": Evaluate,
-            "render": Render,
-            "compare": Compare,
-            "ablate": Ablate,
-            "baselines": Baselines,
-            "demo": Demo,
-        },
+        {name: asked for name, (asked, _, _) in COMMANDS.items()},
         prog="tidefield",
         description="New views of tidal flats from drone photographs.",
     )
     console = _begin(options.talk)
-    from tidefield import commands
-
-    todo = {
-        Prepare: commands.prepare,
-        Import: commands.import_project,
-        Train: commands.train,
-        Pretrain: commands.pretrain,
-        Evaluate: commands.evaluate,
-        Render: commands.render,
-        Compare: commands.compare,
-        Ablate: commands.ablate,
-        Baselines: commands.baselines,
-        Demo: commands.demo,
-    }
-    todo[type(options)](options, console)
+    module, function = next((module, name) for asked, module, name in COMMANDS.values() if asked is type(options))
+    getattr(import_module(f"tidefield.commands.{module}"), function)(options, console)
 
 
 def _begin(talk: Talk) -> Console:

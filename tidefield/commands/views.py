@@ -13,7 +13,6 @@ from tidefield.methods import FLOORS
 from tidefield.options import Evaluate, Render
 from tidefield.products.pictures import write_still
 from tidefield.products.trajectory import make_trajectory
-from tidefield.products.video import write_video
 from tidefield.train.evaluate import Evaluation
 from tidefield.train.evaluate import evaluate as evaluate_method
 from tidefield.train.lpips import download_lpips_weights
@@ -58,6 +57,8 @@ def render(options: Render, console: Console) -> None:
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = trajectory.cameras
         with Meter(console, "Rendering") as meter:
+            from tidefield.products.video import write_video
+
             write_video(
                 (view(cameras[k]) for k in range(len(cameras))),
                 out,
