@@ -13,6 +13,7 @@ What is measured:
 
 from __future__ import annotations
 
+import math
 import statistics
 import tempfile
 import time
@@ -192,11 +193,11 @@ def _summary(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> dict[st
 
 
 def _greatest_of_a_tile(change: Float[Tensor, "h w"]) -> float:
-    """The greatest mean of a tile, of those at least half of which both frames show."""
+    """The greatest mean of a tile, of those at least half of which both frames show; nan if there is none."""
     side = min(STEADY_TILE_PX, *change.shape)
     tiles = change.unfold(0, side, side).unfold(1, side, side).flatten(2)
-    shown = ~tiles.isnan()
-    return tiles.nan_to_num().sum(-1).div(shown.sum(-1))[shown.float().mean(-1) >= 0.5].max().item()
+    shown = (~tiles.isnan()).float().mean(-1)
+    return max(tiles.nanmean(-1)[shown >= 0.5].tolist(), default=math.nan)
 
 
 def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator[Float[Tensor, "h w"]]:

@@ -172,7 +172,11 @@ def _stage_table(presets: Mapping[str, Any]) -> Table:
     stages = dict.fromkeys(stage for column in columns for stage in column)
     rows = [(stage, *(shown(_micro(c.get(stage)), "{:.1f}") for c in columns)) for stage in stages]
     rows.append(("sum", *(f"{sum(column.values()) * 1e6:.1f}" for column in columns)))
-    return Table("Where the time goes, microseconds per ray", ["stage", *map(" ".join, kinds)], rows)
+    return Table(
+        "Where the time goes, microseconds per ray, with all cores at one piece after another",
+        ["stage", *map(" ".join, kinds)],
+        rows,
+    )
 
 
 def _micro(seconds: float | None) -> float | None:

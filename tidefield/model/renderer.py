@@ -130,7 +130,7 @@ class Renderer:
         ]
         return torch.cat(in_parallel(pieces, self.device) if self.side_by_side else [piece() for piece in pieces])
 
-    @torch.inference_mode()
+    @torch.inference_mode()  # of every thread its own
     def _piece(
         self, camera: Cameras, prior: Float[Tensor, "3 h w"], corners: Float[Tensor, "T 2"], views: Views | None
     ) -> Float[Tensor, "T R 6"]:
