@@ -48,6 +48,24 @@ class Kept:
 Gains = Mapping[str, float | None]
 
 
+@dataclass(frozen=True)
+class Quality:
+    """A metric, whether more of it is better, and the difference that shows in a table."""
+
+    metric: str
+    title: str
+    more: bool
+    style: str
+    visible: float
+
+
+QUALITIES = (
+    Quality("psnr", "PSNR", True, "{:+.2f} dB", 0.005),
+    Quality("ssim", "SSIM", True, "{:+.4f}", 0.0005),
+    Quality("lpips_vgg", "LPIPS (VGG)", False, "{:+.4f}", 0.0005),
+)
+
+
 def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
     """Every bar. Results of other settings than those aimed at count as not measured."""
 
@@ -57,11 +75,14 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
         return {scene: _gain(results, scene, name, own, others, more) for scene in scenes}
 
     def ahead(own: str, others: tuple[str, ...], scenes: tuple[str, ...], aim: str) -> list[Bar]:
-        kinds = (("psnr", "PSNR above", True, "{:+.2f} dB"), ("ssim", "SSIM above", True, "{:+.4f}"))
-        kinds += (("lpips_vgg", "LPIPS (VGG) below", False, "{:+.4f}"),)
         return [
-            _on_each(aim.format(title), gain(name, others, scenes, more, own), style, lambda x: x > 0)
-            for name, title, more, style in kinds
+            _on_each(
+                aim.format(f"{of.title} {'above' if of.more else 'below'}"),
+                gain(of.metric, others, scenes, of.more, own),
+                of.style,
+                lambda x: x > 0,
+            )
+            for of in QUALITIES
         ]
 
     blending = gain("psnr_seen_cc", FLOORS, SURVEYS)
@@ -95,36 +116,36 @@ def _gain(results: Results, scene: str, name: str, own: str, others: tuple[str, 
 def _of_lengths(lengths: ByLength) -> list[Bar]:
     """Ten seconds are not worse than none, as far as the tables show, and a minute better than ten without weights."""
 
-    def gains(metric: str, sign: int, length: str, other: str) -> Gains:
+    def gains(of: Quality, length: str, other: str) -> Gains:
+        sign = 1 if of.more else -1
         pairs = {scene: [lengths.get(name, {}).get(scene) for name in (length, other)] for scene in BEGUN}
         values = {
             scene: [
-                result.metric(metric) if result is not None and _measured_as_aimed(result) else None for result in pair
+                result.metric(of.metric) if result is not None and _measured_as_aimed(result) else None
+                for result in pair
             ]
             for scene, pair in pairs.items()
         }
         return {s: None if a is None or b is None else sign * (a - b) for s, (a, b) in values.items()}
 
-    kinds = (("psnr", 1, "PSNR", "{:+.2f} dB", 0.005), ("ssim", 1, "SSIM", "{:+.3f}", 0.0005))
-    kinds += (("lpips_vgg", -1, "LPIPS (VGG)", "{:+.3f}", 0.0005),)
     return [
         *(
             _on_each(
-                f"Ten seconds of training, {title} not worse than zero-shot's",
-                gains(metric, sign, SECONDS, ZERO_SHOT),
-                style,
-                lambda gain, visible=visible: gain > -visible,
+                f"Ten seconds of training, {of.title} not worse than zero-shot's",
+                gains(of, SECONDS, ZERO_SHOT),
+                of.style,
+                lambda gain, visible=of.visible: gain > -visible,
             )
-            for metric, sign, title, style, visible in kinds
+            for of in QUALITIES
         ),
         *(
             _on_each(
-                f"One minute of training, {title} better than after ten from scratch",
-                gains(metric, sign, MINUTE, FROM_SCRATCH),
-                style,
+                f"One minute of training, {of.title} better than after ten from scratch",
+                gains(of, MINUTE, FROM_SCRATCH),
+                of.style,
                 lambda gain: gain > 0,
             )
-            for metric, sign, title, style, _ in kinds
+            for of in QUALITIES
         ),
     ]
 
