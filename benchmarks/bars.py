@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from benchmarks.begun import FROM_SCRATCH, MINUTE, SECONDS, ByLength
@@ -128,25 +129,24 @@ def _of_lengths(lengths: ByLength) -> list[Bar]:
         }
         return {s: None if a is None or b is None else sign * (a - b) for s, (a, b) in values.items()}
 
+    aims = (
+        (
+            "Ten seconds of training, {} not worse than zero-shot's",
+            SECONDS,
+            ZERO_SHOT,
+            lambda of, gain: gain > -of.visible,
+        ),
+        (
+            "One minute of training, {} better than after ten from scratch",
+            MINUTE,
+            FROM_SCRATCH,
+            lambda of, gain: gain > 0,
+        ),
+    )
     return [
-        *(
-            _on_each(
-                f"Ten seconds of training, {of.title} not worse than zero-shot's",
-                gains(of, SECONDS, ZERO_SHOT),
-                of.style,
-                lambda gain, visible=of.visible: gain > -visible,
-            )
-            for of in QUALITIES
-        ),
-        *(
-            _on_each(
-                f"One minute of training, {of.title} better than after ten from scratch",
-                gains(of, MINUTE, FROM_SCRATCH),
-                of.style,
-                lambda gain: gain > 0,
-            )
-            for of in QUALITIES
-        ),
+        _on_each(aim.format(of.title), gains(of, length, other), of.style, partial(enough, of))
+        for aim, length, other, enough in aims
+        for of in QUALITIES
     ]
 
 

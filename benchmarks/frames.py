@@ -13,7 +13,6 @@ What is measured:
 
 from __future__ import annotations
 
-import math
 import statistics
 import tempfile
 import time
@@ -169,7 +168,7 @@ def among_copies(scene: Scene, count: int) -> Scene:
     )
 
 
-def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, dict[str, float]]:
+def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, dict[str, float | None]]:
     own = scene.cameras[scene.train[0]]
     height = max(16, round(STEADY_WIDTH * own.height / own.width))
     flight = make_trajectory("cameras", scene, frames=STEADY_FLIGHT_FRAMES, width=STEADY_WIDTH, height=height).cameras
@@ -182,22 +181,23 @@ def _steadiness(view_of: Callable[[Scene], Render], scene: Scene) -> dict[str, d
     return result
 
 
-def _summary(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> dict[str, float]:
-    found = list(changes(frames, cameras))
+def _summary(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> dict[str, float | None]:
+    """Of the frames that share anything, and of the tiles that they share; None where none do."""
+    found = [change for change in changes(frames, cameras) if not change.isnan().all()]
     of_frames = [change.nanmean().item() for change in found]
     return {
-        "mean_levels": statistics.mean(of_frames),
-        "greatest_levels": max(of_frames),
-        "greatest_of_a_tile_levels": max(_greatest_of_a_tile(change) for change in found),
+        "mean_levels": statistics.mean(of_frames) if of_frames else None,
+        "greatest_levels": max(of_frames, default=None),
+        "greatest_of_a_tile_levels": max((level for change in found for level in _of_tiles(change)), default=None),
     }
 
 
-def _greatest_of_a_tile(change: Float[Tensor, "h w"]) -> float:
-    """The greatest mean of a tile, of those at least half of which both frames show; nan if there is none."""
+def _of_tiles(change: Float[Tensor, "h w"]) -> list[float]:
+    """Means of the tiles at least half of which both frames show."""
     side = min(STEADY_TILE_PX, *change.shape)
     tiles = change.unfold(0, side, side).unfold(1, side, side).flatten(2)
     shown = (~tiles.isnan()).float().mean(-1)
-    return max(tiles.nanmean(-1)[shown >= 0.5].tolist(), default=math.nan)
+    return tiles.nanmean(-1)[shown >= 0.5].tolist()
 
 
 def changes(frames: Sequence[Rendering], cameras: Sequence[Cameras]) -> Iterator[Float[Tensor, "h w"]]:

@@ -195,7 +195,10 @@ def frame_tables(frames: Mapping[str, Any]) -> list[Table]:
         ),
     ]
     steady = [
-        (name, *(f"{found[key]:.2f}" for key in ("mean_levels", "greatest_levels", "greatest_of_a_tile_levels")))
+        (
+            name,
+            *(shown(found[key], "{:.2f}") for key in ("mean_levels", "greatest_levels", "greatest_of_a_tile_levels")),
+        )
         for name, found in frames["steadiness"].items()
     ]
     title = f"Zero-shot views of {width} x {height} px, {frames['preset']}, {frames['device']}"

@@ -191,6 +191,9 @@ def test_a_jump_of_one_tile_is_told() -> None:
     colour[32:64, 64:96] += 0.1
     found = frames._summary([shown[0], replace(shown[1], colour=colour)], each)
     assert found["greatest_of_a_tile_levels"] == pytest.approx(25.5, abs=1.5)
+    nothing = replace(shown[1], depth=2 * shown[1].depth)
+    told = frames._summary([shown[0], nothing, shown[0]], [each[0], each[1], each[0]])
+    assert set(told.values()) == {None}, "frames that share nothing say nothing, and JSON has no nan"
     assert found["greatest_levels"] == found["mean_levels"] == pytest.approx(25.5 * 32 * 32 / (72 * 96), abs=0.2)
 
 

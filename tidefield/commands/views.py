@@ -56,9 +56,9 @@ def render(options: Render, console: Console) -> None:
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = trajectory.cameras
-        with Meter(console, "Rendering") as meter:
-            from tidefield.products.video import write_video
+        from tidefield.products.video import write_video
 
+        with Meter(console, "Rendering") as meter:
             write_video(
                 (view(cameras[k]) for k in range(len(cameras))),
                 out,
