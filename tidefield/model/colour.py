@@ -66,15 +66,19 @@ class ColourBlend(nn.Module):
     def _view_logits(
         self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
     ) -> Float[Tensor, "T N P"]:
-        apart = (1 - gathered.cosine)[..., None]
+        apart = 1 - gathered.cosine
         # 1e-4 is the angle, 0.8 degrees, below which a closer view is no better than its resampling.
         closeness = -torch.log(apart.clamp(min=0) + 1e-4)
         # In a survey the angles are small: scaled so that 10 degrees are of order one.
-        near = [(direction[:, None] - gathered.directions) * 5, apart * -20, evidence.view_weight[..., None]]
+        turned = (direction[:, None] - gathered.directions) * 5
+        near = [*turned.unbind(-1), apart * -20, evidence.view_weight]
         if self.angle is not None:
             near.append(closeness / 4)
-        hidden = self.view(evidence.per_view) + self.direction(torch.cat(near, dim=-1))
-        logits = self.logit(F.relu(hidden, inplace=True))
+        hidden = self.view(evidence.per_view)
+        # Each of the numbers for all samples, one after the other: a linear layer would first lay them side by side.
+        across = self.direction.weight.T.expand(hidden.shape[0] * hidden.shape[1], -1, -1)
+        hidden = torch.baddbmm(hidden.flatten(0, 1), torch.stack(near, dim=2).flatten(0, 1).transpose(1, 2), across)
+        logits = self.logit(F.relu(hidden, inplace=True))[..., 0].unflatten(0, gathered.cosine.shape[:2])
         if self.angle is not None:
-            logits = logits + self.angle * closeness + gathered.presence.log()[..., None]
-        return logits[..., 0].masked_fill(~gathered.valid, -torch.inf)
+            logits = logits + self.angle * closeness + gathered.presence.log()
+        return logits.masked_fill(~gathered.valid, -torch.inf)

@@ -53,10 +53,12 @@ def place_samples(
     depth = 1 / inverse_depth
     ray = cameras.directions_world(uv_px)
     length = ray.norm(dim=-1, keepdim=True)
-    points = cameras.position_world[:, None, None] + ray[:, :, None] * depth[..., None]
     ends = torch.cat([depth, (1 / intervals.far)[..., None]], dim=-1) * length
-    unit = (ray / length)[:, :, None].expand_as(points)
-    return Samples(place, inverse_depth, points.flatten(1, 2), unit.flatten(1, 2), ends.diff(dim=-1).clamp(min=0))
+    # In memory all x, then all y, then all z: nearly everything that is done with points runs along many of them.
+    along, unit = (x.transpose(1, 2)[..., None] for x in (ray, ray / length))
+    points = cameras.position_world[..., None, None] + along * depth[:, None]
+    points, unit = (x.flatten(2).transpose(1, 2) for x in (points, unit.expand_as(points)))
+    return Samples(place, inverse_depth, points, unit, ends.diff(dim=-1).clamp(min=0))
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,10 @@ class Views:
             detail: read the photographs themselves, not their means over the stride.
         """
         tiles, count = self.which.shape
-        matrix = self.cameras.projection.unflatten(0, (tiles, count))
-        homogeneous = points_world[:, None] @ matrix[..., :3].transpose(2, 3) + matrix[:, :, None, :, 3]
+        # One product for all views of a tile, with all x in memory, then all y, then all z.
+        matrix = self.cameras.projection.unflatten(0, (tiles, count)).flatten(1, 2)
+        products = torch.baddbmm(matrix[..., 3:], matrix[..., :3], points_world.transpose(1, 2))
+        homogeneous = products.unflatten(1, (count, 3)).transpose(2, 3)
         z = homogeneous[..., 2:]
         front = z > 1e-6
         uv = homogeneous[..., :2] / torch.where(front, z, 1.0)
@@ -111,7 +113,7 @@ class Views:
         if detail or stride == 1:
             colours, on_map = gather(self.encoded.photographs, self.which, uv)
         offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
-        theirs = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+        theirs = offset * offset.square().sum(-1, keepdim=True).clamp(min=1e-18).rsqrt()
         return Gathered(
             colours=colours,
             features=features,
