@@ -98,7 +98,7 @@ class Surfaces:
     def __getitem__(self, index: int) -> Float[Tensor, "3 h w"]:
         if index not in self._priors:
             cameras = self.scene.cameras
-            self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras)
+            self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
         return self._priors[index]
 
     def observed(self, index: int) -> Observed:

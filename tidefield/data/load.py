@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tidefield.data.exif import read_metadata
 from tidefield.data.exposure import estimate_gains
+from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
 from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
 from tidefield.data.readers.blender import read_blender
@@ -83,6 +84,7 @@ def load_scene(
         test=test,
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (white if see_through else None),
+        hull=visual_hull(cameras, photographs, train) if points is None and see_through else None,
     )
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from tidefield.data.hull import Hull, hull_range
 from tidefield.data.scene import SparsePoints
 from tidefield.data.surface import surface_depth, trusted_points
 from tidefield.geometry.cameras import Cameras
@@ -24,6 +25,8 @@ LONELY_MARGIN = 0.5
 """... and where the nearest of them is a tenth of the image's width away."""
 PARALLAX_MARGIN = 0.01
 """Share of the depth by which it goes beyond the expected surface in any case."""
+BEHIND_HULL = 0.1
+"""How far into the hull the surface is expected: it touches the hull or, in hollows, lies behind."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +58,26 @@ def observed_depths(camera: Cameras, points: SparsePoints | None, index: int) ->
     return Observed(points.uv_px[mine][front], 1 / z[front], weight[front])
 
 
-def surface_prior(camera: Cameras, points: SparsePoints | None, cameras: Cameras) -> Float[Tensor, "3 h w"]:
+def surface_prior(
+    camera: Cameras, points: SparsePoints | None, cameras: Cameras, hull: Hull | None = None
+) -> Float[Tensor, "3 h w"]:
     """Expected, nearest and farthest inverse z-depth of one camera's pixels, on cells of `STRIDE` pixels.
 
     Expected is the surface through the sparse points; the interval spans the points around, with a margin that grows
-    where they are few. Without points nothing is expected (NaN) and the interval is the camera's near to far.
+    where they are few. Without points, but before a known background, the interval is where the ray passes the visual
+    hull, and the surface is expected near the hull's front. Without either, nothing is expected (NaN) and the interval
+    is the camera's near to far.
     """
     width, height = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
     near, far = 1 / camera.near_far[0]
-    if points is None:
-        return torch.stack([torch.full_like(near, torch.nan), near, far])[:, None, None].expand(3, height, width)
     # The cells of a grid of ceil(W / 4) columns are 4 pixels wide only if the camera is widened to match.
     cells = camera.cropped(width * STRIDE, height * STRIDE).resized(width, height)
+    if points is None:
+        if hull is None:
+            return torch.stack([torch.full_like(near, torch.nan), near, far])[:, None, None].expand(3, height, width)
+        shallow, deep, meets = hull_range(cells, hull)
+        front = torch.lerp(shallow, deep, BEHIND_HULL)
+        return 1 / torch.stack([torch.where(meets, front, torch.nan), shallow, deep])
     expected = 1 / surface_depth(cells, points, cameras)
     uv, inverse = trusted_points(cells, points, cameras)
     if len(uv) < AROUND:

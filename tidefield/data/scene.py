@@ -8,6 +8,7 @@ from pathlib import Path
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tidefield.data.hull import Hull
 from tidefield.data.images import Photographs
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
@@ -59,6 +60,7 @@ class Scene:
         test: indices of the held-out photographs.
         origin_world: what was subtracted, once and in float64, from the coordinates on disk.
         background_rgb: the colour behind the scene for photographs with alpha; None for real photographs.
+        hull: where what stands before it can be; None where there are sparse points, or nothing is known.
     """
 
     root: Path
@@ -70,6 +72,7 @@ class Scene:
     test: tuple[int, ...]
     origin_world: Float[Tensor, "3"]
     background_rgb: tuple[float, float, float] | None = None
+    hull: Hull | None = None
 
     def index(self, name: str) -> int:
         """Index of a photograph by its name, with or without its suffix."""

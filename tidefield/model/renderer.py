@@ -66,7 +66,7 @@ class Renderer:
     def __call__(self, camera: Cameras) -> Rendering:
         """The view of one camera, at its own gain."""
         scene = self.scene
-        prior = surface_prior(camera, scene.points, scene.cameras)
+        prior = surface_prior(camera, scene.points, scene.cameras, scene.hull)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
         picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
         for top in range(0, rows, BLOCK_TILES):

@@ -1,0 +1,156 @@
+"""The visual hull of what stands before a known background: the places that no photograph sees past (Laurentini, 1994).
+
+Photographs with alpha come without sparse points as a rule. Their outlines then tell where to look: what a photograph
+shows as background is empty all along the ray.
+
+Alphabet: P voxels, h x w cells of a camera's pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn import functional as F
+
+from tidefield.data.images import Photographs
+from tidefield.geometry.cameras import Cameras, pixel_grid
+
+ROUGH, ROUNDS = 32, 3
+"""Voxels along the sides of the box while it closes in on the hull, and how often it does."""
+HALVINGS = 2
+"""Of the sides of the voxels that are left."""
+OUTLINE_PX, MOST = 400, 100
+"""Longest side of the outlines that are looked at, and how many are: larger and more ones change the hull little."""
+LEAST_SEEN, LEAST_SHARE = 3, 0.5
+"""Photographs that must have a voxel in their frame, and of how many: about what few see, outlines say little."""
+STEPS_PER_VOXEL = 1.5
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Voxels of a box.
+
+    Attributes:
+        corner_world: where the first voxel begins.
+        voxel_world: its sides.
+        filled: whether no photograph sees past it.
+    """
+
+    corner_world: Float[Tensor, "3"]
+    voxel_world: Float[Tensor, "3"]
+    filled: Bool[Tensor, "X X X"]
+
+    def contains(self, points_world: Float[Tensor, "*P 3"]) -> Bool[Tensor, "*P"]:
+        """Whether points lie in the hull."""
+        size = torch.tensor(self.filled.shape)
+        index = ((points_world - self.corner_world) / self.voxel_world).floor().long()
+        inside = ((index >= 0) & (index < size)).all(-1)
+        x, y, z = index.clamp(min=0).minimum(size - 1).unbind(-1)
+        return self.filled[x, y, z] & inside
+
+
+def visual_hull(cameras: Cameras, photographs: Photographs, train: Sequence[int]) -> Hull | None:
+    """The hull that the training photographs' alphas leave; None where they leave nothing, or one has none.
+
+    Args:
+        cameras: of all photographs, with near and far.
+        photographs: whose alphas are read.
+        train: those that may be learned from.
+    """
+    some = train[:: -(-len(train) // MOST)]
+    alphas = [photographs.alpha(i) for i in some]
+    outlines = [_outline(alpha) for alpha in alphas if alpha is not None]
+    if len(outlines) < max(len(alphas), LEAST_SEEN):
+        return None
+    views = cameras[list(some)]
+    middle = views.position_world + views.forward_world * views.near_far.mean(1, keepdim=True)
+    widest = views.near_far.amax()
+    corner, side = middle.mean(0) - widest, (2 * widest / ROUGH).expand(3)
+    whole = _subdivided(torch.zeros(1, 3, dtype=torch.long), ROUGH)
+    kept = _left(whole, corner, side, views, outlines)
+    for _ in range(ROUNDS):
+        if not len(kept):
+            return None
+        low, high = kept.amin(0) - 1, kept.amax(0) + 2
+        corner, side = corner + low * side, side * (high - low) / ROUGH
+        kept = _left(whole, corner, side, views, outlines)
+    for _ in range(HALVINGS):
+        side = side / 2
+        kept = _left(_subdivided(kept, 2), corner, side, views, outlines)
+    filled = torch.zeros([ROUGH * 2**HALVINGS] * 3, dtype=torch.bool)
+    filled[kept.unbind(-1)] = True
+    return Hull(corner, side, filled) if len(kept) else None
+
+
+def _subdivided(voxels: Int[Tensor, "P 3"], parts: int) -> Int[Tensor, "Q 3"]:
+    """The voxels that voxels fall into when each of their sides is cut into parts."""
+    within = torch.cartesian_prod(*[torch.arange(parts)] * 3)
+    return (parts * voxels[:, None] + within).flatten(0, 1)
+
+
+def _outline(alpha: UInt8[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+    """1 where a photograph shows anything but background, on squares of as many pixels as `OUTLINE_PX` asks for."""
+    side = -(-max(alpha.shape) // OUTLINE_PX)
+    return F.max_pool2d((alpha > 0).float()[None], side, ceil_mode=True)[0]
+
+
+def _left(
+    voxels: Int[Tensor, "P 3"],
+    corner: Float[Tensor, "3"],
+    side: Float[Tensor, "3"],
+    views: Cameras,
+    outlines: Sequence[Float[Tensor, "_ _"]],
+) -> Int[Tensor, "Q 3"]:
+    """The voxels that no photograph shows as background, of those in enough frames."""
+    points = corner + (voxels + 0.5) * side
+    left, seen = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.long)
+    for k, outline in enumerate(outlines):
+        view = views[k]
+        uv, z = (x[0] for x in view.project(points[left]))
+        near, square = view.near_far[0, 0], -(-max(view.width, view.height) // OUTLINE_PX)
+        inside = (z > near) & (uv >= 0).all(-1) & (uv < view.size_px).all(-1)
+        # A voxel may show anywhere in a square as wide as its diagonal.
+        reach = (view.focal_px.amax() * side.norm() / 2 / near / square).clamp(max=OUTLINE_PX).item()
+        coarser = max(1, int(reach) // 3)
+        around = math.ceil(reach / coarser)
+        wide = F.max_pool2d(outline[None], coarser, ceil_mode=True)
+        for across, down in ((around, 0), (0, around)):
+            wide = F.max_pool2d(wide, (2 * down + 1, 2 * across + 1), 1, (down, across))
+        column, row = (uv.masked_fill(~inside[:, None], 0) / (square * coarser)).long().unbind(-1)
+        seen[left] += inside
+        left = left[~inside | (wide[0, row, column] > 0)]
+    return voxels[left[seen[left] >= max(LEAST_SEEN, LEAST_SHARE * len(outlines))]]
+
+
+def hull_range(camera: Cameras, hull: Hull) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """z-depths between which the rays of a camera's pixels pass the hull, and whether they do.
+
+    Pixels whose rays miss it have the range of all the others; if all do, the camera's own.
+    """
+    width, height = camera.width, camera.height
+    near, far = camera.near_far[0]
+    step = hull.voxel_world.amin() / STEPS_PER_VOXEL
+    ends = torch.cartesian_prod(*torch.stack([torch.zeros(3), hull.voxel_world * len(hull.filled)], -1))
+    box = camera.project(hull.corner_world + ends)[1].clamp(near, far)
+    depth = torch.arange(box.amin().item(), box.amax().item() + step.item(), step.item())
+    ray = camera.directions_world(pixel_grid(width, height)[None])[0]
+    lowest, highest = torch.full((len(ray),), torch.inf), torch.zeros(len(ray))
+    for some in depth.split(16):
+        inside = hull.contains(camera.position_world + ray[:, None] * some[:, None])
+        lowest = torch.minimum(lowest, torch.where(inside, some, torch.inf).amin(1))
+        highest = torch.maximum(highest, torch.where(inside, some, 0.0).amax(1))
+    meets = (highest > 0).reshape(height, width)
+    if not meets.any():
+        return near.expand(height, width), far.expand(height, width), meets
+    # Rays between the cells' middles pass where those beside them do.
+    shallow = -F.max_pool2d(-lowest.reshape(1, 1, height, width), 3, 1, 1)[0, 0] - step
+    deep = F.max_pool2d(highest.reshape(1, 1, height, width), 3, 1, 1)[0, 0] + step
+    around = shallow.isfinite()
+    shallow = torch.where(around, shallow, shallow[around].min()).clamp(min=near)
+    deep = torch.where(around, deep, deep[around].max()).clamp(max=far)
+    return shallow, deep, meets
