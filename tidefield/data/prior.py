@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from tidefield.data.hull import Hull, hull_range
 from tidefield.data.scene import SparsePoints
-from tidefield.data.surface import surface_depth, trusted_points
+from tidefield.data.surface import depth_through, trusted_points
 from tidefield.geometry.cameras import Cameras
 
 STRIDE = 4
@@ -78,8 +78,8 @@ def surface_prior(
         shallow, deep, meets = hull_range(cells, hull)
         front = torch.lerp(shallow, deep, BEHIND_HULL)
         return 1 / torch.stack([torch.where(meets, front, torch.nan), shallow, deep])
-    expected = 1 / surface_depth(cells, points, cameras)
     uv, inverse = trusted_points(cells, points, cameras)
+    expected = 1 / depth_through(cells, uv, inverse)
     if len(uv) < AROUND:
         lowest, highest = far.expand_as(expected), near.expand_as(expected)
     else:

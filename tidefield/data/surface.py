@@ -37,12 +37,14 @@ def surface_depth(camera: Cameras, points: SparsePoints | None, cameras: Cameras
         cameras: the scene's cameras, which `points.camera_index` counts in.
     """
     assert len(camera) == 1, f"one camera at a time, not {len(camera)}"
-    if points is not None:
-        uv, inverse = trusted_points(camera, points, cameras)
-        if len(uv):
-            return _interpolate(camera, uv, inverse)
-    middle = 2 / (1 / camera.near_far[0]).sum()
-    return middle.expand(camera.height, camera.width).clone()
+    if points is None:
+        return _middle_depth(camera)
+    return depth_through(camera, *trusted_points(camera, points, cameras))
+
+
+def depth_through(camera: Cameras, uv: NDArray, inverse: NDArray) -> Float[Tensor, "H W"]:
+    """`surface_depth` where its points are known already, as `trusted_points` gives them."""
+    return _interpolate(camera, uv, inverse) if len(uv) else _middle_depth(camera)
 
 
 def trusted_points(camera: Cameras, points: SparsePoints, cameras: Cameras) -> tuple[NDArray, NDArray]:
@@ -82,6 +84,11 @@ def doubly_seen(scene: Scene, camera: Cameras) -> Bool[Tensor, "H W"]:
 def in_frame(cameras: Cameras, uv_px: Float[Tensor, "V P 2"], z: Float[Tensor, "V P"]) -> Bool[Tensor, "V P"]:
     """Whether projected points lie in front of each camera and inside its image."""
     return (z > 0) & (uv_px > 0).all(-1) & (uv_px < cameras.size_px[:, None]).all(-1)
+
+
+def _middle_depth(camera: Cameras) -> Float[Tensor, "H W"]:
+    middle = 2 / (1 / camera.near_far[0]).sum()
+    return middle.expand(camera.height, camera.width).clone()
 
 
 def _visible(camera: Cameras, points: SparsePoints, cameras: Cameras) -> tuple[NDArray, NDArray]:
