@@ -20,6 +20,7 @@ from tidefield.errors import RunError, TidefieldError
 
 MEASURED = Path("docs/measured")
 COMPARISON = (MEASURED / "comparison.json",)
+ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
 BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "scratch"))
 DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
 a name, it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
@@ -173,7 +174,7 @@ def surveys(
 
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
-    ablation: tuple[Path, ...] = (MEASURED / "ablation.json",),
+    ablation: tuple[Path, ...] = ABLATION,
     begun: tuple[Path, ...] = BEGUN,
     runs: Path = MEASURED,
     out: Path = Path("docs/results.md"),

@@ -8,7 +8,7 @@ import pytest
 from scenes_on_disk import PINHOLE, survey, write_colmap
 from test_compare import Children, evaluation, quiet
 
-from tidefield.compare.ablation import ablation_table, variants
+from tidefield.compare.ablation import ablation_tables, variants
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
 from tidefield.compare.write import write_ablation
@@ -54,9 +54,12 @@ def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
     scene = load_scene(tmp_path / "flats", width=48)
     psnr = {"tidefield": 30.0, OTHER_SEED: 30.2, "views-2": 27.0, "degree-0": 29.85}
     by = {("flats", name): Result(evaluation(scene, value)) for name, value in psnr.items()}
-    table = ablation_table(Results(("flats",), (*psnr, "field"), by))
-    assert [row[-1] for row in table.rows] == ["-", "+0.20", "-3.00", "-0.15, within the noise", "-"]
+    by["creek", "tidefield"] = Result(evaluation(scene, 25.0))
+    table, other = ablation_tables(Results(("flats", "creek"), (*psnr, "field"), by))
+    assert [row[-1] for row in table.rows] == ["-", "+0.20", "-3.00", "-0.15, within the noise"]
     assert table.rows[2][:2] == ["views-2", "27.00"]
+    assert "flats" in table.title
+    assert [row[:2] for row in other.rows] == [["tidefield", "25.00"]]
 
 
 def test_an_ablation_is_run_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

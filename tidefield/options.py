@@ -249,7 +249,8 @@ class Compare:
 
 @dataclass(frozen=True)
 class Ablate:
-    """Train and evaluate variants of a preset, each with one part left out or changed, and write one table.
+    """Train and evaluate variants of a preset, each with one part left out or changed, and write a table for each
+    scene.
 
     What is done is not repeated: the same command goes on after an interruption, and with more variants or scenes.
     """

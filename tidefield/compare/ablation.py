@@ -19,31 +19,34 @@ def variants(chosen: Sequence[str]) -> tuple[str, ...]:
     return (WHOLE, OTHER_SEED, *(chosen or VARIANTS))
 
 
-def ablation_table(results: Results) -> Table:
-    """A line for each variant: means over the scenes, and what they say beside the network as it is.
+def ablation_tables(results: Results) -> list[Table]:
+    """One for each scene."""
+    return [_table(results, scene) for scene in results.scenes]
+
+
+def _table(results: Results, scene: str) -> Table:
+    """A line for each variant, and what it says beside the network as it is.
 
     "Within the noise" is a variant whose PSNR is no further away than that of another seed, or less than `LEAST_DB`.
     """
-    scenes = results.scenes
-    whole, other = (results.mean(method, "psnr_seen", scenes) for method in (WHOLE, OTHER_SEED))
+    whole, other = (results.metric(scene, method, "psnr_seen") for method in (WHOLE, OTHER_SEED))
     noise = LEAST_DB if whole is None or other is None else max(LEAST_DB, abs(other - whole))
     columns = ["variant", "PSNR, dB", "PSNR after the colour fit, dB", "SSIM", "LPIPS, VGG", "rays/s", "difference, dB"]
     rows = []
     for method in results.methods:
-        values = [results.mean(method, metric, scenes) for metric, _ in _METRICS]
-        rates = [results.by[s, method].evaluation["rays_per_second"] for s in scenes if (s, method) in results.by]
-        rows.append(
-            [
-                method,
-                *(shown(value, style) for value, (_, style) in zip(values, _METRICS, strict=True)),
-                f"{sum(rates) / len(rates):,.0f}" if rates else NOTHING,
-                _verdict(method, values[0], whole, noise),
-            ]
-        )
+        result = results.by.get((scene, method))
+        if result is not None:
+            values = [result.metric(metric) for metric, _ in _METRICS]
+            rows.append(
+                [
+                    method,
+                    *(shown(value, style) for value, (_, style) in zip(values, _METRICS, strict=True)),
+                    f"{result.evaluation['rays_per_second']:,.0f}",
+                    _verdict(method, values[0], whole, noise),
+                ]
+            )
     return Table(
-        f"What each part brings, over pixels that two training photographs or more see ({', '.join(scenes)})",
-        columns,
-        rows,
+        f"What each part brings on {scene}, over pixels that two training photographs or more see", columns, rows
     )
 
 

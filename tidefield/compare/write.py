@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.ablation import ablation_table
+from tidefield.compare.ablation import ablation_tables
 from tidefield.compare.figures import side_by_side, write_curves
 from tidefield.compare.record import stamp, write_json
 from tidefield.compare.results import Results, figures_of
@@ -27,8 +27,8 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     tables, made = all_tables(results), stamp()
     files = [
         _write(out / "tables.md", _page("Comparison", tables, _remarks(results), settings, made)),
-        _write(out / "tables.tex", "\n\n".join(table.latex() for table in tables) + "\n"),
-        _write(out / "tables.csv", "\n".join(f"{table.title}\n{table.csv()}" for table in tables)),
+        _write(out / "tables.tex", _latex(tables)),
+        _write(out / "tables.csv", _csv(tables)),
     ]
     write_json(out / "comparison.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     files.append(out / "comparison.json")
@@ -50,19 +50,27 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
 
 
 def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path]:
-    """Write the table of an ablation as far as it is there, over an older one.
+    """Write the tables of an ablation as far as it is there, over older ones.
 
     Returns:
         The files.
     """
-    table, made = ablation_table(results), stamp()
+    tables, made = ablation_tables(results), stamp()
     write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     return [
-        _write(out / "ablation.md", _page("Ablation", [table], _remarks(results), settings, made)),
-        _write(out / "ablation.tex", table.latex() + "\n"),
-        _write(out / "ablation.csv", table.csv()),
+        _write(out / "ablation.md", _page("Ablation", tables, _remarks(results), settings, made)),
+        _write(out / "ablation.tex", _latex(tables)),
+        _write(out / "ablation.csv", _csv(tables)),
         out / "ablation.json",
     ]
+
+
+def _latex(tables: list[Table]) -> str:
+    return "\n\n".join(table.latex() for table in tables) + "\n"
+
+
+def _csv(tables: list[Table]) -> str:
+    return "\n".join(f"{table.title}\n{table.csv()}" for table in tables)
 
 
 def _remarks(results: Results) -> list[str]:
