@@ -10,7 +10,7 @@ from benchmarks.bars import SCENES, Bar, Kept, judge
 from benchmarks.begun import by_length, length_tables
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
-from tidefield.compare.ablation import ablation_tables, variants
+from tidefield.compare.ablation import ablation_tables, variants, verdicts
 from tidefield.compare.record import read_json, stamp
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.run import METHODS, WHOLE
@@ -70,7 +70,8 @@ def page(compared: Results, ablated: Results, begun: Sequence[Results], kept: Ke
                 "## What trained weights bring",
                 *([table.markdown() for table in length_tables(lengths)] or ["Not measured."]),
                 "## What each part brings",
-                *([table.markdown() for table in ablation_tables(ablated)] or ["Not measured."]),
+                *(verdicts(ablated) or ["Not measured."]),
+                *(table.markdown() for table in ablation_tables(ablated)),
                 "## Speed",
                 *_speed(kept.speed),
                 "## Views of a scene that nothing was trained on",

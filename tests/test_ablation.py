@@ -8,7 +8,7 @@ import pytest
 from scenes_on_disk import PINHOLE, survey, write_colmap
 from test_compare import Children, evaluation, quiet
 
-from tidefield.compare.ablation import ablation_tables, variants
+from tidefield.compare.ablation import ablation_tables, variants, verdicts
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
 from tidefield.compare.write import write_ablation
@@ -60,6 +60,26 @@ def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
     assert table.rows[2][:2] == ["views-2", "27.00"]
     assert "flats" in table.title
     assert [row[:2] for row in other.rows] == [["tidefield", "25.00"]]
+
+
+def test_what_brings_nothing_on_any_scene_gets_a_line_that_says_so(tmp_path: Path):
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    scene = load_scene(tmp_path / "flats", width=48)
+    psnr = {
+        "flats": {
+            "tidefield": 30.0,
+            OTHER_SEED: 30.2,
+            "views-2": 27.0,
+            "degree-0": 29.85,
+            "field": 31.0,
+            "views-8": 29.0,
+        },
+        "creek": {"tidefield": 25.0, "views-2": 25.01, "degree-0": 25.04, "field": 25.2, "views-8": 25.3},
+    }
+    by = {(name, method): Result(evaluation(scene, value)) for name, of in psnr.items() for method, value in of.items()}
+    lines = verdicts(Results(tuple(psnr), (*psnr["flats"], "no-neighbours"), by))
+    assert [line.rpartition(": ")[2] for line in lines] == ["views-2.", "field.", "degree-0."]
+    assert "brings nothing" in lines[2]
 
 
 def test_an_ablation_is_run_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

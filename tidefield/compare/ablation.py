@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from tidefield.compare.results import Results
 from tidefield.compare.run import OTHER_SEED, WHOLE
-from tidefield.compare.table import NOTHING, Table, shown
+from tidefield.compare.table import Table, shown
 from tidefield.variants import VARIANTS
 
 LEAST_DB = 0.05
 """What is less says nothing, even if two seeds happened to agree better."""
+WITHIN = "within the noise"
 _METRICS = (("psnr_seen", "{:.2f}"), ("psnr_seen_cc", "{:.2f}"), ("ssim_seen", "{:.4f}"), ("lpips_vgg_seen", "{:.4f}"))
 
 
@@ -24,13 +26,39 @@ def ablation_tables(results: Results) -> list[Table]:
     return [_table(results, scene) for scene in results.scenes]
 
 
-def _table(results: Results, scene: str) -> Table:
-    """A line for each variant, and what it says beside the network as it is.
+def verdicts(results: Results) -> list[str]:
+    """What the tables say of all scenes together, as sentences: which parts matter, and which bring nothing."""
+    told: dict[str, list[str]] = {}
+    for method in results.methods:
+        if method not in (WHOLE, OTHER_SEED):
+            found = {_verdict(results, scene, method) for scene in results.scenes} - {None}
+            beyond = found - {WITHIN}
+            if found and len(beyond) < 2:
+                told.setdefault(next(iter(beyond), WITHIN), []).append(method)
+    sentences = {
+        "worse": "Worse than the whole, and nowhere better",
+        "better": "Better than the whole, and nowhere worse",
+        WITHIN: "Nowhere to be told from another seed, so that what was changed brings nothing in this time",
+    }
+    return [f"{said}: {', '.join(told[verdict])}." for verdict, said in sentences.items() if verdict in told]
 
-    "Within the noise" is a variant whose PSNR is no further away than that of another seed, or less than `LEAST_DB`.
-    """
-    whole, other = (results.metric(scene, method, "psnr_seen") for method in (WHOLE, OTHER_SEED))
-    noise = LEAST_DB if whole is None or other is None else max(LEAST_DB, abs(other - whole))
+
+def _difference(results: Results, scene: str, method: str) -> float | None:
+    """PSNR beside that of the network as it is, dB."""
+    own, whole = (results.metric(scene, name, "psnr_seen") for name in (method, WHOLE))
+    return None if own is None or whole is None or method == WHOLE else own - whole
+
+
+def _verdict(results: Results, scene: str, method: str) -> str | None:
+    """Better, worse or within the noise, which is what another seed makes, and at least `LEAST_DB`."""
+    difference, other = (_difference(results, scene, name) for name in (method, OTHER_SEED))
+    if difference is None:
+        return None
+    return WITHIN if abs(difference) <= max(LEAST_DB, abs(other or 0)) else "better" if difference > 0 else "worse"
+
+
+def _table(results: Results, scene: str) -> Table:
+    """A line for each variant, and what it says beside the network as it is."""
     columns = ["variant", "PSNR, dB", "PSNR after the colour fit, dB", "SSIM", "LPIPS, VGG", "rays/s", "difference, dB"]
     rows = []
     for method in results.methods:
@@ -42,17 +70,20 @@ def _table(results: Results, scene: str) -> Table:
                     method,
                     *(shown(value, style) for value, (_, style) in zip(values, _METRICS, strict=True)),
                     f"{result.evaluation['rays_per_second']:,.0f}",
-                    _verdict(method, values[0], whole, noise),
+                    _shown_difference(results, scene, method),
                 ]
             )
-    return Table(
-        f"What each part brings on {scene}, over pixels that two training photographs or more see", columns, rows
-    )
+    budgets = {_budget(result.process.get("settings", {})) for (at, _), result in results.by.items() if at == scene}
+    return Table(f"{scene}, {' or '.join(sorted(budgets))}, pixels that two photographs or more see", columns, rows)
 
 
-def _verdict(method: str, psnr: float | None, whole: float | None, noise: float) -> str:
-    if psnr is None or whole is None or method == WHOLE:
-        return NOTHING
-    difference = psnr - whole
-    within = abs(difference) <= noise and method != OTHER_SEED
-    return f"{difference:+.2f}{', within the noise' if within else ''}"
+def _budget(settings: Mapping[str, Any]) -> str:
+    """How a variant was trained."""
+    steps, minutes = settings.get("steps"), settings.get("minutes")
+    begun = " from random weights" if settings.get("from_scratch") else ""
+    return (f"{minutes:g} min" if minutes is not None else f"{steps} steps") + begun
+
+
+def _shown_difference(results: Results, scene: str, method: str) -> str:
+    within = _verdict(results, scene, method) == WITHIN and method != OTHER_SEED
+    return shown(_difference(results, scene, method), "{:+.2f}") + (f", {WITHIN}" if within else "")

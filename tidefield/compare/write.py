@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.ablation import ablation_tables
+from tidefield.compare.ablation import ablation_tables, verdicts
 from tidefield.compare.figures import side_by_side, write_curves
 from tidefield.compare.record import stamp, write_json
 from tidefield.compare.results import Results, figures_of
@@ -58,7 +58,9 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     tables, made = ablation_tables(results), stamp()
     write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     return [
-        _write(out / "ablation.md", _page("Ablation", tables, _remarks(results), settings, made)),
+        _write(
+            out / "ablation.md", _page("Ablation", tables, [*verdicts(results), *_remarks(results)], settings, made)
+        ),
         _write(out / "ablation.tex", _latex(tables)),
         _write(out / "ablation.csv", _csv(tables)),
         out / "ablation.json",
