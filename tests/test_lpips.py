@@ -48,7 +48,16 @@ def test_without_weights_the_reason_names_the_file_and_the_commands(checkpoints,
         reason = networks[metric]
         assert isinstance(reason, str)
         assert "--download-lpips" in reason
-        assert f"curl --create-dirs --output '{checkpoints / file}' {lpips.WEIGHTS_URL}{file}" in reason
+        assert f'curl --create-dirs --output "{checkpoints / file}" {lpips.WEIGHTS_URL}{file}' in reason
+
+
+def test_the_reason_does_not_tell_whose_home_folder_it_was(checkpoints, monkeypatch):
+    monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
+    monkeypatch.setattr(lpips.Path, "home", lambda: checkpoints.parent)
+    reason = lpips.load_lpips()["lpips_vgg"]
+    assert isinstance(reason, str)
+    assert f'--output "$HOME/{checkpoints.name}/vgg16-397923af.pth"' in reason
+    assert str(checkpoints) not in reason
 
 
 def test_a_missing_network_leaves_nulls_with_its_reason_and_all_else_whole():

@@ -90,7 +90,7 @@ def load_lpips() -> dict[str, Lpips | str]:
                 networks[metric] = Lpips(backbone, path)
             except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, ValueError, KeyError) as error:
                 what = str(error).splitlines()[0] if str(error) else type(error).__name__
-                networks[metric] = f"{path} does not hold the backbone's weights ({what}); {_how_to_get(path)}"
+                networks[metric] = f"{path.name} does not hold the backbone's weights ({what}); {_how_to_get(path)}"
     return networks
 
 
@@ -146,9 +146,12 @@ def prepare_torchvision() -> str | None:
 
 
 def _how_to_get(path: Path) -> str:
+    # Results are kept and handed on: whose home folder it was is nobody's business.
+    home = Path.home()
+    told = f"$HOME/{path.relative_to(home).as_posix()}" if path.is_relative_to(home) else path
     return (
         "run `tidefield evaluate` once with --download-lpips, or: "
-        f"curl --create-dirs --output '{path}' {WEIGHTS_URL}{path.name}"
+        f'curl --create-dirs --output "{told}" {WEIGHTS_URL}{path.name}'
     )
 
 
