@@ -31,7 +31,8 @@ def verdicts(results: Results) -> list[str]:
     told: dict[str, list[str]] = {}
     for method in results.methods:
         if method not in (WHOLE, OTHER_SEED):
-            found = {_verdict(results, scene, method) for scene in results.scenes} - {None}
+            each = (_verdict(results, scene, method) for scene in results.scenes)
+            found = {verdict for verdict in each if verdict is not None}
             beyond = found - {WITHIN}
             if found and len(beyond) < 2:
                 told.setdefault(next(iter(beyond), WITHIN), []).append(method)
