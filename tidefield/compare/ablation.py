@@ -22,8 +22,9 @@ def variants(chosen: Sequence[str]) -> tuple[str, ...]:
 
 
 def ablation_tables(results: Results) -> list[Table]:
-    """One for each scene."""
-    return [_table(results, scene) for scene in results.scenes]
+    """One for each scene of which something is there."""
+    there = {scene for scene, _ in results.by}
+    return [_table(results, scene) for scene in results.scenes if scene in there]
 
 
 def verdicts(results: Results) -> list[str]:
@@ -75,7 +76,8 @@ def _table(results: Results, scene: str) -> Table:
                 ]
             )
     budgets = {_budget(result.process.get("settings", {})) for (at, _), result in results.by.items() if at == scene}
-    return Table(f"{scene}, {' or '.join(sorted(budgets))}, pixels that two photographs or more see", columns, rows)
+    title = f"{scene}, {' or '.join(sorted(budgets))}, pixels that two training photographs or more see"
+    return Table(title, columns, rows)
 
 
 def _budget(settings: Mapping[str, Any]) -> str:
