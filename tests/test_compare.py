@@ -27,6 +27,7 @@ from tidefield.compare.tables import cost_table, paper_table, quality_tables
 from tidefield.compare.write import write_comparison
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
 from tidefield.options import Compare
 from tidefield.train.evaluate import NAMES
@@ -314,3 +315,8 @@ def test_what_is_missing_is_told_before_anything_is_trained(
     monkeypatch.setattr("tidefield.commands.peers.find_spec", lambda name: None)
     with pytest.raises(RunError, match="matplotlib is not installed"):
         tidefield.commands.peers.compare(Compare((disk,)), Console(quiet=True))
+
+
+def test_the_record_says_which_device_auto_was() -> None:
+    settings = tidefield.commands.peers._settings(Compare(device="auto"), from_scratch=False)
+    assert settings.device == str(choose_device("auto"))

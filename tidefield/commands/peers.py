@@ -50,8 +50,8 @@ def ablate(options: Ablate, console: Console) -> None:
 
 
 def _settings(options: Compare | Ablate, **others: Any) -> Settings:
-    budget = budget_of(options.length)
-    return Settings(budget.minutes, budget.steps, options.width, options.device, options.seed, **others)
+    budget, device = budget_of(options.length), str(choose_device(options.device))  # the record says what auto was
+    return Settings(budget.minutes, budget.steps, options.width, device, options.seed, **others)
 
 
 def _run(
