@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.geometry.scattered import interpolate_on_pixels
 
 FRAME_MARGIN = 0.3  # points this share of the image beyond its border still shape the surface at the border
 NEIGHBOURS = 16  # image neighbours that a point is compared with
@@ -122,7 +123,6 @@ def _seen_from_similar_direction(
 
 
 def _interpolate(camera: Cameras, uv: NDArray, inverse: NDArray) -> Float[Tensor, "H W"]:
-    from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import KDTree
 
     width, height = camera.width, camera.height
@@ -132,12 +132,11 @@ def _interpolate(camera: Cameras, uv: NDArray, inverse: NDArray) -> Float[Tensor
     nearest = np.asarray(KDTree(uv).query(frame, k=min(NEIGHBOURS, len(uv)))[1]).reshape(len(frame), -1)
     uv = np.concatenate([uv, frame])
     residual = np.concatenate([residual, np.median(residual[nearest], axis=1)])
-    pixels = pixel_grid(width, height).double().numpy()
-    result = LinearNDInterpolator(uv, residual)(pixels) + _on_plane(plane, pixels)
+    on_plane = _on_plane(plane, pixel_grid(width, height).double().numpy()).reshape(height, width)
+    result = interpolate_on_pixels(uv, residual, width, height) + on_plane
     # Twice beyond what the points show: keeps an extrapolated plane in front of the camera.
     result = np.clip(result, inverse.min() / 2, inverse.max() * 2)
-    depth = torch.from_numpy((1 / result).reshape(height, width))
-    return depth.to(camera.focal_px)
+    return torch.from_numpy(1 / result).to(camera.focal_px)
 
 
 def _robust_plane(uv: NDArray, inverse: NDArray) -> NDArray:

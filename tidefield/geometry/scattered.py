@@ -1,0 +1,75 @@
+"""Values between scattered points, on the pixels of an image."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+
+def interpolate_on_pixels(
+    uv_px: Float64[ndarray, "P 2"], values: Float64[ndarray, " P"], width: int, height: int
+) -> Float64[ndarray, "H W"]:
+    """Linear interpolation in the Delaunay triangles of points, at the centres of all pixels.
+
+    What scipy's LinearNDInterpolator gives, which finds the triangle of each pixel by walking through the mesh. Here
+    each triangle says at which pixel of a row it begins, as in scan conversion; it ends where the next one begins.
+
+    Args:
+        uv_px: where the points are; their hull must hold all pixels.
+        values: there.
+        width, height: of the image.
+    """
+    from scipy.spatial import Delaunay
+
+    corners = Delaunay(uv_px).simplices
+    owner = _owners(uv_px[corners], width, height)
+    slope, offset = _planes(uv_px[corners], values[corners])
+    u, v = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    return slope[owner, 0] * u + slope[owner, 1] * v + offset[owner]
+
+
+def _owners(triangles: Float64[ndarray, "T 3 2"], width: int, height: int) -> ndarray:
+    """The triangle in which each pixel's centre lies, H x W.
+
+    A row crosses a triangle if it lies at or below its uppermost corner and above its lowest one; what it meets exactly
+    is thus decided as if it lay a trifle lower.
+    """
+    upper, lower = triangles[..., 1].min(1), triangles[..., 1].max(1)
+    first, end = (np.ceil(x - 0.5).clip(0, height).astype(np.int64) for x in (upper, lower))
+    count = (end - first).clip(min=0)
+    which = np.repeat(np.arange(len(triangles)), count)
+    row = np.arange(len(which)) - np.repeat(count.cumsum() - count - first, count)
+    left, lean = _left_edges(triangles[which], row + 0.5)
+    order = np.lexsort((lean, left, row))
+    at = np.ceil(left - 0.5).clip(0, width).astype(np.int64)
+    order = order[at[order] < width]
+    begins = np.full(height * width, -1)
+    # Of several that begin before the same pixel the last one reaches it.
+    begins[(row * width + at)[order]] = which[order]
+    latest = np.maximum.accumulate(np.where(begins >= 0, np.arange(len(begins)), 0))
+    return begins[latest].reshape(height, width)
+
+
+def _left_edges(triangles: Float64[ndarray, "K 3 2"], v: Float64[ndarray, " K"]) -> tuple[ndarray, ndarray]:
+    """Where each triangle's row begins, and how far this moves from one row to the next."""
+    ahead = np.roll(triangles, -1, axis=1)
+    upside = (triangles[..., 1] > ahead[..., 1])[..., None]
+    above, below = np.where(upside, ahead, triangles), np.where(upside, triangles, ahead)
+    crossed = (above[..., 1] <= v[:, None]) & (v[:, None] < below[..., 1])
+    rise = np.where(crossed, below[..., 1] - above[..., 1], 1.0)
+    lean = (below[..., 0] - above[..., 0]) / rise
+    u = np.where(crossed, above[..., 0] + (v[:, None] - above[..., 1]) * lean, np.inf)
+    left = u.min(1)
+    return left, np.where(u == left[:, None], lean, np.inf).min(1)
+
+
+def _planes(triangles: Float64[ndarray, "T 3 2"], values: Float64[ndarray, "T 3"]) -> tuple[ndarray, ndarray]:
+    """Slopes (T x 2) and offsets (T) of the planes through the triangles' values."""
+    first, second = (triangles[:, k] - triangles[:, 0] for k in (1, 2))
+    rise, other = values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]
+    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    across = np.stack([rise * second[:, 1] - other * first[:, 1], other * first[:, 0] - rise * second[:, 0]], axis=1)
+    # A triangle without area holds no pixel.
+    slope = across / np.where(area == 0, 1.0, area)[:, None]
+    return slope, values[:, 0] - (slope * triangles[:, 0]).sum(1)
