@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
+from jaxtyping import Float64, Int64
 
 
 def interpolate_on_pixels(
-    uv_px: Float64[ndarray, "P 2"], values: Float64[ndarray, " P"], width: int, height: int
-) -> Float64[ndarray, "H W"]:
+    uv_px: Float64[np.ndarray, "P 2"], values: Float64[np.ndarray, " P"], width: int, height: int
+) -> Float64[np.ndarray, "H W"]:
     """Linear interpolation in the Delaunay triangles of points, at the centres of all pixels.
 
     What scipy's LinearNDInterpolator gives, which finds the triangle of each pixel by walking through the mesh. Here
@@ -29,7 +28,7 @@ def interpolate_on_pixels(
     return slope[owner, 0] * u + slope[owner, 1] * v + offset[owner]
 
 
-def _owners(triangles: Float64[ndarray, "T 3 2"], width: int, height: int) -> ndarray:
+def _owners(triangles: Float64[np.ndarray, "T 3 2"], width: int, height: int) -> Int64[np.ndarray, "H W"]:
     """The triangle in which each pixel's centre lies, H x W.
 
     A row crosses a triangle if it lies at or below its uppermost corner and above its lowest one; what it meets exactly
@@ -51,7 +50,7 @@ def _owners(triangles: Float64[ndarray, "T 3 2"], width: int, height: int) -> nd
     return begins[latest].reshape(height, width)
 
 
-def _left_edges(triangles: Float64[ndarray, "K 3 2"], v: Float64[ndarray, " K"]) -> tuple[ndarray, ndarray]:
+def _left_edges(triangles: Float64[np.ndarray, "K 3 2"], v: Float64[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
     """Where each triangle's row begins, and how far this moves from one row to the next."""
     ahead = np.roll(triangles, -1, axis=1)
     upside = (triangles[..., 1] > ahead[..., 1])[..., None]
@@ -64,7 +63,9 @@ def _left_edges(triangles: Float64[ndarray, "K 3 2"], v: Float64[ndarray, " K"])
     return left, np.where(u == left[:, None], lean, np.inf).min(1)
 
 
-def _planes(triangles: Float64[ndarray, "T 3 2"], values: Float64[ndarray, "T 3"]) -> tuple[ndarray, ndarray]:
+def _planes(
+    triangles: Float64[np.ndarray, "T 3 2"], values: Float64[np.ndarray, "T 3"]
+) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (T x 2) and offsets (T) of the planes through the triangles' values."""
     first, second = (triangles[:, k] - triangles[:, 0] for k in (1, 2))
     rise, other = values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]
