@@ -65,6 +65,8 @@ def pretrain(options: Pretrain, console: Console) -> None:
     from tidefield.train.stream import Stream
 
     budget, folder, config = budget_of(options.length), options.out, PRESETS[options.preset]
+    if not 0 < options.mixing <= 1:
+        raise RunError(f"--mixing is {options.mixing}: expected more than 0 and at most 1; 1 hands on what was learned")
     occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     device = across.join(choose_device(options.device))  # none gets further, and writes, before all have looked
     if occupied:
@@ -76,15 +78,15 @@ def pretrain(options: Pretrain, console: Console) -> None:
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.own_seed(options.seed), device) as stream:
         shown = next(iter(validation.scenes.values()))
-        learner = across.Pretrainer(config, stream, shown, options.seed, device)
+        learner = across.Pretrainer(config, stream, shown, options.seed, device, options.mixing)
         if options.resume:
             learner.resume(folder)
         finished = train_loop(learner, folder, budget, Display(console), validation)
     if learner.leads:
         done, real = learner.progress, [scene.resolve().name for scene in options.real]
         about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **stamp()}
-        about["processes"] = across.processes()
-        write_weights(folder / WEIGHTS_FILE, learner.network, config, {**about, "validation": validation.points})
+        about |= {"mixing": options.mixing, "processes": across.processes(), "validation": validation.points}
+        write_weights(folder / WEIGHTS_FILE, learner.handed_on(), config, about)
     _end(learner.progress, finished, folder, console)
 
 
