@@ -199,7 +199,7 @@ def card(weights: Path, comparison: tuple[Path, ...] = COMPARISON) -> None:
 
     Args:
         weights: Of `tidefield pretrain`.
-        comparison: What `tidefield compare` left, with the method zero-shot.
+        comparison: What `tidefield compare` left, with the method zero-shot, or paper-zero-shot for those of paper.
     """
     from benchmarks.card import write_card
 

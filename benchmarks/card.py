@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.bars import SCENES, UNSEEN
 from tidefield.compare.results import Results, read_figures
-from tidefield.compare.run import UNTRAINED, ZERO_SHOT
+from tidefield.compare.run import PAPER_ZERO_SHOT, UNTRAINED, ZERO_SHOT
 from tidefield.compare.table import Table, shown
 from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
@@ -26,7 +26,9 @@ from tidefield.train.stream import (
 )
 from tidefield.train.weights import about, sha256
 
-METHODS = (ZERO_SHOT, "nerfacto", *UNTRAINED)
+OWN = {"swift": ZERO_SHOT, "paper": PAPER_ZERO_SHOT}
+"""By preset, what its weights are called in a comparison."""
+PEERS = ("nerfacto", *UNTRAINED)
 LICENCES = {
     "brighton_beach": "BSD-2-Clause, (c) 2017 Piero Toffanin",
     "turin_lot": "MIT, from the repository vinstray/i-sfm",
@@ -39,7 +41,7 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
 
     Args:
         weights: of `tidefield pretrain`.
-        comparison: files of `tidefield compare` with the method zero-shot.
+        comparison: files of `tidefield compare` with the method zero-shot or paper-zero-shot.
 
     Returns:
         The card.
@@ -47,10 +49,11 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
     """
-    results = read_figures(comparison, SCENES, METHODS)
-    if not any(method == ZERO_SHOT for _, method in results.by):
+    own = OWN[about(weights)["config"]["preset"]]
+    results = read_figures(comparison, SCENES, (own, *PEERS))
+    if not any(method == own for _, method in results.by):
         named = ", ".join(map(str, comparison))
-        raise RunError(f"{named} hold no zero-shot results: expected some; run `tidefield compare` with them")
+        raise RunError(f"{named} hold no {own} results: expected some; run `tidefield compare` with them")
     out = weights.with_suffix(".md")
     with completed_file(out, overwrite=True) as partial:
         partial.write_text(card(weights, results), encoding="utf-8")
@@ -112,7 +115,8 @@ def _curve(points: list[Mapping[str, Any]]) -> Table:
 
 def _quality(results: Results, metric: str, title: str, style: str) -> Table:
     rows = [
-        (scene, *(shown(results.metric(scene, method, metric), style) for method in METHODS))
+        (scene, *(shown(results.metric(scene, method, metric), style) for method in results.methods))
         for scene in results.scenes
+        if (scene, results.methods[0]) in results.by
     ]
-    return Table(title, ["scene", *METHODS], rows)
+    return Table(title, ["scene", *results.methods], rows)

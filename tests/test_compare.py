@@ -67,7 +67,7 @@ class Children:
             (folder / "run.json").write_text("{}")
             (folder / "curve.json").write_text("[[10, 20.5], [600, 25.0]]")
         else:
-            psnr = 20.0 + (METHODS.index(folder.name) if folder.name in METHODS else 0)
+            psnr = 28.0 if folder.name == "nearest" else 20.0
             (folder / "evaluation.json").write_text(json.dumps(evaluation(self.scene, psnr)))
             for i in self.scene.test:
                 picture = (folder / "renderings" / self.scene.names[i]).with_suffix(".png")
@@ -105,6 +105,13 @@ def test_every_method_is_trained_and_evaluated_once(disk: Path, tmp_path: Path):
     assert record["train"]["seconds"] == 12.5
     assert record["settings"]["scene"] == str(disk.resolve())
     assert record["evaluate"]["command"] == "tidefield evaluate RUN --device cpu"
+
+
+def test_zero_shot_is_with_the_weights_of_its_preset() -> None:
+    for method, preset in (("zero-shot", "swift"), ("paper-zero-shot", "paper")):
+        asked = commands(Path("data"), Path("run"), method, SETTINGS)
+        assert list(asked) == ["evaluate"]
+        assert asked["evaluate"][3:6] == ["--zero-shot", "--preset", preset]
 
 
 def test_a_training_that_broke_off_begins_anew_and_one_that_ended_does_not(disk: Path, tmp_path: Path):

@@ -15,6 +15,7 @@ import torch
 import torch.multiprocessing as processes
 from rich.console import Console
 from safetensors import safe_open
+from scenes_on_disk import PINHOLE, survey, write_colmap
 from test_training import SMALL
 from torch.nn import functional as F
 
@@ -87,6 +88,14 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
         scenes.draw(16, again)
         left = {path.name for path in (tmp_path / "scenes").iterdir()}
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
+
+
+def test_a_real_scene_is_there_at_every_width(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    with Stream(tmp_path / "scenes", [tmp_path / "flats"], 1, CPU, (24, 48)) as scenes:
+        assert [scene.cameras.width for scene in scenes.real] == [24, 48]
+    assert max(stream.WIDTHS_WHOLE) < max(stream.WIDTHS)
 
 
 def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:

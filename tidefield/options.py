@@ -15,7 +15,16 @@ Preset = Literal["swift", "paper"]
 Floor = Literal["plane-sweep", "sparse-depth", "nearest"]
 Trained = Literal["tidefield", "nerf", "nerfacto", "splatfacto"]
 Compared = Literal[
-    "tidefield", "zero-shot", "paper", "nerf", "nerfacto", "splatfacto", "plane-sweep", "sparse-depth", "nearest"
+    "tidefield",
+    "zero-shot",
+    "paper",
+    "paper-zero-shot",
+    "nerf",
+    "nerfacto",
+    "splatfacto",
+    "plane-sweep",
+    "sparse-depth",
+    "nearest",
 ]
 Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
@@ -233,9 +242,9 @@ class Compare:
     """Scenes; with --protocol tidalflats in addition to its own, with --protocol mipnerf360 the folder of the data
     set."""
     methods: tuple[Compared, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
-    """Which, in the order of the tables. tidefield and paper are presets of ours, zero-shot is the former without any
-    training on the scene; nerf is classical NeRF; nerfacto and
-    splatfacto are nerfstudio's; the others need no training."""
+    """Which, in the order of the tables. tidefield and paper are presets of ours, zero-shot and paper-zero-shot these
+    without any training on the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; the others
+    need no training."""
     length: OmitArgPrefixes[Length] = Length()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""

@@ -62,7 +62,7 @@ def train(options: Train, console: Console) -> None:
 def pretrain(options: Pretrain, console: Console) -> None:
     """See `tidefield pretrain --help`."""
     from tidefield.train import pretrain as across
-    from tidefield.train.stream import Stream
+    from tidefield.train.stream import WIDTHS, WIDTHS_WHOLE, Stream
 
     budget, folder, config = budget_of(options.length), options.out, PRESETS[options.preset]
     if not 0 < options.mixing <= 1:
@@ -76,7 +76,8 @@ def pretrain(options: Pretrain, console: Console) -> None:
     if across.together() and budget.steps is None:
         raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    with Stream(folder / "scenes", options.real, across.own_seed(options.seed), device) as stream:
+    widths, seed = WIDTHS if config.train.crop_px else WIDTHS_WHOLE, across.own_seed(options.seed)
+    with Stream(folder / "scenes", options.real, seed, device, widths) as stream:
         shown = next(iter(validation.scenes.values()))
         learner = across.Pretrainer(config, stream, shown, options.seed, device, options.mixing)
         if options.resume:

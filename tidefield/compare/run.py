@@ -19,9 +19,10 @@ UNTRAINED = ("plane-sweep", "sparse-depth", "nearest")
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and once more for the noise of an ablation."""
 PEERS = ("nerfacto", "nerf", "splatfacto")
-ZERO_SHOT = "zero-shot"
-METHODS = (WHOLE, ZERO_SHOT, "paper", *PEERS, *UNTRAINED)
+ZERO_SHOT, PAPER_ZERO_SHOT = "zero-shot", "paper-zero-shot"
+METHODS = (WHOLE, ZERO_SHOT, "paper", PAPER_ZERO_SHOT, *PEERS, *UNTRAINED)
 """What can be compared; in an ablation, the variants of our network, too."""
+_NOT_TRAINED = (ZERO_SHOT, PAPER_ZERO_SHOT, *UNTRAINED)
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
 
 
@@ -51,8 +52,9 @@ def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict
     """The tidefield commands of a method on a scene, by name, in their order."""
     device = ["--device", settings.device]
     width = [] if settings.width is None else ["--width", str(settings.width)]
-    if method in (ZERO_SHOT, *UNTRAINED):
-        kind = ["--zero-shot", "--preset", settings.preset] if method == ZERO_SHOT else ["--method", method]
+    if method in _NOT_TRAINED:
+        presets = {ZERO_SHOT: settings.preset, PAPER_ZERO_SHOT: "paper"}
+        kind = ["--zero-shot", "--preset", presets[method]] if method in presets else ["--method", method]
         return {"evaluate": ["evaluate", str(scene), str(folder), *kind, *width, *device]}
     seed = ["--seed", str(settings.seed + (method == OTHER_SEED))]
     if settings.minutes is not None:
@@ -113,9 +115,9 @@ def compare(
 def _record(scene: Path, method: str, settings: Settings) -> dict[str, object]:
     """What a result depends on; of what is not trained, no budget, and of others' methods, not how ours begin."""
     kept = asdict(settings)
-    if method in (ZERO_SHOT, *UNTRAINED):
+    if method in _NOT_TRAINED:
         kept |= {"minutes": None, "steps": None, "seed": None}
-    if method in (ZERO_SHOT, *PEERS, *UNTRAINED):
+    if method in (*PEERS, *_NOT_TRAINED):
         del kept["from_scratch"]
     return {**kept, "scene": str(scene.resolve())}
 

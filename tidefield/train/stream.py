@@ -39,7 +39,9 @@ STEPS_EACH = 100
 REAL_SHARE = 0.5
 """Of the scenes, where there are real ones."""
 WIDTHS = (256, 400, 800)
-"""Of real scenes' photographs: each is there at all of them."""
+"""Of real scenes' photographs."""
+WIDTHS_WHOLE = (256, 400)
+"""The same where photographs are encoded whole, and a step needs memory for nearly all of a scene's at once."""
 MISPOSED_DEG = 0.6
 SPARSE_SHARE = 0.25
 """Of the scenes with few points, so that depth is learned from what the views see, too."""
@@ -231,11 +233,14 @@ class Stream:
         real: folders of scenes of which only the training photographs are learned from.
         seed: of the procedural ones.
         device: where the network is.
+        widths: of the real ones' photographs; each is there at all of them.
     """
 
-    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
+    def __init__(
+        self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, widths: Sequence[int] = WIDTHS
+    ) -> None:
         self.folder, self.seed, self.device = folder, seed, device
-        self.real = [load_scene(path, width=width) for path in real for width in WIDTHS]
+        self.real = [load_scene(path, width=width) for path in real for width in widths]
         self.pool: dict[int, Drawn] = {}
         self.coming: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
