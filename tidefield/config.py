@@ -165,8 +165,8 @@ SWIFT = Config(
     network=NetworkConfig(
         encoder=EncoderConfig(widths=(16, 16, 32, 64), blocks=(1, 1, 1), instance_norm=False),
         stages=(
-            StageConfig(stride=4, samples=16, feature_stride=4, feature_channels=32, hidden=32),
-            StageConfig(stride=1, samples=4, feature_stride=1, feature_channels=16, hidden=16),
+            StageConfig(stride=4, samples=24, feature_stride=4, feature_channels=32, hidden=32),
+            StageConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
         ),
         views=5,
         fold=True,
