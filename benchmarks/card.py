@@ -14,7 +14,6 @@ from tidefield.compare.tables import METRICS, lpips_weights
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.train.stream import (
-    MIRRORED_SHARE,
     POINTLESS_SHARE,
     RECOLOURED_SHARE,
     SHIFT_PX,
@@ -85,14 +84,11 @@ def card(weights: Path, results: Results) -> str:
         f"{SPARSE_SHARE:.0%} of the scenes came with {SPARSE_POINTS[0]:.0%} to {SPARSE_POINTS[1]:.0%} of their sparse "
         f"points and {POINTLESS_SHARE:.0%} without any; of {SHIFTED_SHARE:.0%} the photographs were off by "
         f"{SHIFT_PX[0]} to {SHIFT_PX[1]} px, of {UNEVEN_SHARE:.0%} the exposures by {UNEVEN[0]:.0%} to "
-        f"{UNEVEN[1]:.0%}; {RECOLOURED_SHARE:.0%} had the channels of their colours in a random order, "
-        f"{MIRRORED_SHARE:.0%} were seen in a mirror, and all were turned at random.",
+        f"{UNEVEN[1]:.0%}; {RECOLOURED_SHARE:.0%} had the channels of their colours in a random order, and all were "
+        "turned at random.",
         f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
         f"cores, {told['date']}, Tidefield {told['version']}:",
-        f"    {launch} pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}"
-        f" --mixing {told['mixing']}",
-        f"What is handed on lies {told['mixing']:.0%} of the way from the random weights that training began with to "
-        "those that it ended with (Wortsman et al., 2022); so does what was validated.",
+        f"    {launch} pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
         "PSNR in dB on scenes that nothing is learned from (of the real ones, their held-out photographs), two small "
         "views of each:",
         _curve(told["validation"]).markdown(),

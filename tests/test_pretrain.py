@@ -9,13 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import test_hull as ball
 import textured_wall as wall
 import torch
 import torch.multiprocessing as processes
 from rich.console import Console
 from safetensors import safe_open
-from scenes_on_disk import PINHOLE, survey, write_colmap
 from test_training import SMALL
 from torch.nn import functional as F
 
@@ -25,7 +23,6 @@ from tidefield.data.batches import Surfaces
 from tidefield.data.synthetic import Flight
 from tidefield.errors import RunError
 from tidefield.model.network import Network
-from tidefield.model.renderer import Renderer
 from tidefield.options import Length, Pretrain
 from tidefield.train import pretrain, stream
 from tidefield.train.loop import Budget, Trainer
@@ -90,14 +87,6 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
 
 
-def test_a_real_scene_is_there_at_every_width(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    write_colmap(tmp_path / "flats", survey(PINHOLE))
-    with Stream(tmp_path / "scenes", [tmp_path / "flats"], 1, CPU, (24, 48)) as scenes:
-        assert [scene.cameras.width for scene in scenes.real] == [24, 48]
-    assert max(stream.WIDTHS_WHOLE) < max(stream.WIDTHS)
-
-
 def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
     every = [stream.slot(3, number, 0.5) for number in range(100)]
     assert every[5] == stream.slot(3, 5, 0.5)
@@ -111,14 +100,13 @@ def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
     assert len({own.uneven for own in every}) > 10
     assert 30 < sum(own.channels != (0, 1, 2) for own in every) < 60
     assert len({own.channels for own in every}) == 6
-    assert 30 < sum(own.mirrored for own in every) < 70
 
 
 def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
     at = wall.scene(wall.cameras(6))
     easy, hard = (
-        stream.Slot(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7, False),
-        stream.Slot(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7, False),
+        stream.Slot(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
+        stream.Slot(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
     )
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
         whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
@@ -141,45 +129,6 @@ def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp
     assert len(points.error_px) == len(points.xyz_world) == len(points.point_index.unique())
     seen_at = at.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
     assert (seen_at - points.uv_px).norm(dim=-1).max() < 1e-3, "every observation is still of its point"
-
-
-def test_a_mirrored_scene_is_another_one_that_fits_itself(tmp_path: Path) -> None:
-    at = wall.scene(wall.cameras(6))
-    cameras = replace(at.cameras, principal_px=at.cameras.principal_px + torch.tensor([3.25, -1.5]))
-    at = replace(at, cameras=cameras)
-    assert at.points is not None
-    seen = cameras.project(at.points.xyz_world)[0][at.points.camera_index, at.points.point_index]
-    at = replace(at, points=replace(at.points, uv_px=seen))
-    with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
-        easy = stream.Slot(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7, True)
-        mirrored = scenes._with_hardships(at, easy).scene
-    assert mirrored.points is not None
-    rotation = mirrored.cameras.T_world_camera[:, :, :3]
-    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(6))
-    uv, depth = mirrored.cameras.project(mirrored.points.xyz_world)
-    own = mirrored.points.camera_index, mirrored.points.point_index
-    torch.testing.assert_close(uv[own], mirrored.points.uv_px, atol=1e-3, rtol=0)
-    torch.testing.assert_close(depth, cameras.project(at.points.xyz_world)[1])
-    width = float(cameras.size_px[0, 0])
-    torch.testing.assert_close(mirrored.points.uv_px[:, 0], width - at.points.uv_px[:, 0])
-    assert torch.equal(mirrored.photographs[2], at.photographs[2].flip(1))
-    again = stream.mirrored(mirrored)
-    assert again.points is not None
-    torch.testing.assert_close(again.cameras.projection, cameras.projection)
-    torch.testing.assert_close(again.points.xyz_world, at.points.xyz_world)
-
-
-def test_what_stands_before_a_background_is_mirrored_too() -> None:
-    cameras = ball.around()
-    photographs = ball.pictures(cameras)
-    hull = ball.hull_of(cameras, range(24))
-    at = replace(wall.scene(cameras), photographs=photographs, points=None, train=tuple(range(24)), hull=hull)
-    mirrored = stream.mirrored(at)
-    assert mirrored.hull is not None
-    across = torch.tensor([-1.0, 1.0, 1.0])
-    outwards = F.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)))
-    assert mirrored.hull.contains(across * (ball.CENTRE + 0.99 * ball.RADIUS * outwards)).all()
-    assert not mirrored.hull.contains(across * (ball.CENTRE + 2 * ball.RADIUS * outwards)).any()
 
 
 def test_a_turned_scene_has_the_same_views_of_itself() -> None:
@@ -270,22 +219,6 @@ def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(5 < point["psnr"]["wall"] < 60 for point in points)
 
 
-def test_less_than_all_that_was_learned_is_handed_on() -> None:
-    at = wall.scene(wall.cameras(5), (1, 3))
-    one, other = (Pretrainer(SMALL, Walls(), at, 0, CPU, mixing) for mixing in (1.0, 0.25))
-    first = {name: value.clone() for name, value in one.network.state_dict().items()}
-    for learner in (one, other):
-        learner.step(Budget(steps=2))
-    learned, mixed = one.handed_on().state_dict(), other.handed_on().state_dict()
-    assert any(not torch.equal(learned[name], value) for name, value in first.items())
-    for name, value in first.items():
-        torch.testing.assert_close(learned[name], other.network.state_dict()[name])
-        torch.testing.assert_close(mixed[name], value + 0.25 * (learned[name] - value))
-    (shown,) = other.views([at.cameras[1]])
-    torch.testing.assert_close(shown.colour, Renderer(other.handed_on(), at, SMALL, CPU)(at.cameras[1]).colour)
-    assert other.network.training
-
-
 def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
     scene = wall.scene(wall.cameras(4))
     trainer, file = Trainer(SMALL, scene, 1, CPU), tmp_path / "w.safetensors"
@@ -323,9 +256,6 @@ def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(RunError, match="--resume"):
         pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
     pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=3), device="cpu", resume=True), QUIET)
-    with pytest.raises(RunError, match="--mixing is 0"):
-        pretrain_command(Pretrain(tmp_path / "new", length=Length(steps=2), device="cpu", mixing=0.0), QUIET)
-    assert not (tmp_path / "new").exists()
     points = json.loads((tmp_path / "out" / "validation.json").read_text())
     assert [point["step"] for point in points] == [2, 3]
     read_weights(tmp_path / "out" / "weights.safetensors", Network(SMALL.network))

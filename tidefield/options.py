@@ -120,9 +120,6 @@ class Pretrain:
     length: OmitArgPrefixes[Length] = Length()
     seed: int = 0
     """Of the weights, the scenes and their order."""
-    mixing: float = 1.0
-    """How far the weights that are handed on lie from the random ones to the learned ones, 0 to 1: after a short
-    training on few scenes, less than all the way keeps what learning from these has harmed for others."""
     device: Device = "auto"
     resume: bool = False
     """Go on with what is in the folder."""

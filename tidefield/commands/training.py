@@ -62,11 +62,9 @@ def train(options: Train, console: Console) -> None:
 def pretrain(options: Pretrain, console: Console) -> None:
     """See `tidefield pretrain --help`."""
     from tidefield.train import pretrain as across
-    from tidefield.train.stream import WIDTHS, WIDTHS_WHOLE, Stream
+    from tidefield.train.stream import Stream
 
     budget, folder, config = budget_of(options.length), options.out, PRESETS[options.preset]
-    if not 0 < options.mixing <= 1:
-        raise RunError(f"--mixing is {options.mixing}: expected more than 0 and at most 1; 1 hands on what was learned")
     occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     device = across.join(choose_device(options.device))  # none gets further, and writes, before all have looked
     if occupied:
@@ -76,18 +74,17 @@ def pretrain(options: Pretrain, console: Console) -> None:
     if across.together() and budget.steps is None:
         raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    widths, seed = WIDTHS if config.train.crop_px else WIDTHS_WHOLE, across.own_seed(options.seed)
-    with Stream(folder / "scenes", options.real, seed, device, widths) as stream:
+    with Stream(folder / "scenes", options.real, across.own_seed(options.seed), device) as stream:
         shown = next(iter(validation.scenes.values()))
-        learner = across.Pretrainer(config, stream, shown, options.seed, device, options.mixing)
+        learner = across.Pretrainer(config, stream, shown, options.seed, device)
         if options.resume:
             learner.resume(folder)
         finished = train_loop(learner, folder, budget, Display(console), validation)
     if learner.leads:
         done, real = learner.progress, [scene.resolve().name for scene in options.real]
         about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **stamp()}
-        about |= {"mixing": options.mixing, "processes": across.processes(), "validation": validation.points}
-        write_weights(folder / WEIGHTS_FILE, learner.handed_on(), config, about)
+        about["processes"] = across.processes()
+        write_weights(folder / WEIGHTS_FILE, learner.network, config, {**about, "validation": validation.points})
     _end(learner.progress, finished, folder, console)
 
 

@@ -6,7 +6,6 @@ Under `torchrun` every process draws scenes of its own, and all learn from the m
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ VIEWS = {4: 0.2, 5: 0.35, 6: 0.2, 8: 0.15, 10: 0.06, 12: 0.04}
 LEAST_ERROR = 1e-5
 """Mean squared error (50 dB) below which a batch counts less and less."""
 VALIDATION_FILE = "validation.json"
-VALIDATION_STEPS = 250
+VALIDATION_STEPS = 500
 VALIDATION_WIDTH = 224
 
 
@@ -96,18 +95,14 @@ class Pretrainer(Learner):
         shown: a scene for pictures; nothing is learned from it.
         seed: of weights and batches.
         device: where to compute.
-        mixing: how far the weights that are handed on lie from the random ones to the learned ones.
     """
 
     network: Network
 
-    def __init__(
-        self, config: Config, stream: Source, shown: Scene, seed: int, device: torch.device, mixing: float = 1.0
-    ) -> None:
+    def __init__(self, config: Config, stream: Source, shown: Scene, seed: int, device: torch.device) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = Network(config.network).to(device)
-        self.random, self.mixing = copy.deepcopy(network), mixing
         self.config, self.stream, self.seed = config, stream, own_seed(seed)
         super().__init__(network, groups_of(network, config.train), shown, self.seed, device, (0.9, 0.99), 1e-12)
         objective = Objective(network, config.train)
@@ -134,21 +129,8 @@ class Pretrainer(Learner):
         # (trees, brighton_beach) have a hundred times the weight of bare mud, and nothing is learned from it.
         return loss / (error.detach() + LEAST_ERROR), error
 
-    @torch.no_grad()
-    def handed_on(self) -> Network:
-        """The network on the straight line from the random weights to the learned ones, in evaluation mode.
-
-        What learning from few scenes has harmed for others is mended long before what it brought is lost (Wortsman et
-        al., 2022, "Robust fine-tuning of zero-shot models", eq. 1, there between weights that were trained elsewhere
-        and fine-tuned ones; here the former are random ones, from which a network of this kind renders well already).
-        """
-        network = copy.deepcopy(self.network).eval()
-        for value, first in zip(network.parameters(), self.random.parameters(), strict=True):
-            value.copy_(first.lerp(value, self.mixing))
-        return network
-
     def renderer(self) -> Render:
-        return Renderer(self.handed_on(), self.scene, self.config, self.device)
+        return Renderer(self.network, self.scene, self.config, self.device)
 
     def agreed(self, stop: bool) -> bool:
         if not together():
@@ -182,11 +164,13 @@ class Validation:
         if not learner.leads or (step % VALIDATION_STEPS and share < 1):
             return
         assert isinstance(learner, Pretrainer)
-        network, psnr = learner.handed_on(), {}
+        learner.network.eval()
+        psnr = {}
         for kind, curve in self.curves.items():
-            render = Renderer(network, self.scenes[kind], learner.config, learner.device)
+            render = Renderer(learner.network, self.scenes[kind], learner.config, learner.device)
             curve.add(learner.progress.seconds, [render(camera) for camera in curve.cameras])
             psnr[kind] = curve.points[-1][1]
+        learner.network.train()
         self.points = [point for point in self.points if point["step"] < step]
         self.points.append({"step": step, "seconds": learner.progress.seconds, "psnr": psnr})
         with completed_file(self.file, overwrite=True) as partial:

@@ -2,7 +2,7 @@
 
 Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
 next, which another process has made meanwhile. Procedural or real, a scene comes with hardships of its own: few sparse
-points, photographs that are a little off, and exposures that are not quite evened out; and half of them are mirrored.
+points, photographs that are a little off, and exposures that are not quite evened out.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tidefield.data.batches import Surfaces
-from tidefield.data.hull import visual_hull
-from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.data.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
@@ -34,14 +32,12 @@ from tidefield.geometry.cameras import Cameras
 
 AT_HAND = 8
 """Scenes at a time."""
-STEPS_EACH = 100
+STEPS_EACH = 200
 """Steps after which the oldest makes room."""
 REAL_SHARE = 0.5
 """Of the scenes, where there are real ones."""
-WIDTHS = (256, 400, 800)
-"""Of real scenes' photographs."""
-WIDTHS_WHOLE = (256, 400)
-"""The same where photographs are encoded whole, and a step needs memory for nearly all of a scene's at once."""
+WIDTHS = (256, 400)
+"""Of real scenes' photographs: each is there at both."""
 MISPOSED_DEG = 0.6
 SPARSE_SHARE = 0.25
 """Of the scenes with few points, so that depth is learned from what the views see, too."""
@@ -59,8 +55,6 @@ UNEVEN = 0.01, 0.08
 """Standard deviations of the logarithms of these: one for each of these scenes."""
 RECOLOURED_SHARE = 0.5
 """Of the scenes with their colours' channels in a random order, so that little is learned of mud being brown."""
-MIRRORED_SHARE = 0.5
-"""Of the scenes seen in a mirror, which makes two of each real one."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,6 @@ class Slot:
         uneven: standard deviation of the logarithms of its exposures' errors.
         channels: the order of its colours' channels.
         seed: of what is random in this.
-        mirrored: whether it is seen in a mirror.
     """
 
     recipe: Recipe | None
@@ -102,7 +95,6 @@ class Slot:
     uneven: float
     channels: tuple[int, ...]
     seed: int
-    mirrored: bool
 
 
 @dataclass(frozen=True)
@@ -131,7 +123,6 @@ def slot(seed: int, number: int, real_share: float) -> Slot:
         uneven=float(random.uniform(*UNEVEN)) if uneven else 0.0,
         channels=tuple(random.permutation(3).tolist()) if recoloured else (0, 1, 2),
         seed=int(random.integers(1 << 31)),
-        mirrored=bool(random.random() < MIRRORED_SHARE),
     )
 
 
@@ -199,32 +190,6 @@ def turned(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
     return replace(drawn, cameras=replace(drawn.cameras, T_world_camera=turn.to(pose) @ pose))
 
 
-def mirrored(scene: Scene) -> Scene:
-    """The scene in a mirror across x = 0 of the world: photographs left for right, and cameras and points to match."""
-    world = torch.tensor([-1.0, 1.0, 1.0])
-    cameras, points, taken = scene.cameras, scene.points, scene.photographs
-    pose = world[:, None] * cameras.T_world_camera
-    pose[:, :, 0] *= -1  # a rotation again; the photograph's x axis, too, points the other way now
-    principal = cameras.principal_px * torch.tensor([-1.0, 1.0])
-    principal[:, 0] += cameras.size_px[:, 0]
-    if points is not None:
-        uv = points.uv_px * torch.tensor([-1.0, 1.0])
-        uv[:, 0] += cameras.size_px[points.camera_index.long(), 0]
-        points = replace(points, xyz_world=world * points.xyz_world, uv_px=uv)
-    colours = tuple(colour.flip(1) for colour in taken.colours)
-    alphas = tuple(None if alpha is None else alpha.flip(1) for alpha in taken.alphas)
-    cameras = replace(cameras, T_world_camera=pose, principal_px=principal)
-    photographs = Photographs(colours, alphas)
-    return replace(
-        scene,
-        cameras=cameras,
-        photographs=photographs,
-        points=points,
-        origin_world=world.to(scene.origin_world) * scene.origin_world,
-        hull=None if scene.hull is None else visual_hull(cameras, photographs, scene.train),
-    )
-
-
 class Stream:
     """Draws scenes.
 
@@ -233,14 +198,11 @@ class Stream:
         real: folders of scenes of which only the training photographs are learned from.
         seed: of the procedural ones.
         device: where the network is.
-        widths: of the real ones' photographs; each is there at all of them.
     """
 
-    def __init__(
-        self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, widths: Sequence[int] = WIDTHS
-    ) -> None:
+    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
         self.folder, self.seed, self.device = folder, seed, device
-        self.real = [load_scene(path, width=width) for path in real for width in widths]
+        self.real = [load_scene(path, width=width) for path in real for width in WIDTHS]
         self.pool: dict[int, Drawn] = {}
         self.coming: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
@@ -293,8 +255,6 @@ class Stream:
 
     def _with_hardships(self, scene: Scene, own: Slot) -> Drawn:
         """A scene with what makes it harder; the loss is told of all points that were observed."""
-        if own.mirrored:
-            scene = mirrored(scene)
         random = np.random.default_rng(own.seed)
         off = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
         light = torch.from_numpy(np.exp(random.normal(scale=own.uneven, size=(len(scene.names), 1)))).float()
