@@ -105,6 +105,11 @@ def test_torch_is_not_imported_with_what_answers_help(name: str):
     assert not [m for m in imported_with(name) if m.split(".")[0] == "torch"]
 
 
+@pytest.mark.parametrize("command", ["views", "training"])
+def test_what_renders_and_trains_does_without_structure_from_motion(command: str):
+    assert not [m for m in imported_with(f"tidefield.commands.{command}") if m.split(".")[0] == "pycolmap"]
+
+
 def test_modules_of_the_same_folder_do_not_import_each_other_in_circles():
     open_, done = [], set()
 

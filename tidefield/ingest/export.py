@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, UInt8
 
+from tidefield.data.cloud import write_cloud
 from tidefield.data.scene import every_eighth
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens, lens_from_colmap
@@ -24,7 +25,6 @@ CLOUD_FILE = "sparse_pc.ply"
 
 # nerfstudio computes in float32 from the beginning, which tells apart 1 mm up to so many metres from the origin.
 _FARTHEST = 10_000.0
-_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 
 
 def write_transforms(
@@ -98,14 +98,3 @@ def _points(model: pycolmap.Reconstruction) -> tuple[Float64[np.ndarray, "P 3"],
     xyz = np.array([point.xyz for point in points], dtype=np.float64)
     rgb = np.array([point.color for point in points], dtype=np.uint8)
     return xyz.reshape(-1, 3), rgb.reshape(-1, 3)
-
-
-def write_cloud(path: Path, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], overwrite: bool) -> None:
-    """A binary PLY file, as open3d and thereby nerfstudio reads it."""
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
-    header += [f"property float {axis}" for axis in "xyz"]
-    header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    vertices = np.empty(len(xyz), _VERTEX)
-    vertices["xyz"], vertices["rgb"] = xyz, rgb
-    with completed_file(path, overwrite=overwrite) as partial:
-        partial.write_bytes("\n".join([*header, "end_header\n"]).encode() + vertices.tobytes())

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from PIL import Image
 
+from tidefield.data.cloud import write_cloud
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
-from tidefield.ingest.export import write_cloud
 
 TRANSFORMS_FILE, CLOUD_FILE = "transforms.json", "points.ply"
 
