@@ -60,7 +60,7 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
 
 
 def card(weights: Path, results: Results) -> str:
-    """The whole card."""
+    """The whole card; the first of the results' methods is what the weights are called there."""
     told = about(weights)
     unknown = [name for name in told["real"] if name not in LICENCES]
     if unknown:
