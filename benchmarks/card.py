@@ -28,6 +28,12 @@ from tidefield.train.weights import about, sha256
 OWN = {"swift": ZERO_SHOT, "paper": PAPER_ZERO_SHOT}
 """By preset, what its weights are called in a comparison."""
 PEERS = ("nerfacto", *UNTRAINED)
+BY_DIRECTION = (
+    "Neighbours are, as printed, the photographs that look in the most similar directions, wherever they were taken. "
+    "Of a survey that looks straight down they may not show the place at all, and the view then has one colour: on "
+    "surveys, use `swift`, which chooses them by what they show."
+)
+"""Told of presets that do so."""
 LICENCES = {
     "brighton_beach": "BSD-2-Clause, (c) 2017 Piero Toffanin",
     "turin_lot": "MIT, from the repository vinstray/i-sfm",
@@ -78,6 +84,7 @@ def card(weights: Path, results: Results) -> str:
         "Views of scenes that nothing was trained on (`--zero-shot`), and a start for `tidefield train`. For drone "
         "photographs of tidal flats that overlap well and have sparse points. Where few photographs see a place, where "
         "things move, and far from where photographs were taken, views are guesses: do not measure in them.",
+        *([BY_DIRECTION] if told["config"]["train"]["neighbours"] == "direction" else []),
         "## What they were trained on",
         "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
         f"moving water and wrong poses{real}",

@@ -18,7 +18,7 @@ from test_training import SMALL
 from torch.nn import functional as F
 
 from tidefield.commands.training import pretrain as pretrain_command
-from tidefield.config import SWIFT
+from tidefield.config import PRESETS, SWIFT
 from tidefield.data.batches import Surfaces
 from tidefield.data.synthetic import Flight
 from tidefield.errors import RunError
@@ -28,7 +28,7 @@ from tidefield.train import pretrain, stream
 from tidefield.train.loop import Budget, Trainer
 from tidefield.train.pretrain import Pretrainer, Validation
 from tidefield.train.stream import Drawn, Recipe, Stream, recipe
-from tidefield.train.weights import read_weights, sha256, write_weights
+from tidefield.train.weights import SHIPPED, read_weights, sha256, write_weights
 
 CPU = torch.device("cpu")
 QUIET = Console(quiet=True)
@@ -244,6 +244,17 @@ def test_wrong_weights_are_told(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(RunError, match="damaged"):
         read_weights(file, Network(SMALL.network))
+
+
+def test_what_ships_fits_its_preset_and_its_card() -> None:
+    files = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
+    assert set(files) == set(PRESETS)
+    for preset, file in files.items():
+        read_weights(file, Network(PRESETS[preset].network))
+        card = file.with_suffix(".md").read_text(encoding="utf-8")
+        assert card.startswith(f"# Weights of the preset {preset}\n")
+        assert sha256(file) in card
+    assert sum(file.stat().st_size for file in files.values()) < 20e6
 
 
 def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

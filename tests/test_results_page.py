@@ -12,7 +12,7 @@ from benchmarks.begun import by_length, length_tables
 from tidefield.compare import record
 from tidefield.compare.results import read_figures
 from tidefield.compare.run import METHODS
-from tidefield.config import SWIFT
+from tidefield.config import PAPER, SWIFT
 from tidefield.errors import RunError
 from tidefield.model.network import Network
 from tidefield.train.evaluate import NAMES
@@ -206,6 +206,18 @@ def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
         assert line in text.splitlines(), line
     assert f"SHA-256 `{sha256(file)}`" in text
     assert "in 2.0 hours" in text
+    assert card.BY_DIRECTION not in text
     write_weights(file, Network(SWIFT.network), SWIFT, {**told, "real": ["elsewhere"], **record.stamp()})
     with pytest.raises(RunError, match="learned from elsewhere"):
         card.write_card(file, [tmp_path / "comparison.json"])
+
+
+def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
+    file = tmp_path / "paper.safetensors"
+    told = {"steps": 10, "seconds": 60.0, "seed": 0, "processes": 1, "real": [], "validation": []}
+    write_weights(file, Network(PAPER.network), PAPER, {**told, **record.stamp()})
+    keep_result(tmp_path / "comparison.json", "swindale", "paper-zero-shot", 20.5)
+    keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
+    text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()
+    assert card.BY_DIRECTION in text
+    assert "| swindale | 20.50 | - | - | - | - |" in text.splitlines()
