@@ -25,9 +25,16 @@ def by_length(compared: Results, begun: Sequence[Results]) -> ByLength:
             if method == ZERO_SHOT:
                 found.setdefault((False, 0.0, ZERO_SHOT), {})[scene] = result
             elif method == WHOLE and minutes is not None:
-                name = f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
-                found.setdefault((scratch, minutes, f"{name} from scratch" if scratch else name), {})[scene] = result
+                found.setdefault((scratch, minutes, length_of(result)), {})[scene] = result
     return {name: scenes for (_, _, name), scenes in sorted(found.items(), key=lambda item: item[0])}
+
+
+def length_of(result: Result) -> str:
+    """What the length of a training is called, if it was trained for so many minutes."""
+    settings = result.process["settings"]
+    minutes = settings["minutes"]
+    name = f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
+    return f"{name} from scratch" if settings.get("from_scratch") else name
 
 
 def length_tables(lengths: ByLength) -> list[Table]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.bars import SCENES, Bar, Kept, judge
-from benchmarks.begun import by_length, length_tables
+from benchmarks.begun import by_length, length_of, length_tables
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_tables, variants, verdicts
@@ -52,14 +52,14 @@ def write_page(
 
 def page(compared: Results, ablated: Results, begun: Sequence[Results], kept: Kept) -> str:
     """The whole page."""
-    trainings, lengths = (compared, ablated, *begun), by_length(compared, begun)
+    records, lengths = _records(compared, ablated, begun, kept), by_length(compared, begun)
     return (
         "\n\n".join(
             [
                 "# Results",
                 "`make bench ARGS=table` wrote this page from what `tidefield compare`, `tidefield ablate`, `speed`, "
                 "`frames` and `memory` left in [docs/measured](measured); nothing is typed by hand.",
-                "\n".join(f"- {line}" for line in _circumstances(trainings, kept)),
+                "\n".join(f"- {line}" for line in _circumstances(records)),
                 "## What was aimed at",
                 _bar_table(judge(compared, kept, lengths)).markdown(),
                 "## Methods on the same photographs, split, resolution, machine and budget",
@@ -79,7 +79,7 @@ def page(compared: Results, ablated: Results, begun: Sequence[Results], kept: Ke
                 "## A large frame",
                 _frame(kept.memory),
                 "## Commands",
-                "\n".join(f"    {command}" for command in _commands(trainings, kept)),
+                "\n".join(f"    {command}" for command in dict.fromkeys(record["command"] for _, record in records)),
             ]
         )
         + "\n"
@@ -92,31 +92,36 @@ def _narrowed(results: Results) -> Results:
     return Results(results.scenes, there, results.by)
 
 
-def _records(trainings: Sequence[Results], kept: Kept) -> list[Mapping[str, Any]]:
-    """Everything with a date, a machine and a command."""
-    processes = [
-        result.process[step]
-        for results in trainings
-        for result in results.by.values()
-        for step in ("train", "evaluate")
-        if step in result.process
+def _records(
+    compared: Results, ablated: Results, begun: Sequence[Results], kept: Kept
+) -> list[tuple[str, Mapping[str, Any]]]:
+    """Everything with a date, a machine and a command, and what it is called."""
+    named = [
+        *((method, result) for (_, method), result in compared.by.items()),
+        *(("ablation", result) for result in ablated.by.values()),
+        *((length_of(result), result) for results in begun for result in results.by.values()),
     ]
-    return [record for record in (*processes, *vars(kept).values()) if record]
+    steps = [(name, result.process.get(step)) for name, result in named for step in ("train", "evaluate")]
+    return [(name, record) for name, record in (*vars(kept).items(), *steps) if record]
 
 
-def _circumstances(trainings: Sequence[Results], kept: Kept) -> list[str]:
-    records = _records(trainings, kept)
-    machines, dates = [], sorted({record["date"] for record in records})
-    for machine in (record["machine"] for record in records):
+def _circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    machines: dict[str, list[str]] = {}
+    dates = sorted({record["date"] for _, record in records})
+    for name, record in records:
+        machine = record["machine"]
         text = (
             f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
             f"{machine['system']}, Python {machine['python']}, torch {machine['torch']}"
         )
-        machines += [] if text in machines else [text]
-    versions = sorted({record["version"] for record in records})
+        machines.setdefault(text, []).append(name)
+    versions = sorted({record["version"] for _, record in records})
     measured = " to ".join(dict.fromkeys([dates[0], dates[-1]])) if dates else "at an unknown date"
+    lines = [f"Machine: {text}." for text in machines]
+    if len(machines) > 1:
+        lines = [f"Machine: {text}: {', '.join(dict.fromkeys(names))}." for text, names in machines.items()]
     return [
-        *(f"Machine: {machine}." for machine in machines),
+        *lines,
         f"Measured {measured} with Tidefield {', '.join(versions) or 'of unknown version'}; written {stamp()['date']}.",
     ]
 
@@ -223,13 +228,3 @@ def _frame(memory: Mapping[str, Any] | None) -> str:
         f"encoding included ({memory['preset']}, {memory['device']}): {memory['peak_memory_bytes'] / 1e9:.2f} GB, "
         f"{memory['seconds']:.0f} s."
     )
-
-
-def _commands(trainings: Sequence[Results], kept: Kept) -> list[str]:
-    """Each once."""
-    found = [record["command"] for record in vars(kept).values() if record]
-    for results in trainings:
-        for result in results.by.values():
-            for step in ("train", "evaluate"):
-                found += [result.process[step]["command"]] if step in result.process else []
-    return list(dict.fromkeys(found))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+import torch
 
 from benchmarks import bars, card, table
 from benchmarks.begun import by_length, length_tables
@@ -177,6 +178,25 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     assert "### FLIP" in text
     with pytest.raises(RunError, match="no results"):
         table.write_page([], [ablation.with_name("none.json")], [], tmp_path / "docs", tmp_path / "other.md")
+
+
+def test_of_several_machines_the_page_says_what_each_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, file, minute = record.stamp(), tmp_path / "comparison.json", tmp_path / "minute.json"
+    keep_result(file, "swindale", "tidefield", 24.0)
+    keep_result(file, "swindale", "nerfacto", 21.0)
+    out = tmp_path / "results.md"
+    table.write_page([file], [], [minute], tmp_path, out)
+    machine = next(line for line in out.read_text().splitlines() if line.startswith("- Machine: "))
+    assert machine.endswith(f"torch {torch.__version__}.")
+    other = here | {"machine": here["machine"] | {"processor": "Another"}}
+    monkeypatch.setattr(record, "stamp", lambda: other)
+    keep_result(minute, "swindale", "tidefield", 23.5, minutes=1)
+    table.write_page([file], [], [minute], tmp_path, out)
+    machines = [line for line in out.read_text().splitlines() if line.startswith("- Machine: ")]
+    assert machines == [
+        machine.removesuffix(".") + ": tidefield, nerfacto.",
+        machine.removesuffix(".").replace(here["machine"]["processor"], "Another") + ": 1 min.",
+    ]
 
 
 def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
