@@ -19,7 +19,7 @@ from tidefield.cores import spin_briefly
 from tidefield.errors import RunError, TidefieldError
 
 MEASURED = Path("docs/measured")
-COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper"))
+COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
 BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "scratch"))
 DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
