@@ -21,7 +21,7 @@ from tidefield.errors import RunError, TidefieldError
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
-BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "scratch"))
+BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
 DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
 a name, it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
 
