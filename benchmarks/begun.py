@@ -30,10 +30,13 @@ def by_length(compared: Results, begun: Sequence[Results]) -> ByLength:
 
 
 def length_of(result: Result) -> str:
-    """What the length of a training is called, if it was trained for so many minutes."""
-    settings = result.process["settings"]
-    minutes = settings["minutes"]
-    name = f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
+    """What the length of a training is called."""
+    settings = result.process.get("settings", {})
+    minutes = settings.get("minutes")
+    if minutes is None:
+        name = f"{settings.get('steps')} steps"
+    else:
+        name = f"{60 * minutes:.0f} s" if minutes < 1 else f"{minutes:g} min"
     return f"{name} from scratch" if settings.get("from_scratch") else name
 
 

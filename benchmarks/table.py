@@ -106,7 +106,7 @@ def _records(
 
 
 def _circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
-    machines: dict[str, list[str]] = {}
+    machines: dict[str, dict[str, None]] = {}
     dates = sorted({record["date"] for _, record in records})
     for name, record in records:
         machine = record["machine"]
@@ -114,14 +114,15 @@ def _circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str
             f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
             f"{machine['system']}, Python {machine['python']}, torch {machine['torch']}"
         )
-        machines.setdefault(text, []).append(name)
+        machines.setdefault(text, {})[name] = None
     versions = sorted({record["version"] for _, record in records})
     measured = " to ".join(dict.fromkeys([dates[0], dates[-1]])) if dates else "at an unknown date"
-    lines = [f"Machine: {text}." for text in machines]
-    if len(machines) > 1:
-        lines = [f"Machine: {text}: {', '.join(dict.fromkeys(names))}." for text, names in machines.items()]
+    several = len(machines) > 1
     return [
-        *lines,
+        *(
+            f"Machine: {': '.join([text, ', '.join(names)] if several else [text])}."
+            for text, names in machines.items()
+        ),
         f"Measured {measured} with Tidefield {', '.join(versions) or 'of unknown version'}; written {stamp()['date']}.",
     ]
 

@@ -27,8 +27,9 @@ def keep_result(
     method: str,
     psnr: float,
     peak: int = 2_000_000_000,
-    minutes: float = 10,
+    minutes: float | None = 10,
     from_scratch: bool = False,
+    steps: int | None = None,
 ) -> None:
     """Add one to what is in the file, in place of an older one."""
     mean: dict = dict.fromkeys(NAMES, 0.1)
@@ -38,7 +39,7 @@ def keep_result(
     evaluation |= {"rays_per_second": 5e4, "configuration": {}}
     step = {"command": f"tidefield evaluate RUN {method}", "seconds": 1.0, "peak_memory_bytes": peak}
     process = {
-        "settings": {"minutes": minutes, "width": 400, "device": "cpu", "from_scratch": from_scratch},
+        "settings": {"minutes": minutes, "steps": steps, "width": 400, "device": "cpu", "from_scratch": from_scratch},
         "evaluate": step | record.stamp(),
     }
     if method not in bars.FLOORS:
@@ -58,6 +59,12 @@ def keep_all(file: Path, psnr: Mapping[str, float], others: Mapping[str, float] 
     for scene in bars.SCENES:
         for method, value in {"tidefield": psnr.get(scene, 27.0), **others}.items():
             keep_result(file, scene, method, value)
+
+
+def move_to_another_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = record.stamp()
+    other = here | {"machine": here["machine"] | {"processor": "Another"}}
+    monkeypatch.setattr(record, "stamp", lambda: other)
 
 
 def judged(file: Path) -> dict[str, bars.Bar]:
@@ -188,8 +195,7 @@ def test_of_several_machines_the_page_says_what_each_measured(tmp_path: Path, mo
     table.write_page([file], [], [minute], tmp_path, out)
     machine = next(line for line in out.read_text().splitlines() if line.startswith("- Machine: "))
     assert machine.endswith(f"torch {torch.__version__}.")
-    other = here | {"machine": here["machine"] | {"processor": "Another"}}
-    monkeypatch.setattr(record, "stamp", lambda: other)
+    move_to_another_machine(monkeypatch)
     keep_result(minute, "swindale", "tidefield", 23.5, minutes=1)
     table.write_page([file], [], [minute], tmp_path, out)
     machines = [line for line in out.read_text().splitlines() if line.startswith("- Machine: ")]
@@ -197,6 +203,15 @@ def test_of_several_machines_the_page_says_what_each_measured(tmp_path: Path, mo
         machine.removesuffix(".") + ": tidefield, nerfacto.",
         machine.removesuffix(".").replace(here["machine"]["processor"], "Another") + ": 1 min.",
     ]
+
+
+def test_a_shorter_comparison_may_count_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, steps = tmp_path / "comparison.json", tmp_path / "steps.json"
+    keep_result(file, "swindale", "tidefield", 24.0)
+    move_to_another_machine(monkeypatch)
+    keep_result(steps, "swindale", "tidefield", 23.5, minutes=None, steps=2000)
+    table.write_page([file], [], [steps], tmp_path, tmp_path / "results.md")
+    assert ": 2000 steps." in (tmp_path / "results.md").read_text()
 
 
 def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
