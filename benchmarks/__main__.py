@@ -75,7 +75,7 @@ def speed(
 def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> Any:
     """The scene that is asked for, or the built-in one, made small."""
     from tidefield.data.load import load_scene
-    from tidefield.data.synthetic import make_survey, write_survey
+    from tidefield.synthetic import make_survey, write_survey
 
     if folder is not None:
         return load_scene(folder, width=width)

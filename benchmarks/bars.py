@@ -16,7 +16,7 @@ SURVEYS = ("caliterra", "swindale", "turin_lot", "brighton_beach")
 """Where we are compared with blending, which is good there."""
 SCENES = (*TABLE_3, *SURVEYS, "fern", "lego")
 """Where we are compared with Nerfacto."""
-FLOORS = ("plane-sweep", "sparse-depth")
+UNTRAINED = ("plane-sweep", "sparse-depth")
 UNSEEN = ("caliterra", "swindale")
 """Which the shipped weights have never learned from."""
 BEGUN = (*UNSEEN, "turin_lot", "fern")
@@ -86,8 +86,8 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
             for of in QUALITIES
         ]
 
-    blending = gain("psnr_seen_cc", FLOORS, SURVEYS)
-    structure = gain("ssim_seen_cc", FLOORS, SURVEYS)
+    blending = gain("psnr_seen_cc", UNTRAINED, SURVEYS)
+    structure = gain("ssim_seen_cc", UNTRAINED, SURVEYS)
     paper = gain("psnr_seen_cc", ("paper",), SURVEYS)
     peer = ("nerfacto",)
     return [
@@ -98,7 +98,7 @@ def judge(results: Results, kept: Kept, lengths: ByLength) -> list[Bar]:
         *ahead("tidefield", peer, SCENES, "{} Nerfacto's on each scene"),
         _in_the_mean("PSNR above Nerfacto's, doubly seen pixels", gain("psnr_seen", peer, SCENES), AHEAD_DB),
         *ahead("zero-shot", peer, UNSEEN, "Zero-shot, {} Nerfacto's where nothing was learned"),
-        *ahead("zero-shot", FLOORS, SCENES, "Zero-shot, {} the better floor on each scene"),
+        *ahead("zero-shot", UNTRAINED, SCENES, "Zero-shot, {} the better floor on each scene"),
         *_of_lengths(lengths),
         *(_as_fast(results, kept.speed, other) for other in TIMES_AS_FAST),
         *_frame_times(kept.frames),

@@ -30,16 +30,15 @@ from torch.nn import functional as F
 
 from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
 from tidefield.config import PRESETS
-from tidefield.data.batches import choose_neighbours
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
-from tidefield.data.neighbours import Neighbours
+from tidefield.data.neighbours import Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import surface_points
 from tidefield.geometry.cameras import Cameras
 from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render, Rendering
-from tidefield.products.trajectory import make_trajectory
+from tidefield.render.trajectory import make_trajectory
 from tidefield.train.weights import given_or_shipped
 
 FRAMES_FILE = "frames.json"

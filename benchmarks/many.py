@@ -50,7 +50,7 @@ def _flown_later(exif: Image.Exif, copy: int) -> None:
 
 def _copies(source: Path, folder: Path, count: int) -> None:
     """Reduced photographs, and gps.csv with the copies' places side by side."""
-    from tidefield.ingest.reading.photographs import read_survey
+    from tidefield.survey.io.photographs import read_survey
 
     folder.mkdir(parents=True)
     photographs = [photograph for photograph in read_survey(source).photographs if photograph.position is not None]

@@ -80,9 +80,9 @@ def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
 
     from tidefield.config import PRESETS
     from tidefield.data.load import load_scene
-    from tidefield.data.synthetic import make_survey, write_survey
+    from tidefield.synthetic import make_survey, write_survey
     from tidefield.train.checkpoint import Run, write_run
-    from tidefield.train.loop import Trainer
+    from tidefield.train.loop import SceneTrainer
 
     folder = work / "scene"
     survey = make_survey("river_mouths", seed=7, views=photographs, width=min(width, SURVEY_WIDTH))
@@ -94,7 +94,7 @@ def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
     # Readers fit the cameras to photographs of another size than the model says. No weight depends on their size, so
     # small ones will do here.
     scene = load_scene(folder, width=min(width, 64))
-    Trainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
+    SceneTrainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
     write_run(work / "run", Run(folder.resolve(), None, 0, PRESETS[preset]))
     return scene.names[scene.test[-1]]
 

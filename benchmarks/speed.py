@@ -26,7 +26,7 @@ from tidefield.config import Config
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.renderer import Renderer
-from tidefield.train.loop import Budget, Trainer
+from tidefield.train.loop import Budget, SceneTrainer
 
 SQUARE_PX = 32
 """Renderings are timed on whole squares of so many pixels, as tiles are."""
@@ -93,7 +93,7 @@ def measure_speed(
     ceilings = measure_ceilings(device, effort.seconds / 8)
     speeds = {}
     for preset, config in configs.items():
-        trainer = Trainer(config, scene, 0, device)
+        trainer = SceneTrainer(config, scene, 0, device)
         say(f"{preset}: training ...")
         training = measure_training(trainer, effort)
         say(f"{preset}: rendering ...")
@@ -113,7 +113,7 @@ def measure_speed(
     }
 
 
-def measure_training(trainer: Trainer, effort: Effort) -> Pace:
+def measure_training(trainer: SceneTrainer, effort: Effort) -> Pace:
     """Steps of training, batches included."""
     device, rays = trainer.device, trainer.rays_per_step
     for index in trainer.scene.train:
@@ -133,7 +133,7 @@ def measure_training(trainer: Trainer, effort: Effort) -> Pace:
     )
 
 
-def measure_rendering(trainer: Trainer, effort: Effort) -> tuple[Pace, float]:
+def measure_rendering(trainer: SceneTrainer, effort: Effort) -> tuple[Pace, float]:
     """A part of a photograph's camera, and the seconds that encoding one photograph takes."""
     device, scene, network = trainer.device, trainer.scene, trainer.network.eval()
     renderer = Renderer(network, scene, trainer.config, device)

@@ -127,7 +127,7 @@ def _in_turn() -> Iterator[None]:
     def in_turn(tasks: list[Callable[[], Any]], _: torch.device) -> list[Any]:
         return [task() for task in tasks]
 
-    places = ("model.renderer", "train.side_by_side")
+    places = ("model.renderer", "train.parallel_backward")
     with ExitStack() as stack:
         for place in places:
             stack.enter_context(patch(f"tidefield.{place}.in_parallel", in_turn))

@@ -9,20 +9,21 @@ import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from shared_data import SHARED
 
-from tidefield.ingest.reading.photographs import read_survey
-from tidefield.ingest.survey import Photograph, Survey
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.survey import Photograph, Survey
 
-SHARED = Path(__file__).parents[1] / ".." / "shared" / "data" / "photographs"
+PHOTOGRAPHS = SHARED / "photographs"
 BRIGHTON = (46.8426, -91.9946)
 DJI = {"Make": "DJI", "Model": "FC300S"}
 
 
 def real_survey(name: str) -> Path:
     """The folder of a real survey; skips the test where it is not there."""
-    if not (SHARED / name).is_dir():
+    if not (PHOTOGRAPHS / name).is_dir():
         pytest.skip(f"the survey {name} is not on this machine")
-    return (SHARED / name).resolve()
+    return (PHOTOGRAPHS / name).resolve()
 
 
 def texture(size: tuple[int, int], seed: int = 0) -> np.ndarray:

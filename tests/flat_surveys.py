@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.ingest.report import Findings
-from tidefield.ingest.survey import LensPrior, Photograph, Position, Survey
+from tidefield.survey.report import Findings
+from tidefield.survey.survey import LensPrior, Photograph, Position, Survey
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 300.0
 ABOVE = 60.0

@@ -9,7 +9,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.ingest.survey import Control, Mark, Photograph, Position, Survey
+from tidefield.survey.survey import Control, Mark, Photograph, Position, Survey
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 570.0  # of the model's images; photographs are twice as large
 ZOOM = 2
@@ -147,3 +147,26 @@ def in_a_frame_of_its_own(model: pycolmap.Reconstruction, seed: int = 0) -> pyco
     rotation = Rotation.random(rng=generator).as_matrix()
     turned.transform(pycolmap.Sim3d(0.04, pycolmap.Rotation3d(rotation), generator.normal(0, 3, 3)))
     return turned
+
+
+def unlocated_photograph(
+    k: int, latitude: float | None, longitude: float = 0.0, time_s: float | None = None
+) -> Photograph:
+    nan = float("nan")
+    place = None if latitude is None else Position(latitude, longitude, nan, nan, nan, "unknown", "EXIF")
+    return Photograph(
+        path=Path(f"{k:04d}.jpg"),
+        name=f"{k:04d}.jpg",
+        width=400,
+        height=300,
+        orientation=1,
+        camera="",
+        serial="",
+        focal_mm=nan,
+        lens=None,
+        time_s=float(k) if time_s is None else time_s,
+        log_exposure=nan,
+        position=place,
+        relative_altitude_m=nan,
+        gimbal_deg=None,
+    )

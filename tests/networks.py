@@ -7,16 +7,21 @@ import torch
 from torch import Tensor
 
 from tidefield.config import PAPER, SWIFT, EncoderConfig, FieldConfig, NetworkConfig, StageConfig
+from tidefield.data.depth_prior import surface_prior
 from tidefield.data.neighbours import Neighbours
-from tidefield.data.prior import surface_prior
 from tidefield.data.scene import Scene
+from tidefield.model.cache import FeatureCache
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, TileRendering, Tiles
 from tidefield.model.renderer import start_intervals
-from tidefield.model.shelf import FeatureShelf
 from tidefield.model.views import Views
 
 CPU = torch.device("cpu")
+SMALL = replace(
+    SWIFT,
+    network=replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False), views=3),
+    train=replace(SWIFT.train, tiles=1, tile_px=16, crop_px=48),
+)
 FIELD = FieldConfig(levels=4, log2_entries=10, coarsest=4, finest=64)
 SMALL_PAPER = replace(
     PAPER.network,
@@ -63,7 +68,7 @@ def looking(
         return tiles, None, start
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
     presence, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
-    return tiles, FeatureShelf(own, at, CPU).views(Neighbours(neighbours, presence), middle), start
+    return tiles, FeatureCache(own, at, CPU).views(Neighbours(neighbours, presence), middle), start
 
 
 def outputs(rendering: TileRendering) -> list[Tensor]:

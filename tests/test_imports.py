@@ -1,4 +1,4 @@
-"""Imports point downward: geometry <- data <- model <- train, products <- baselines <- commands, cli."""
+"""Imports point downward, from the commands to geometry: RANK below has the order of the folders."""
 
 import ast
 from collections.abc import Iterator
@@ -10,17 +10,19 @@ PACKAGE = Path(__file__).parents[1] / "tidefield"
 RANK = {
     "geometry": 0,
     "data": 1,
-    "ingest": 2,
+    "synthetic": 2,
+    "survey": 2,
     "model": 2,
-    "train": 3,
-    "products": 3,
-    "baselines": 4,
-    "methods": 5,
-    "compare": 5,
-    "commands": 6,
-    "cli": 7,
+    "evaluation": 3,
+    "render": 3,
+    "train": 4,
+    "baselines": 5,
+    "methods": 6,
+    "compare": 7,
+    "commands": 8,
+    "cli": 9,
 }
-FOR_ALL = {"config", "cores", "device", "errors", "files", "meter", "options", "parallel", "variants"}
+FOR_ALL = {"config", "cores", "device", "errors", "files", "progress", "options", "parallel", "variants"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

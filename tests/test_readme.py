@@ -34,7 +34,7 @@ def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyP
     words, called = shlex.split(line), []
     _, module, function = cli.COMMANDS[words[1]]
     monkeypatch.setattr(f"tidefield.commands.{module}.{function}", lambda options, console: called.append(options))
-    monkeypatch.setattr(cli, "_begin", lambda talk: None)
+    monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
     monkeypatch.setattr(sys, "argv", words)
     cli.main()
     assert len(called) == 1
@@ -59,19 +59,6 @@ def test_the_python_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), ModuleType("readme").__dict__)
     assert "torch.Size([48, 64, 3])" in capsys.readouterr().out
-
-
-def test_the_tree_names_every_file_and_no_other() -> None:
-    (tree,) = [block for block in blocks("text") if block.startswith("tidefield/\n")]
-    folders, named = [], set()
-    for line in tree.splitlines():
-        depth, (name, *purpose) = (len(line) - len(line.lstrip())) // 4, line.split()
-        folders[depth:] = [name]
-        if not name.endswith("/"):
-            assert purpose, f"{name} has no purpose"
-            named.add("".join(folders))
-    there = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tidefield").rglob("*.py")}
-    assert named == {path for path in there if not path.endswith("__init__.py")}
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)

@@ -15,7 +15,19 @@ import tyro
 
 from tidefield.cores import spin_briefly
 from tidefield.errors import TidefieldError
-from tidefield.options import Ablate, Baselines, Compare, Demo, Evaluate, Import, Prepare, Pretrain, Render, Talk, Train
+from tidefield.options import (
+    Ablate,
+    Baselines,
+    Compare,
+    Demo,
+    Evaluate,
+    Import,
+    Prepare,
+    Pretrain,
+    Render,
+    Train,
+    Verbosity,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,12 +70,12 @@ def _run() -> None:
         prog="tidefield",
         description="New views of tidal flats from drone photographs.",
     )
-    console = _begin(options.talk)
+    console = _begin(options.verbosity)
     module, function = next((module, name) for asked, module, name in COMMANDS.values() if asked is type(options))
     getattr(import_module(f"tidefield.commands.{module}"), function)(options, console)
 
 
-def _begin(talk: Talk) -> Console:
+def _begin(verbosity: Verbosity) -> Console:
     """Set up messages; returns the console that commands print to."""
     spin_briefly()
     from rich.console import Console
@@ -71,8 +83,8 @@ def _begin(talk: Talk) -> Console:
 
     from tidefield.device import keep_large_allocations
 
-    console = Console(quiet=talk.quiet)
-    level = logging.ERROR if talk.quiet else logging.DEBUG if talk.verbose else logging.INFO
+    console = Console(quiet=verbosity.quiet)
+    level = logging.ERROR if verbosity.quiet else logging.DEBUG if verbosity.verbose else logging.INFO
     terminal, handler = Console(stderr=True), logging.StreamHandler()
     form = "%(asctime)s %(message)s"
     if terminal.is_terminal:  # elsewhere Rich would break lines

@@ -9,27 +9,27 @@ from pathlib import Path
 import torch
 
 from tidefield.baselines import nearest, plane_sweep, sparse_depth
-from tidefield.baselines.nerf import NerfLearner
+from tidefield.baselines.nerf import NerfTrainer
 from tidefield.baselines.nerfstudio import driver
 from tidefield.config import Config, NerfConfig, NerfstudioConfig
 from tidefield.data.scene import Scene
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render
-from tidefield.train.checkpoint import Progress, Run, load_network
-from tidefield.train.loop import Learner, Trainer
+from tidefield.train.checkpoint import Run, TrainingProgress, load_network
+from tidefield.train.loop import SceneTrainer, Trainer
 from tidefield.train.weights import read_weights, sha256
 
-FLOORS = {"plane-sweep": plane_sweep.make, "sparse-depth": sparse_depth.make, "nearest": nearest.make}
+UNTRAINED = {"plane-sweep": plane_sweep.make, "sparse-depth": sparse_depth.make, "nearest": nearest.make}
 
 
-def make_learner(
+def make_trainer(
     config: Config | NerfConfig, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
-) -> Learner:
+) -> Trainer:
     """What trains a method that lives in this process; our network may begin with trained weights."""
     if isinstance(config, NerfConfig):
-        return NerfLearner(config, scene, seed, device)
-    return Trainer(config, scene, seed, device, weights)
+        return NerfTrainer(config, scene, seed, device)
+    return SceneTrainer(config, scene, seed, device, weights)
 
 
 def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device) -> tuple[Render, str]:
@@ -45,7 +45,7 @@ def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device)
 
 
 @contextmanager
-def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Iterator[tuple[Render, Progress]]:
+def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Iterator[tuple[Render, TrainingProgress]]:
     """A run as a method, while the block lasts, and how far it was trained.
 
     Raises:
@@ -55,7 +55,7 @@ def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Itera
         with driver.renderer(folder) as render:
             yield render, driver.progress_of(folder)
         return
-    learner = make_learner(run.config, scene, run.seed, device)
+    learner = make_trainer(run.config, scene, run.seed, device)
     progress = load_network(folder, learner.network)
     learner.network.eval()
     yield learner.renderer(), progress

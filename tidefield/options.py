@@ -32,7 +32,7 @@ AllowMissing = Annotated[bool, arg(help="Go on without photographs that the scen
 
 
 @dataclass(frozen=True)
-class Talk:
+class Verbosity:
     """How much is said."""
 
     verbose: Annotated[bool, arg(aliases=["-v"])] = False
@@ -101,7 +101,7 @@ class Train:
     """Render two held-out views at a quarter of their size now and then, for a curve of quality against time; the
     clock stands still meanwhile."""
     allow_missing: AllowMissing = False
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Pretrain:
     device: Device = "auto"
     resume: bool = False
     """Go on with what is in the folder."""
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Evaluate:
     overwrite: bool = False
     """Replace an evaluation that is there."""
     allow_missing: AllowMissing = False
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Render:
     overwrite: bool = False
     """Replace files that are there."""
     allow_missing: AllowMissing = False
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class Prepare:
     redo: Stage | None = None
     """Do this stage again, and all that follow."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class Import:
     link: bool = False
     """Give the photographs a second name (hard links) instead of copying them."""
     allow_missing: AllowMissing = False
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ class Compare:
     """Folder for the runs, tables and figures."""
     device: Device = "auto"
     seed: int = 0
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ class Ablate:
     """Folder for the runs and the table."""
     device: Device = "auto"
     seed: int = 0
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class Baselines:
     """nerfacto is nerfstudio, with splatfacto."""
     overwrite: bool = False
     """Begin anew where it is installed already."""
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 @dataclass(frozen=True)
@@ -303,4 +303,4 @@ class Demo:
     device: Device = "auto"
     overwrite: bool = False
     """Begin anew in a folder that holds a demonstration; without it, what is there is used and finished."""
-    talk: OmitArgPrefixes[Talk] = Talk()
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()

@@ -6,7 +6,7 @@ the sparse points span; where it saw nothing, its colours are continued.
 
 from __future__ import annotations
 
-from tidefield.baselines.gather import read_photograph
+from tidefield.baselines.photograph import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras

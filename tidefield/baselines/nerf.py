@@ -24,7 +24,7 @@ from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.compositing import composite, weights
 from tidefield.model.intervals import sample
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.loop import Learner
+from tidefield.train.loop import Trainer
 
 RAYS_AT_ONCE = 1024
 """When rendering: the widest layer's values of so many rays are some 200 MB."""
@@ -153,7 +153,7 @@ class Nerf(nn.Module):
         return Seen(composite(w, colour), (w * z).sum(-1), w.sum(-1), w)
 
 
-class NerfLearner(Learner):
+class NerfTrainer(Trainer):
     """Trains on rays through random pixels of all training photographs."""
 
     def __init__(self, config: NerfConfig, scene: Scene, seed: int, device: torch.device) -> None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tidefield.baselines.gather import read_photograph
+from tidefield.baselines.photograph import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras

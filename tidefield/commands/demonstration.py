@@ -19,7 +19,7 @@ PICTURE = "river_mouths_0033.png"
 
 def demo(options: Demo, console: Console) -> None:
     """See `tidefield demo --help`."""
-    from tidefield.data.synthetic import make_survey, write_survey
+    from tidefield.synthetic import make_survey, write_survey
 
     out, device = options.out, options.device
     if options.overwrite and out.exists():

@@ -14,10 +14,10 @@ from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError
-from tidefield.meter import Meter
 from tidefield.methods import trained, zero_shot
 from tidefield.model.rendering import Render as RenderMethod
 from tidefield.options import Evaluate, Length, Render
+from tidefield.progress import ProgressBar
 from tidefield.train.checkpoint import read_run
 from tidefield.train.loop import Budget
 from tidefield.train.weights import given_or_shipped
@@ -40,7 +40,7 @@ def budget_of(length: Length) -> Budget:
 
 def load(scene: Path, width: int | None, allow_missing: bool, console: Console) -> Scene:
     """Read a scene, with progress while photographs are decoded."""
-    with Meter(console, "Reading photographs") as meter:
+    with ProgressBar(console, "Reading photographs") as meter:
         return load_scene(scene, width=width, allow_missing=allow_missing, progress=meter)
 
 

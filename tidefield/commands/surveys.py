@@ -9,16 +9,16 @@ import pycolmap
 from rich.console import Console
 
 from tidefield.errors import RunError
-from tidefield.ingest import convert
-from tidefield.ingest.findings import findings
-from tidefield.ingest.motion.features import FeatureOptions
-from tidefield.ingest.motion.features import choose_device as choose_pycolmap_device
-from tidefield.ingest.prepare import Wishes
-from tidefield.ingest.prepare import prepare as prepare_scene
-from tidefield.ingest.reading.photographs import read_survey
-from tidefield.ingest.report import write_report
-from tidefield.meter import Meter
 from tidefield.options import Import, Prepare
+from tidefield.progress import ProgressBar
+from tidefield.survey import import_project as convert
+from tidefield.survey.findings import findings
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.prepare import PrepareOptions
+from tidefield.survey.prepare import prepare as prepare_scene
+from tidefield.survey.report import write_report
+from tidefield.survey.sfm.features import FeatureOptions
+from tidefield.survey.sfm.features import choose_device as choose_pycolmap_device
 
 log = logging.getLogger(__name__)
 
@@ -29,19 +29,19 @@ def prepare(options: Prepare, console: Console) -> None:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     survey = read_survey(options.photographs, options.gps, options.control)
     # Its log tells every step of structure from motion.
-    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.talk.verbose else pycolmap.logging.ERROR)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.verbosity.verbose else pycolmap.logging.ERROR)
     if options.no_control:
         survey = replace(survey, control=None)
     for remark in survey.remarks:
         log.warning(remark)
-    wishes = Wishes(
+    wishes = PrepareOptions(
         keep_all=options.keep_all,
         colour=options.colour,
         features=FeatureOptions(options.feature_width, options.features),
         redo=options.redo,
     )
     prepared = prepare_scene(survey, options.scene, wishes, choose_pycolmap_device(options.device), console)
-    asked = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "talk", "redo")}
+    asked = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
     report = write_report(findings(prepared, options.scene, asked), options.scene)
     lost = len(survey.photographs) - len(prepared.models[0])
     console.print(
@@ -58,7 +58,7 @@ def prepare(options: Prepare, console: Console) -> None:
 
 def import_project(options: Import, console: Console) -> None:
     """See `tidefield import --help`."""
-    with Meter(console, "Placing photographs") as meter:
+    with ProgressBar(console, "Placing photographs") as meter:
         made = convert.import_project(
             options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=meter
         )

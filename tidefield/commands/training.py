@@ -16,10 +16,10 @@ from tidefield.config import PRESETS, AnyConfig, Config, FieldConfig, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
-from tidefield.methods import make_learner
+from tidefield.evaluation.curves import Curve, make_curve
+from tidefield.methods import make_trainer
 from tidefield.options import Pretrain, Train
-from tidefield.train.checkpoint import RUN_FILE, Progress, Run, read_run, write_run
-from tidefield.train.curve import Curve, make_curve
+from tidefield.train.checkpoint import RUN_FILE, Run, TrainingProgress, read_run, write_run
 from tidefield.train.display import Display
 from tidefield.train.loop import Budget
 from tidefield.train.loop import train as train_loop
@@ -49,7 +49,7 @@ def train(options: Train, console: Console) -> None:
         write_run(folder, run)
         progress, finished = _train_nerfstudio(run, scene, folder, budget, where, curve, console), True
     else:
-        learner = make_learner(run.config, scene, run.seed, where, weights)
+        learner = make_trainer(run.config, scene, run.seed, where, weights)
         if options.resume:
             learner.resume(folder)
         else:
@@ -88,7 +88,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
     _end(learner.progress, finished, folder, console)
 
 
-def _end(progress: Progress, finished: bool, folder: Path, console: Console) -> None:
+def _end(progress: TrainingProgress, finished: bool, folder: Path, console: Console) -> None:
     """Tell what was done; a training that was interrupted ends its command as an interruption."""
     console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
     if not finished:
@@ -98,14 +98,14 @@ def _end(progress: Progress, finished: bool, folder: Path, console: Console) -> 
 
 def _train_nerfstudio(
     run: Run, scene: Scene, folder: Path, budget: Budget, device: torch.device, curve: Curve | None, console: Console
-) -> Progress:
+) -> TrainingProgress:
     """Train one of nerfstudio's methods, with progress."""
     config = run.config
     assert isinstance(config, NerfstudioConfig), "the others train in this process"
     with Display(console) as display:
 
         def progress(step: int, seconds: float) -> None:
-            used = Progress(step, seconds)
+            used = TrainingProgress(step, seconds)
             display.show(budget.share(used), f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
 
         return driver.train(config.method, scene, folder, budget, run.seed, device, curve, progress)

@@ -6,16 +6,16 @@ from rich.console import Console
 
 from tidefield.commands.opening import load, opened
 from tidefield.errors import RunError, TidefieldError
+from tidefield.evaluation.evaluate import Evaluation
+from tidefield.evaluation.evaluate import evaluate as evaluate_method
+from tidefield.evaluation.lpips import download_lpips_weights
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
-from tidefield.meter import Meter
-from tidefield.methods import FLOORS
+from tidefield.methods import UNTRAINED
 from tidefield.options import Evaluate, Render
-from tidefield.products.pictures import write_still
-from tidefield.products.trajectory import make_trajectory
-from tidefield.train.evaluate import Evaluation
-from tidefield.train.evaluate import evaluate as evaluate_method
-from tidefield.train.lpips import download_lpips_weights
+from tidefield.progress import ProgressBar
+from tidefield.render.stills import write_still
+from tidefield.render.trajectory import make_trajectory
 
 
 def evaluate(options: Evaluate, console: Console) -> Evaluation:
@@ -32,7 +32,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         out = source
     if method is not None:
         scene = load(source, options.width, options.allow_missing, console)
-        return evaluate_method(FLOORS[method](scene), scene, out, configuration={"method": method}, **settings)
+        return evaluate_method(UNTRAINED[method](scene), scene, out, configuration={"method": method}, **settings)
     with opened(options, console) as (scene, view, configuration):
         return evaluate_method(view, scene, out, configuration=configuration, **settings)
 
@@ -56,9 +56,9 @@ def render(options: Render, console: Console) -> None:
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = trajectory.cameras
-        from tidefield.products.video import write_video
+        from tidefield.render.video import write_video
 
-        with Meter(console, "Rendering") as meter:
+        with ProgressBar(console, "Rendering") as meter:
             write_video(
                 (view(cameras[k]) for k in range(len(cameras))),
                 out,

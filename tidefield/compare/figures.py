@@ -12,8 +12,8 @@ from scipy.ndimage import uniform_filter
 from tidefield.compare.results import Results
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
-from tidefield.train.evaluate import picture_names
-from tidefield.train.pictures import GAP_PX, PAPER, STRIP_PX, strip
+from tidefield.evaluation.evaluate import picture_names
+from tidefield.evaluation.panels import GAP_PX, PAPER, STRIP_PX, strip
 
 PANEL_PX = 320
 """Width of a panel."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from tidefield.data.synthetic import CATEGORIES, make_survey, write_survey
 from tidefield.errors import SceneError
+from tidefield.synthetic import CATEGORIES, make_survey, write_survey
 
 Protocol = Literal["mipnerf360", "tidalflats"]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from tidefield.compare.record import read_json
 from tidefield.compare.run import EVALUATION_FILE, PROCESS_FILE, RUNS
-from tidefield.train.curve import CURVE_FILE
+from tidefield.evaluation.curves import CURVE_FILE
 
 
 @dataclass(frozen=True)

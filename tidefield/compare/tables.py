@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from tidefield.compare import published
 from tidefield.compare.results import Result, Results
 from tidefield.compare.table import NOTHING, Table, shown
-from tidefield.train.lpips import BACKBONES
+from tidefield.evaluation.lpips import BACKBONES
 
 METRICS = (
     ("psnr", "PSNR, dB", "{:.2f}", True),

@@ -12,19 +12,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tidefield.config import TrainConfig
-from tidefield.data.neighbours import Neighbours, nearest, of_tiles, rank_by_direction, rank_by_view
-from tidefield.data.prior import STRIDE, Observed, observed_depths, read_prior, surface_prior
-from tidefield.data.scene import Scene, SparsePoints
+from tidefield.data.depth_prior import STRIDE, DepthPriors, Observed, unproject_to_surface
+from tidefield.data.exposure import to_common_exposure
+from tidefield.data.neighbours import choose_neighbours
+from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, pixel_grid, project
-
-FEW = 64
-"""Photographs that are ranked for every place; of more, only those that every so many places see best."""
-EVERY = 7
-SPARE = 1
-"""Views that a tile has beyond those of each corner: room for others to take over within the tile."""
-SPOTS = ((0.0, 0.0), (-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4))
-"""Around each corner of a tile, in its sides, where it is asked who sees the surface."""
 
 
 @dataclass(frozen=True)
@@ -82,116 +75,16 @@ class Batch:
         )
 
 
-class Surfaces:
-    """What a scene's sparse points say of every camera's surface, made when first asked for.
-
-    Args:
-        scene: whose cameras.
-        observed: points that are told as observed; the scene's own if not given.
-    """
-
-    def __init__(self, scene: Scene, observed: SparsePoints | None = None) -> None:
-        self.scene, self.points = scene, observed or scene.points
-        self._priors: dict[int, Tensor] = {}
-        self._observed: dict[int, Observed] = {}
-
-    def __getitem__(self, index: int) -> Float[Tensor, "3 h w"]:
-        if index not in self._priors:
-            cameras = self.scene.cameras
-            self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
-        return self._priors[index]
-
-    def observed(self, index: int) -> Observed:
-        """The sparse points that one photograph observed."""
-        if index not in self._observed:
-            self._observed[index] = observed_depths(self.scene.cameras[index], self.points, index)
-        return self._observed[index]
-
-
-def even(scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)) -> Float[Tensor, "h w 3"]:
-    """A part of a photograph at the common exposure: divided by its gain (method.md, section 12)."""
-    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])
-
-
-def choose_neighbours(
-    camera: Cameras,
-    prior: Float[Tensor, "3 h w"],
-    corner_px: Float[Tensor, "2"],
-    grid: tuple[int, int],
-    side_px: int,
-    scene: Scene,
-    count: int,
-    strategy: str,
-    excluded: int | None = None,
-) -> Neighbours:
-    """Training photographs that serve as neighbouring views of a grid of tiles, row by row.
-
-    Args:
-        camera: that shows the tiles.
-        prior: its surface.
-        corner_px: the grid's upper left corner.
-        grid: columns and rows of tiles.
-        side_px: of a tile.
-        scene: whose photographs.
-        count: of views at each corner; the tiles have `SPARE` more, unless all places have the same.
-        strategy: `TrainConfig.neighbours`.
-        excluded: a photograph that may not serve.
-    """
-    columns, rows = grid
-    places = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
-    uv = places[:, None] + corner_px.new_tensor(SPOTS) * side_px
-    surface = surface_at(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
-    spare = SPARE if count and strategy != "direction" else 0
-    chosen, presence = _ranked(camera, surface, scene, count, spare, strategy, excluded)
-    first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
-    corners = first + torch.tensor([0, 1, columns + 1, columns + 2])
-    return of_tiles(chosen, presence, corners)
-
-
 def tile_doubly_seen(
     camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "2"], side_px: int, others: Cameras
 ) -> Bool[Tensor, " R"]:
     """Which pixels of a tile show surface that two or more other cameras see, as the prior's cells tell it."""
     cells = max(1, side_px // STRIDE)
     middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
-    uv, z = others.project(surface_at(camera, prior, middles))
+    uv, z = others.project(unproject_to_surface(camera, prior, middles))
     seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
     near = torch.arange(side_px) * cells // side_px
     return seen[near][:, near].reshape(-1)
-
-
-def surface_at(camera: Cameras, prior: Float[Tensor, "3 h w"], uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-    """Surface points at pixels of one camera; beyond the image they are those at its border."""
-    uv = torch.minimum(uv_px.clamp(min=0), camera.size_px[0].to(uv_px))[None]
-    expected, near, far = read_prior(prior[None], uv)
-    inverse = torch.where(expected.isnan(), (near + far) / 2, expected)
-    return (camera.position_world[:, None] + camera.directions_world(uv) / inverse[..., None])[0]
-
-
-def _ranked(
-    camera: Cameras,
-    surface_world: Float[Tensor, "K S 3"],
-    scene: Scene,
-    count: int,
-    spare: int,
-    strategy: str,
-    excluded: int | None,
-) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
-    """Training photographs that show some places best, and how far each is there (`nearest`)."""
-    train = torch.tensor(scene.train)
-    if strategy != "direction" and len(train) > FEW and len(surface_world) > EVERY:
-        # What is best at some places is best at all that lie between: the work of ranking stays small, however many
-        # photographs there are.
-        some = rank_by_view(camera, surface_world[::EVERY], scene.cameras[train])
-        train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
-    candidates = scene.cameras[train]
-    if strategy == "direction":
-        rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
-    else:
-        rank = rank_by_view(camera, surface_world, candidates)
-    out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
-    chosen, presence = nearest(rank, out, count, spare)
-    return train[chosen], presence
 
 
 def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
@@ -204,7 +97,9 @@ def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) 
     return inverse / total.clamp(min=1e-12), total.clamp(max=1)
 
 
-def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int, generator: torch.Generator) -> Batch:
+def draw_batch(
+    scene: Scene, surfaces: DepthPriors, config: TrainConfig, views: int, generator: torch.Generator
+) -> Batch:
     """Random tiles of random training photographs."""
     side = config.tile_px
     train = torch.tensor(scene.train)
@@ -217,7 +112,7 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
     middles_world, neighbours, presences, weights, depths = [], [], [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], surfaces[target]
-        middles_world.append(surface_at(camera, prior, at[None] + side / 2)[0])
+        middles_world.append(unproject_to_surface(camera, prior, at[None] + side / 2)[0])
         found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours, target)
         neighbours.append(found.index[0])
         presences.append(found.presence[0])
@@ -244,7 +139,7 @@ def draw_batch(scene: Scene, surfaces: Surfaces, config: TrainConfig, views: int
 def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
     """Colours of a tile's pixels, and which of them the photograph has."""
     u, v = corner.tolist()
-    pixels = even(scene, index, slice(v, v + side), slice(u, u + side))
+    pixels = to_common_exposure(scene, index, slice(v, v + side), slice(u, u + side))
     height, width = pixels.shape[:2]
     colours, inside = torch.zeros(side, side, 3), torch.zeros(side, side, dtype=torch.bool)
     colours[:height, :width], inside[:height, :width] = pixels, True
@@ -257,7 +152,8 @@ def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> tuple[Tensor, tuple[
     sizes, group = scene.cameras.size_px[photographs].unique(dim=0, return_inverse=True)
     order = group.argsort(stable=True)
     images = tuple(
-        torch.stack([even(scene, int(i)).permute(2, 0, 1) for i in photographs[group == g]]) for g in range(len(sizes))
+        torch.stack([to_common_exposure(scene, int(i)).permute(2, 0, 1) for i in photographs[group == g]])
+        for g in range(len(sizes))
     )
     return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images)
 
@@ -274,7 +170,7 @@ def _crops(
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())
     crops = [
-        even(scene, i, slice(v, v + height), slice(u, u + width)).permute(2, 0, 1)
+        to_common_exposure(scene, i, slice(v, v + height), slice(u, u + width)).permute(2, 0, 1)
         for i, (u, v) in zip(flat.tolist(), corner.long().tolist(), strict=True)
     ]
     return torch.arange(len(flat)).reshape(neighbours.shape), (torch.stack(crops),), (corner,)

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from tidefield.data.exif import Metadata
 from tidefield.data.images import Photographs
-from tidefield.data.scene import SparsePoints
+from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras
 
 DISPLAY_SLOPE = 0.45
@@ -273,3 +273,10 @@ def _nearby(position: Array, which: Index) -> _Pairs:
     found = KDTree(position[which]).query(position[which], k=3)
     distance, neighbour = (np.asarray(column)[:, 1:].ravel() for column in found)
     return _Pairs(np.repeat(which, 2), which[neighbour], np.maximum(distance / max(usual, 1e-9), 0.1))
+
+
+def to_common_exposure(
+    scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)
+) -> Float[Tensor, "h w 3"]:
+    """A part of a photograph at the common exposure: divided by its gain (method.md, section 12)."""
+    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])

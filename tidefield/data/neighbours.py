@@ -15,7 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.geometry.cameras import Cameras
+from tidefield.data.depth_prior import unproject_to_surface
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras, pixel_grid
 
 FADE = 0.04
 """Share of its rank by which a view must be better than the first one left out to count in full."""
@@ -23,6 +25,14 @@ BORDER = 0.05
 """Share of its width over which a view fades out of its frame."""
 ANGLE_SCALE_RAD = 0.35
 """Angle at which a view that sees the whole tile is worth as much as one straight on that sees 1 / e of it."""
+
+FEW = 64
+"""Photographs that are ranked for every place; of more, only those that every so many places see best."""
+EVERY = 7
+EXTRA_VIEWS = 1
+"""Views that a tile has beyond those of each corner: room for others to take over within the tile."""
+SPOTS = ((0.0, 0.0), (-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4))
+"""Around each corner of a tile, in its sides, where it is asked who sees the surface."""
 
 
 @dataclass(frozen=True)
@@ -110,3 +120,64 @@ def of_tiles(chosen: Int[Tensor, "K N"], presence: Float[Tensor, "K N"], corners
     everyone = everyone[corners].transpose(1, 2)
     best = everyone.sum(-1).topk(chosen.shape[1], dim=1).indices
     return Neighbours(photographs[best], everyone.gather(1, best[..., None].expand(-1, -1, 4)))
+
+
+def choose_neighbours(
+    camera: Cameras,
+    prior: Float[Tensor, "3 h w"],
+    corner_px: Float[Tensor, "2"],
+    grid: tuple[int, int],
+    side_px: int,
+    scene: Scene,
+    count: int,
+    strategy: str,
+    excluded: int | None = None,
+) -> Neighbours:
+    """Training photographs that serve as neighbouring views of a grid of tiles, row by row.
+
+    Args:
+        camera: that shows the tiles.
+        prior: its surface.
+        corner_px: the grid's upper left corner.
+        grid: columns and rows of tiles.
+        side_px: of a tile.
+        scene: whose photographs.
+        count: of views at each corner; the tiles have `EXTRA_VIEWS` more, unless all places have the same.
+        strategy: `TrainConfig.neighbours`.
+        excluded: a photograph that may not serve.
+    """
+    columns, rows = grid
+    places = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
+    uv = places[:, None] + corner_px.new_tensor(SPOTS) * side_px
+    surface = unproject_to_surface(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
+    spare = EXTRA_VIEWS if count and strategy != "direction" else 0
+    chosen, presence = _ranked(camera, surface, scene, count, spare, strategy, excluded)
+    first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
+    corners = first + torch.tensor([0, 1, columns + 1, columns + 2])
+    return of_tiles(chosen, presence, corners)
+
+
+def _ranked(
+    camera: Cameras,
+    surface_world: Float[Tensor, "K S 3"],
+    scene: Scene,
+    count: int,
+    spare: int,
+    strategy: str,
+    excluded: int | None,
+) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """Training photographs that show some places best, and how far each is there (`nearest`)."""
+    train = torch.tensor(scene.train)
+    if strategy != "direction" and len(train) > FEW and len(surface_world) > EVERY:
+        # What is best at some places is best at all that lie between: the work of ranking stays small, however many
+        # photographs there are.
+        some = rank_by_view(camera, surface_world[::EVERY], scene.cameras[train])
+        train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
+    candidates = scene.cameras[train]
+    if strategy == "direction":
+        rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
+    else:
+        rank = rank_by_view(camera, surface_world, candidates)
+    out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
+    chosen, presence = nearest(rank, out, count, spare)
+    return train[chosen], presence

@@ -13,16 +13,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tidefield.config import Config
-from tidefield.data.batches import SPARE, choose_neighbours, even, surface_at
-from tidefield.data.neighbours import Neighbours
-from tidefield.data.prior import read_prior, surface_prior
+from tidefield.data.depth_prior import read_prior, surface_prior, unproject_to_surface
+from tidefield.data.exposure import to_common_exposure
+from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.cache import CacheFull, FeatureCache
 from tidefield.model.fill import fill_unseen
 from tidefield.model.intervals import Intervals
 from tidefield.model.network import Network, Tiles
 from tidefield.model.rendering import Rendering
-from tidefield.model.shelf import FeatureShelf, NoRoom
 from tidefield.model.views import Views
 from tidefield.parallel import in_parallel
 
@@ -49,8 +49,8 @@ class Renderer:
 
     def __init__(self, network: Network, scene: Scene, config: Config, device: torch.device) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
-        self.shelf = FeatureShelf(network, scene, device) if network.config.views else None
-        stages, views = network.config.stages, network.config.views + SPARE
+        self.shelf = FeatureCache(network, scene, device) if network.config.views else None
+        stages, views = network.config.stages, network.config.views + EXTRA_VIEWS
         gathered = max((TILE_PX // s.stride) ** 2 * s.samples * views * s.feature_channels for s in stages)
         room = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, room // gathered)
@@ -60,7 +60,7 @@ class Renderer:
         self.fills = bool(net.views) and not net.as_printed and net.field is None and scene.background_rgb is None
         few = scene.train[:: -(-len(scene.train) // BEHIND_PHOTOGRAPHS)]
         lines = slice(None, None, BEHIND_STEP)
-        self.fallback = torch.stack([even(scene, i, lines, lines).mean((0, 1)) for i in few]).mean(0)
+        self.fallback = torch.stack([to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few]).mean(0)
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras) -> Rendering:
@@ -92,7 +92,7 @@ class Renderer:
         (left, top), (columns, rows) = corner, size
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
-        middles = surface_at(camera, prior, corners + TILE_PX / 2)
+        middles = unproject_to_surface(camera, prior, corners + TILE_PX / 2)
         views, strategy = self.network.config.views, self.config.train.neighbours
         neighbours = None
         if views:
@@ -114,7 +114,7 @@ class Renderer:
             assert self.shelf is not None
             try:
                 views = self.shelf.views(neighbours, middle_world)
-            except NoRoom:
+            except CacheFull:
                 if len(corners) == 1:
                     raise
                 half = len(corners) // 2

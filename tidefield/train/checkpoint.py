@@ -47,7 +47,7 @@ class Run:
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """How far a run has trained."""
 
     step: int = 0
@@ -89,7 +89,11 @@ def read_run(folder: Path) -> Run:
 
 
 def save_checkpoint(
-    folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, generator: torch.Generator, progress: Progress
+    folder: Path,
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    generator: torch.Generator,
+    progress: TrainingProgress,
 ) -> None:
     """Replace the run's checkpoint."""
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
@@ -109,7 +113,7 @@ def save_checkpoint(
             ) from error
 
 
-def load_network(folder: Path, network: nn.Module) -> Progress:
+def load_network(folder: Path, network: nn.Module) -> TrainingProgress:
     """Read the weights of a run's checkpoint into its network.
 
     Raises:
@@ -122,7 +126,7 @@ def load_network(folder: Path, network: nn.Module) -> Progress:
 
 def load_training(
     folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, generator: torch.Generator
-) -> Progress:
+) -> TrainingProgress:
     """Read all of a run's checkpoint, so that training goes on as if it had not stopped."""
     tensors, progress = _read(folder)
     _load_weights(folder, network, tensors)
@@ -136,7 +140,7 @@ def load_training(
     return progress
 
 
-def _read(folder: Path) -> tuple[dict[str, Tensor], Progress]:
+def _read(folder: Path) -> tuple[dict[str, Tensor], TrainingProgress]:
     path = folder / CHECKPOINT_FILE
     if not path.is_file():
         raise RunError(f"{folder} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
@@ -144,7 +148,9 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], Progress]:
         with safe_open(path, framework="pt") as file:
             header: Any = json.loads((file.metadata() or {})["tidefield"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return tensors, Progress(int(header["step"]), float(header["seconds"]), [float(x) for x in header["losses"]])
+        return tensors, TrainingProgress(
+            int(header["step"]), float(header["seconds"]), [float(x) for x in header["losses"]]
+        )
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise RunError(
             f"{path} is damaged or of another program ({error}): expected a checkpoint that `tidefield train` wrote; "

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from tidefield.meter import Meter
+from tidefield.progress import ProgressBar
 from tidefield.train.losses import psnr
 
 if TYPE_CHECKING:
-    from tidefield.train.loop import Budget, Learner
+    from tidefield.train.loop import Budget, Trainer
 
 
 class Display:
     """Step, loss, PSNR, rays per second and time left."""
 
     def __init__(self, console: Console) -> None:
-        self._meter = Meter(console, "Training")
+        self._meter = ProgressBar(console, "Training")
 
     def __enter__(self) -> Display:
         self._meter.__enter__()
@@ -26,7 +26,7 @@ class Display:
     def __exit__(self, *error: object) -> None:
         self._meter.__exit__(*error)
 
-    def update(self, trainer: Learner, budget: Budget, mean_square: float) -> None:
+    def update(self, trainer: Trainer, budget: Budget, mean_square: float) -> None:
         """Show the state after a step."""
         progress = trainer.progress
         rays = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9)

@@ -19,13 +19,13 @@ from tensorboardX import SummaryWriter
 from torch import nn
 
 from tidefield.config import Config, TrainConfig
-from tidefield.data.batches import Surfaces
+from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.checkpoint import Progress, load_training, save_checkpoint
+from tidefield.train.checkpoint import TrainingProgress, load_training, save_checkpoint
 from tidefield.train.display import Display
 from tidefield.train.losses import psnr
 from tidefield.train.objective import Objective
@@ -46,7 +46,7 @@ class Budget:
     steps: int | None = None
     minutes: float | None = None
 
-    def share(self, progress: Progress) -> float:
+    def share(self, progress: TrainingProgress) -> float:
         """How much of the budget is used, 0 to 1."""
         if self.steps is not None:
             return min(1.0, progress.step / max(self.steps, 1))
@@ -54,11 +54,11 @@ class Budget:
         return min(1.0, progress.seconds / max(60 * self.minutes, 1e-9))
 
 
-Watch = Callable[["Learner", float], None]
+Callback = Callable[["Trainer", float], None]
 """Is told of the learner and of the share of the budget that is used."""
 
 
-class Learner(ABC):
+class Trainer(ABC):
     """A network, its optimiser and its place in the sequence of random batches: what the loop trains.
 
     The same seed, scene and budget in steps give the same weights bit for bit on a CPU, however often training is
@@ -86,7 +86,7 @@ class Learner(ABC):
         self.network, self.scene, self.device = network, scene, device
         self.generator = torch.Generator().manual_seed(seed)
         self.optimizer = torch.optim.Adam([group for group in groups if group["params"]], betas=betas, eps=eps)
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         self.cameras = scene.cameras.to(device)
 
     @property
@@ -147,7 +147,7 @@ class Learner(ABC):
         return value
 
 
-class Trainer(Learner):
+class SceneTrainer(Trainer):
     """Trains the paper's network on tiles of photographs and their neighbours."""
 
     network: Network
@@ -165,7 +165,7 @@ class Trainer(Learner):
         # A small epsilon: the field's gradients are tiny, and Adam's default would stop them.
         super().__init__(network, groups_of(network, config.train), scene, seed, device, (0.9, 0.99), 1e-12)
         self.config = config
-        self.surfaces = Surfaces(scene)
+        self.surfaces = DepthPriors(scene)
         self.objective = Objective(network, config.train)
 
     @property
@@ -195,7 +195,7 @@ def cosine_rate(step: int, share: float, warm_up: int) -> float:
     return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
 
-def train(trainer: Learner, folder: Path, budget: Budget, display: Display, watch: Watch | None = None) -> bool:
+def train(trainer: Trainer, folder: Path, budget: Budget, display: Display, watch: Callback | None = None) -> bool:
     """Train until the budget is used; save every minute and at the end, and on Ctrl-C or a polite kill.
 
     Args:
@@ -241,7 +241,7 @@ def train(trainer: Learner, folder: Path, budget: Budget, display: Display, watc
     return budget.share(progress) >= 1
 
 
-def _picture(trainer: Learner, writer: SummaryWriter) -> None:
+def _picture(trainer: Trainer, writer: SummaryWriter) -> None:
     """A held-out view, if there is one, as TensorBoard picture."""
     scene = trainer.scene
     index = (scene.test or scene.train)[0]

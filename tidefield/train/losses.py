@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.batches import Batch
+from tidefield.evaluation.metrics import similarity
 from tidefield.model.network import Network, TileRendering
-from tidefield.train.metrics import similarity
 
 GLIMPSE_WEIGHT = 0.5
 """Of the coarse stages' own colours, without which nothing would teach them where the surface is."""

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from tidefield.config import TrainConfig
-from tidefield.data.batches import Batch, Surfaces, draw_batch
+from tidefield.data.batches import Batch, draw_batch
+from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
 from tidefield.geometry.cameras import Cameras
@@ -18,7 +19,7 @@ from tidefield.model.network import Network, TileRendering, Tiles
 from tidefield.model.renderer import start_intervals
 from tidefield.model.views import Encoded, Views
 from tidefield.train.losses import photometric, sparse_depth, structural
-from tidefield.train.side_by_side import side_by_side
+from tidefield.train.parallel_backward import side_by_side
 
 
 class Objective(nn.Module):
@@ -34,7 +35,7 @@ class Objective(nn.Module):
         self.network, self.config = network, config
 
     def forward(
-        self, scene: Scene, surfaces: Surfaces, cameras: Cameras, views: int, generator: torch.Generator
+        self, scene: Scene, surfaces: DepthPriors, cameras: Cameras, views: int, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """The loss of a random batch, and the mean squared error of its colours.
 

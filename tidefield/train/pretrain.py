@@ -19,13 +19,13 @@ from torch.nn.parallel import DistributedDataParallel
 from tidefield.config import Config
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
-from tidefield.data.synthetic import CATEGORIES, Flight
+from tidefield.evaluation.curves import make_curve
 from tidefield.files import completed_file
 from tidefield.model.network import Network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render
-from tidefield.train.curve import make_curve
-from tidefield.train.loop import Learner, cosine_rate, groups_of
+from tidefield.synthetic import CATEGORIES, Flight
+from tidefield.train.loop import Trainer, cosine_rate, groups_of
 from tidefield.train.objective import Objective
 from tidefield.train.stream import Recipe, Source, make
 
@@ -86,7 +86,7 @@ def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> d
     return scenes | {path.resolve().name: load_scene(path, width=VALIDATION_WIDTH) for path in real}
 
 
-class Pretrainer(Learner):
+class Pretrainer(Trainer):
     """Trains the paper's network on one scene after the other.
 
     Args:
@@ -159,7 +159,7 @@ class Validation:
         self.curves = {kind: make_curve(scene, smaller=1) for kind, scene in scenes.items()}
         self.points: list[dict] = json.loads(self.file.read_text(encoding="utf-8")) if self.file.is_file() else []
 
-    def __call__(self, learner: Learner, share: float) -> None:
+    def __call__(self, learner: Trainer, share: float) -> None:
         step = learner.progress.step
         if not learner.leads or (step % VALIDATION_STEPS and share < 1):
             return

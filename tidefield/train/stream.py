@@ -24,11 +24,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from tidefield.data.batches import Surfaces
+from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
-from tidefield.data.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 from tidefield.geometry.cameras import Cameras
+from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
 AT_HAND = 8
 """Scenes at a time."""
@@ -102,7 +102,7 @@ class Drawn:
     """A scene with what training asks of it; cameras are where the network is."""
 
     scene: Scene
-    surfaces: Surfaces
+    surfaces: DepthPriors
     cameras: Cameras
 
 
@@ -267,4 +267,4 @@ class Stream:
         if own.channels != (0, 1, 2):
             photographs = replace(photographs, colours=tuple(c[..., own.channels] for c in photographs.colours))
         hard = replace(scene, cameras=cameras, photographs=photographs, points=known)
-        return Drawn(hard, Surfaces(hard, scene.points), cameras.to(self.device))
+        return Drawn(hard, DepthPriors(hard, scene.points), cameras.to(self.device))

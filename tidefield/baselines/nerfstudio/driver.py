@@ -20,11 +20,11 @@ from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.baselines.nerfstudio.export import camera_to_json, export
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
+from tidefield.evaluation.curves import SHARES, Curve
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.checkpoint import Progress
-from tidefield.train.curve import SHARES, Curve
+from tidefield.train.checkpoint import TrainingProgress
 from tidefield.train.loop import Budget
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
@@ -44,7 +44,7 @@ def train(
     device: torch.device,
     curve: Curve | None,
     progress: Callable[[int, float], object],
-) -> Progress:
+) -> TrainingProgress:
     """Train with nerfstudio's defaults, but for the camera optimiser and the appearance embedding, which are off.
 
     Args:
@@ -100,14 +100,14 @@ def require(method: NerfstudioMethod, device: torch.device) -> None:
     python()
 
 
-def progress_of(folder: Path) -> Progress:
+def progress_of(folder: Path) -> TrainingProgress:
     """How far a run has trained.
 
     Raises:
         RunError: not to its end.
     """
     step, seconds = _read_job(folder)["trained"]
-    return Progress(step, seconds)
+    return TrainingProgress(step, seconds)
 
 
 @contextmanager

@@ -1,0 +1,156 @@
+"""Classical NeRF: its encoding and rays against closed forms, and that it learns, is resumed and renders."""
+
+import math
+from pathlib import Path
+
+import pytest
+import textured_wall as wall
+import torch
+
+from tidefield.baselines.nerf import Mlp, Nerf, NerfTrainer, Rays, draw_pixels, encode
+from tidefield.config import NerfConfig
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import pixel_grid
+from tidefield.train.loop import Budget
+
+CPU = torch.device("cpu")
+SMALL = NerfConfig(coarse=8, fine=8, depth=4, width=32, position_octaves=6, rays=128, learning_rate=5e-3)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return wall.scene(wall.cameras(5), test=(2,))
+
+
+class Fog(Mlp):
+    """The same density and colour everywhere."""
+
+    def forward(self, xyz, direction):
+        return torch.full(xyz.shape[:2], 3.0), torch.full(xyz.shape, 0.25)
+
+
+def fog() -> Nerf:
+    network = Nerf(SMALL)
+    network.coarse, network.fine = Fog(SMALL), Fog(SMALL)
+    return network
+
+
+def rays(count: int = 5) -> Rays:
+    camera = wall.cameras(1)
+    uv = pixel_grid(camera.width, camera.height)[:count]
+    return Rays.of(camera, torch.zeros(count, dtype=torch.long), uv)
+
+
+def test_positions_are_encoded_as_the_authors_code_does():
+    x = torch.tensor([[0.3, -0.7, 0.1]])
+    waves = [function(2**k * value) for k in range(4) for function in (math.sin, math.cos) for value in x[0].tolist()]
+    by_octave = [w for k in range(4) for w in waves[6 * k : 6 * k + 6]]
+    found = encode(x, 4)
+    assert found.shape == (1, 27)
+    assert sorted(found[0, 3:].tolist()) == pytest.approx(sorted(by_octave), abs=1e-6)
+    torch.testing.assert_close(found[:, :3], x)
+
+
+def test_fog_dims_as_beer_and_lambert_say():
+    network, some = fog(), rays()
+    network.radius.fill_(2.0)
+    coarse, fine = network(some, opaque=False)
+    length = some.direction_world.norm(dim=-1) / 2
+    for seen in (coarse, fine):
+        # The first sample lies within the first part of the interval, and what is before it counts as empty.
+        first = seen.weights[:, 0]
+        assert (first > 0).all()
+        reach = -torch.log1p(-seen.opacity) / 3
+        whole = (some.near_far[:, 1] - some.near_far[:, 0]) * length
+        assert (reach <= whole + 1e-5).all()
+        assert (reach > 0.9 * whole).all()
+        torch.testing.assert_close(seen.colour, 0.25 * seen.opacity[:, None].expand(-1, 3))
+
+
+def test_an_opaque_scene_stops_all_light():
+    coarse, fine = fog()(rays(), opaque=True)
+    for seen in (coarse, fine):
+        torch.testing.assert_close(seen.opacity, torch.ones(5))
+
+
+def test_fine_samples_lie_where_the_coarse_pass_saw_something():
+    class Sheet(Mlp):
+        """Nothing but a dense sheet at z = 5."""
+
+        def forward(self, xyz, direction):
+            there = (xyz[..., 2] - 5).abs() < 0.5
+            return torch.where(there, 1e3, -1.0), torch.ones_like(xyz)
+
+    network = Nerf(SMALL)
+    network.coarse, network.fine = Sheet(SMALL), Sheet(SMALL)
+    coarse, fine = network(rays(), opaque=False)
+    assert (coarse.depth > 5.1).all()
+    assert ((fine.depth > 4.5) & (fine.depth < 4.9)).all()
+    assert (fine.opacity > 0.999).all()
+
+
+def test_all_that_cameras_may_see_lies_between_minus_and_plus_one(scene: Scene):
+    network = Nerf(SMALL)
+    network.cover(scene.cameras)
+    uv = pixel_grid(scene.cameras[0].width, scene.cameras[0].height)
+    ends = scene.cameras.directions_world(uv.expand(len(scene.cameras), -1, -1))[:, :, None]
+    points = scene.cameras.position_world[:, None, None] + ends * scene.cameras.near_far[:, None, :, None]
+    inside = (points - network.centre_world) / network.radius
+    assert inside.abs().max() <= 1
+    assert inside.abs().max() > 0.9
+
+
+def test_pixels_are_drawn_from_training_photographs_alone_with_their_own_colours(scene: Scene):
+    which, uv, colour = draw_pixels(scene, 500, torch.Generator().manual_seed(0))
+    assert set(which.tolist()) == set(scene.train)
+    for index, (u, v), rgb in zip(which.tolist(), uv.long().tolist(), colour, strict=True):
+        torch.testing.assert_close(rgb * 255, scene.photographs[index][v, u].float())
+
+
+def test_it_learns_a_wall(monkeypatch: pytest.MonkeyPatch):
+    def ramps(xy: torch.Tensor) -> torch.Tensor:
+        x, y = xy[..., 0], xy[..., 1]
+        return (0.5 + 0.15 * torch.stack([x, y, x - y], -1)).clamp(0, 1)
+
+    monkeypatch.setattr(wall, "texture", ramps)
+    scene = wall.scene(wall.cameras(5), test=(2,))
+    learner, budget = NerfTrainer(SMALL, scene, 0, CPU), Budget(steps=100)
+    for _ in range(100):
+        learner.step(budget)
+    learner.network.eval()
+    view = learner.renderer()(scene.cameras[2])
+    assert view.colour.shape == (36, 48, 3)
+    assert view.opacity.min() > 0.999
+    truth = scene.photographs[2].float() / 255
+    assert (view.colour - truth).square().mean() < 0.1 * truth.flatten(0, 1).var(0).mean()
+
+
+def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: Scene, tmp_path: Path):
+    budget, unbroken = Budget(steps=4), NerfTrainer(SMALL, scene, 3, CPU)
+    for _ in range(4):
+        unbroken.step(budget)
+    first = NerfTrainer(SMALL, scene, 3, CPU)
+    for _ in range(2):
+        first.step(budget)
+    first.save(tmp_path)
+    second = NerfTrainer(SMALL, scene, 99, CPU)
+    second.resume(tmp_path)
+    for _ in range(2):
+        second.step(budget)
+    for name, value in unbroken.network.state_dict().items():
+        assert torch.equal(value, second.network.state_dict()[name]), name
+
+
+def test_a_background_shows_where_nothing_is(scene: Scene):
+    from dataclasses import replace
+
+    from tidefield.baselines.nerf import make_render
+
+    class Nothing(Mlp):
+        def forward(self, xyz, direction):
+            return torch.full(xyz.shape[:2], -1.0), torch.zeros_like(xyz)
+
+    network = Nerf(SMALL)
+    network.coarse, network.fine = Nothing(SMALL), Nothing(SMALL)
+    view = make_render(network, replace(scene, background_rgb=(1.0, 0.5, 0.0)), CPU)(scene.cameras[0])
+    torch.testing.assert_close(view.colour, torch.tensor([1.0, 0.5, 0.0]).expand(36, 48, 3))

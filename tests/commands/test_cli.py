@@ -1,0 +1,181 @@
+"""The commands as a user calls them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tidefield import cli, synthetic
+from tidefield import progress as meter
+from tidefield.commands import demonstration
+from tidefield.synthetic import make_survey, write_survey
+
+
+@pytest.fixture(autouse=True, scope="module")
+def messages_as_before() -> Iterator[None]:
+    """Commands set up logging and threads for their whole process, which here is that of all tests."""
+    ours, root, environment = logging.getLogger("tidefield"), logging.getLogger(), dict(os.environ)
+    level, handlers = ours.level, root.handlers[:]
+    yield
+    ours.setLevel(level)
+    root.handlers[:] = handlers
+    os.environ.clear()
+    os.environ.update(environment)
+
+
+def call(*arguments: object) -> None:
+    """Run a command in this process."""
+    sys.argv = ["tidefield", *map(str, arguments)]
+    cli.main()
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that must end with one message and status 2; returns the message."""
+    with pytest.raises(SystemExit) as ended:
+        call(*arguments)
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("tidefield: ")
+    assert "Traceback" not in message
+    return message
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flat") / "scene"
+    write_survey(make_survey("vegetation", seed=1, views=9, width=64, supersample=1), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    call("train", scene, folder, "--steps", 3, "--device", "cpu", "-q")
+    return folder
+
+
+def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_path: Path) -> None:
+    call("evaluate", run, "--device", "cpu", "-q")
+    report = json.loads((run / "evaluation.json").read_text())
+    assert set(report["per_photograph"]) == {"vegetation_0001.png", "vegetation_0009.png"}
+    assert report["mean"]["psnr_seen_cc"] > 20
+    assert report["rays_per_second"] > 0
+    assert report["configuration"]["preset"] == "swift"
+    assert report["split"]["test"] == ["vegetation_0001.png", "vegetation_0009.png"]
+    still = tmp_path / "view.png"
+    call("render", run, still, "--camera", "vegetation_0001", "--width", 40, "-q")
+    with Image.open(still) as picture:
+        assert picture.size == (40, 30)
+    assert np.load(tmp_path / "view_depth.npy").shape == (30, 40)
+    video = tmp_path / "flight.mp4"
+    call("render", run, video, "--path", "strip", "--frames", 2, "--width", 32, "-q")
+    assert video.stat().st_size > 0
+
+
+def test_resume_goes_on_from_the_last_step(scene: Path, run: Path) -> None:
+    from tidefield.model.network import Network
+    from tidefield.train.checkpoint import load_network, read_run
+
+    call("train", scene, run, "--steps", 5, "--resume", "-q")
+    assert load_network(run, Network(read_run(run).config.network)).step == 5
+
+
+def test_a_run_is_not_overwritten_unasked(scene: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "checkpoint.safetensors").read_bytes()
+    assert "--overwrite" in fails(capsys, "train", scene, run, "--steps", 1)
+    assert (run / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_folder_with_other_files_is_not_made_a_run(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert "other files" in fails(capsys, "train", scene, tmp_path, "--steps", 1, "--overwrite")
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_an_imported_scene_is_told_of_and_can_be_used(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("import", scene, tmp_path / "own", "--link")
+    assert re.search(
+        r"own: 9 photographs, 2 of them held out; 1 camera; [\d,]+ sparse points, seen [\d,]+ times",
+        capsys.readouterr().out,
+    )
+    assert (tmp_path / "own" / "transforms.json").is_file()
+    assert "is there already" in fails(capsys, "import", scene, tmp_path / "own")
+    assert "no posed photographs" in fails(capsys, "import", tmp_path, tmp_path / "other")
+    call("evaluate", tmp_path / "own", tmp_path / "floor", "--method", "sparse-depth", "--width", 48, "-q")
+    names = json.loads((tmp_path / "floor" / "evaluation.json").read_text())["split"]["test"]
+    assert names == ["vegetation_0001.png", "vegetation_0009.png"]
+
+
+def test_users_mistakes_are_one_clear_message(
+    scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no posed photographs" in fails(capsys, "train", tmp_path, tmp_path / "new")
+    assert "cuda:7" in fails(capsys, "train", scene, tmp_path / "new", "--device", "cuda:7")
+    assert "both" in fails(capsys, "train", scene, tmp_path / "new", "--steps", 1, "--minutes", 1)
+    assert "holds no run" in fails(capsys, "evaluate", tmp_path)
+    assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
+    assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
+    assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_method_without_training_is_evaluated_on_a_scene(scene: Path, tmp_path: Path) -> None:
+    call("evaluate", scene, tmp_path / "floor", "--method", "sparse-depth", "--width", 48, "-q")
+    report = json.loads((tmp_path / "floor" / "evaluation.json").read_text())
+    assert report["width"] == 48
+    assert report["configuration"] == {"method": "sparse-depth"}
+
+
+def test_the_demonstration_makes_all_that_it_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def smaller(category: str, seed: int, views: int, width: int) -> synthetic.Survey:
+        return make_survey(category, seed, views, width=width // 10, supersample=1)
+
+    monkeypatch.setattr(synthetic, "make_survey", smaller)
+    monkeypatch.setattr(demonstration, "FRAMES", 4)
+    out = tmp_path / "demo"
+    call("demo", out, "--minutes", 0.01, "--device", "cpu")
+    named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("What was made:")[1].strip().splitlines()]
+    names = ["scene", "run/evaluation.json", "side-by-side.png", "run/pictures", "fly-through.mp4"]
+    assert named == [out / name for name in names]
+    assert all(path.exists() for path in named)
+
+
+def test_progress_is_told_where_there_is_no_terminal(
+    scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(meter, "LINE_SECONDS", 0.0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    command = "evaluate", scene, tmp_path / "floor", "--method", "sparse-depth", "--width", 40, "--overwrite"
+    call(*command)
+    told = capfd.readouterr()
+    assert re.search(r"^\d\d:\d\d:\d\d Reading photographs: 9 of 9$", told.err, flags=re.MULTILINE)
+    assert re.search(r"^\d\d:\d\d:\d\d Evaluating: 2 of 2$", told.err, flags=re.MULTILINE)
+    assert "Evaluating" not in told.out
+    call(*command, "-q")
+    told = capfd.readouterr()
+    assert (told.out, told.err) == ("", "")
+
+
+def test_help_does_not_import_torch() -> None:
+    code = "import sys; sys.argv = ['tidefield', '--help']\nfrom tidefield import cli\n"
+    code += "try:\n    cli.main()\nexcept SystemExit:\n    assert 'torch' not in sys.modules\n    print('fine')\n"
+    start = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("fine\n"), time.monotonic() - start

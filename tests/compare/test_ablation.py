@@ -1,0 +1,94 @@
+"""The ablation: variants change one thing, and the table says what each of them brings."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from comparisons import Children, evaluation, quiet
+from scenes_on_disk import PINHOLE, survey, write_colmap
+
+from tidefield.compare.ablation import ablation_tables, variants, verdicts
+from tidefield.compare.results import Result, Results, read_results
+from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
+from tidefield.compare.write import write_ablation
+from tidefield.config import PAPER, SWIFT, EncoderConfig, config_from_json, config_to_json
+from tidefield.data.load import load_scene
+from tidefield.errors import RunError
+from tidefield.model.network import Network
+from tidefield.options import Ablate
+from tidefield.variants import VARIANTS, vary
+
+SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, preset="paper")
+
+
+@pytest.mark.parametrize("preset", [SWIFT, PAPER], ids=lambda config: config.preset)
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_variant_is_a_network_that_a_run_can_store(name: str, preset):
+    varied = vary(preset, name)
+    assert config_from_json(json.loads(json.dumps(config_to_json(varied)))) == varied
+    assert varied.train == preset.train
+    small = replace(varied.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), instance_norm=False))
+    assert sum(p.numel() for p in Network(small).parameters()) > 0
+    itself = {f"degree-{preset.network.harmonics_degree}", f"views-{preset.network.views}"}
+    assert (varied == preset) == (name in itself)
+
+
+def test_there_is_no_other_variant():
+    with pytest.raises(RunError, match="no variant colourless: expected one of no-neighbours"):
+        vary(SWIFT, "colourless")
+
+
+def test_variants_are_trained_like_the_network_itself():
+    names = variants(("views-2",))
+    assert names == ("tidefield", OTHER_SEED, "views-2")
+    whole, other, fewer = (commands(Path("S"), Path("F"), name, SETTINGS)["train"] for name in names)
+    assert whole[3:5] == ["--preset", "paper"]
+    assert fewer == [*whole[:5], "--variant", "views-2", *whole[5:]]
+    assert other == [*whole[:-1], "1"]
+    assert len(variants(Ablate.variants)) == 2 + len(VARIANTS)
+
+
+def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    scene = load_scene(tmp_path / "flats", width=48)
+    psnr = {"tidefield": 30.0, OTHER_SEED: 30.2, "views-2": 27.0, "degree-0": 29.85}
+    by = {("flats", name): Result(evaluation(scene, value)) for name, value in psnr.items()}
+    by["creek", "tidefield"] = Result(evaluation(scene, 25.0))
+    table, other = ablation_tables(Results(("flats", "creek"), (*psnr, "field"), by))
+    assert [row[-1] for row in table.rows] == ["-", "+0.20", "-3.00", "-0.15, within the noise"]
+    assert table.rows[2][:2] == ["views-2", "27.00"]
+    assert "flats" in table.title
+    assert [row[:2] for row in other.rows] == [["tidefield", "25.00"]]
+
+
+def test_what_brings_nothing_on_any_scene_gets_a_line_that_says_so(tmp_path: Path):
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    scene = load_scene(tmp_path / "flats", width=48)
+    psnr = {
+        "flats": {
+            "tidefield": 30.0,
+            OTHER_SEED: 30.2,
+            "views-2": 27.0,
+            "degree-0": 29.85,
+            "field": 31.0,
+            "views-8": 29.0,
+        },
+        "creek": {"tidefield": 25.0, "views-2": 25.01, "degree-0": 25.04, "field": 25.2, "views-8": 25.3},
+    }
+    by = {(name, method): Result(evaluation(scene, value)) for name, of in psnr.items() for method, value in of.items()}
+    lines = verdicts(Results(tuple(psnr), (*psnr["flats"], "no-neighbours"), by))
+    assert [line.rpartition(": ")[2] for line in lines] == ["views-2.", "field.", "degree-0."]
+    assert "brings nothing" in lines[2]
+
+
+def test_an_ablation_is_run_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    run, names = Children(load_scene(tmp_path / "flats", width=48)), variants(("views-2",))
+    compare({"flats": tmp_path / "flats"}, names, SETTINGS, tmp_path / "out", run, quiet)
+    results = read_results(tmp_path / "out", ["flats"], names)
+    files = write_ablation(results, SETTINGS, tmp_path / "out")
+    assert [file.name for file in files] == ["ablation.md", "ablation.tex", "ablation.csv", "ablation.json"]
+    assert "| views-2 |" in files[0].read_text()
+    assert len(json.loads(files[3].read_text())["results"]) == 3

@@ -1,0 +1,280 @@
+"""Comparisons: what is run and what is not run again, tables in every form, figures and curves."""
+
+import csv
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import textured_wall as wall
+from comparisons import SETTINGS, Children, quiet
+from PIL import Image
+from rich.console import Console
+from scenes_on_disk import PINHOLE, survey, write_colmap
+
+import tidefield.commands.peers
+from tidefield import cli
+from tidefield.compare import published
+from tidefield.compare.figures import most_different, side_by_side, write_curves
+from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
+from tidefield.compare.record import write_json
+from tidefield.compare.results import figures_of, read_figures, read_results
+from tidefield.compare.run import METHODS, Settings, commands, compare
+from tidefield.compare.table import Table
+from tidefield.compare.tables import cost_table, paper_table, quality_tables
+from tidefield.compare.write import write_comparison
+from tidefield.data.load import load_scene
+from tidefield.device import choose_device
+from tidefield.errors import RunError, SceneError
+from tidefield.options import Compare
+
+
+@pytest.fixture
+def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    return tmp_path / "flats"
+
+
+def test_every_method_is_trained_and_evaluated_once(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    methods, out = ("tidefield", "nerfacto", "nearest"), tmp_path / "out"
+    compare({"flats": disk}, methods, SETTINGS, out, run, quiet)
+    assert [words[0] for words in run.words] == ["train", "evaluate", "train", "evaluate", "evaluate"]
+    first, peer, floor = run.words[0], run.words[2], run.words[4]
+    assert first[3:5] == ["--preset", "swift"]
+    assert peer[3:5] == ["--method", "nerfacto"]
+    assert floor[3:5] == ["--method", "nearest"]
+    for words in (first, peer):
+        assert words[5:8] == ["--minutes", "10", "--curve"]
+        assert words[8:10] == ["--width", "48"]
+    compare({"flats": disk}, (*methods, "nerf"), SETTINGS, out, run, quiet)
+    assert [words[0] for words in run.words[5:]] == ["train", "evaluate"]
+    record = json.loads((out / "runs" / "flats" / "nerf" / "process.json").read_text())
+    assert record["train"]["seconds"] == 12.5
+    assert record["settings"]["scene"] == str(disk.resolve())
+    assert record["evaluate"]["command"] == "tidefield evaluate RUN --device cpu"
+
+
+def test_zero_shot_is_with_the_weights_of_its_preset() -> None:
+    for method, preset in (("zero-shot", "swift"), ("paper-zero-shot", "paper")):
+        asked = commands(Path("data"), Path("run"), method, SETTINGS)
+        assert list(asked) == ["evaluate"]
+        assert asked["evaluate"][3:6] == ["--zero-shot", "--preset", preset]
+
+
+def test_a_training_that_broke_off_begins_anew_and_one_that_ended_does_not(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    run.fails_at = 2
+    with pytest.raises(RunError, match="it broke"):
+        compare({"flats": disk}, ("tidefield",), SETTINGS, tmp_path / "out", run, quiet)
+    compare({"flats": disk}, ("tidefield",), SETTINGS, tmp_path / "out", run, quiet)
+    assert [words[0] for words in run.words] == ["train", "evaluate", "evaluate"]
+    broken = tmp_path / "out" / "runs" / "flats" / "nerf"
+    broken.mkdir(parents=True)
+    (broken / "run.json").write_text("{}")
+    compare({"flats": disk}, ("nerf",), SETTINGS, tmp_path / "out", run, quiet)
+    assert run.words[3][-1] == "--overwrite"
+
+
+def test_results_of_other_settings_are_not_mixed_in(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    compare({"flats": disk}, ("tidefield", "nearest"), SETTINGS, tmp_path / "out", run, quiet)
+    longer = Settings(minutes=20.0, steps=None, width=48, device="cpu", seed=1)
+    compare({"flats": disk}, ("nearest",), longer, tmp_path / "out", run, quiet)  # is not trained
+    with pytest.raises(RunError, match=r"was made with .*'minutes': 10.0.*'minutes': 20.0.*name another folder"):
+        compare({"flats": disk}, ("tidefield",), longer, tmp_path / "out", run, quiet)
+
+
+def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
+    scene, out = load_scene(disk, width=48), tmp_path / "out"
+    compare({"flats": disk}, ("tidefield", "nearest"), SETTINGS, out, Children(scene), quiet)
+    results = read_results(out, ["flats"], ["tidefield", "nerfacto", "nearest"])
+    files = write_comparison(results, {"flats": disk}, SETTINGS, out)
+    assert [file.relative_to(out).as_posix() for file in files] == [
+        "tables.md",
+        "tables.tex",
+        "tables.csv",
+        "comparison.json",
+        "figures/flats.png",
+        "curves.png",
+    ]
+    page = (out / "tables.md").read_text()
+    assert "| flats | 20.00 | - | **28.00** |" in page
+    assert "LPIPS, VGG" in page
+    assert "LPIPS with alexnet-owt-7be5be79.pth, as it is published (SHA-256 7be5be79" in page
+    assert "LPIPS with vgg16-397923af.pth, which is another file than the published one (SHA-256 ffff" in page
+    assert "LPIPS, AlexNet, all pixels (" not in page, "of what nobody has there is no table"
+    assert "| flats, tidefield | 10.0 | 7 | 0.50 | 1,234 | 3.00, 3.00 |" in page
+    numbers = json.loads((out / "comparison.json").read_text())
+    assert numbers["settings"]["minutes"] == 10
+    assert numbers["results"][0]["curve"] == [[10.0, 20.5], [600.0, 25.0]]
+    assert str(tmp_path) not in (out / "comparison.json").read_text(), "where things lie here is nobody's business"
+    again = read_figures([out / "comparison.json", tmp_path / "none.json"], ["other"], results.methods)
+    assert quality_tables(again) == quality_tables(results)
+    assert cost_table(again) == cost_table(results)
+    with Image.open(out / "figures" / "flats.png") as figure:
+        assert figure.width == 3 * 320 + 2 * 4
+
+
+def test_the_best_stands_out_and_means_need_every_scene(disk: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    run = Children(load_scene(disk, width=48))
+    compare({"a": disk, "b": disk}, ("tidefield",), SETTINGS, out, run, quiet)
+    compare({"a": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    results = read_results(out, ["a", "b"], ["tidefield", "nearest"])
+    (table,) = (t for t in quality_tables(results) if t.title.startswith("PSNR, dB, all pixels ("))
+    assert table.rows == [["a", "20.00", "28.00"], ["b", "20.00", "-"], ["mean", "20.00", "-"]]
+    assert table.bold == {(0, 2)}, "one alone is not the best of anything"
+    (ssim,) = (t for t in quality_tables(results) if t.title.startswith("LPIPS, VGG, all pixels ("))
+    assert "less is better" in ssim.title
+    assert len(cost_table(results).rows) == 3
+
+
+def test_the_last_of_several_comparisons_counts(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    for out, methods in (("one", ("tidefield", "nearest")), ("two", ("tidefield",))):
+        compare({"a": disk}, methods, SETTINGS, tmp_path / out, run, quiet)
+        results = read_results(tmp_path / out, ["a"], methods)
+        results.by["a", "tidefield"].evaluation["mean"]["psnr"] = {"one": 21.0, "two": 22.0}[out]
+        write_json(tmp_path / f"{out}.json", {"results": figures_of(results)})
+    found = read_figures([tmp_path / "one.json", tmp_path / "two.json"], ["b", "a"], ("tidefield", "nearest"))
+    assert found.scenes == ("a",)
+    assert found.metric("a", "tidefield", "psnr") == 22.0
+    assert found.metric("a", "nearest", "psnr") == 28.0
+
+
+def test_published_figures_stand_beside_measured_ones(disk: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    compare({"garden": disk}, ("tidefield",), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
+    results = read_results(out, ["garden", "other"], ["tidefield"])
+    table = paper_table(results, published.TABLE_2, "Table 2")
+    assert table is not None
+    assert table.rows[0][:4] == ["garden", "20.00", "25.01", "23.06"]
+    assert table.rows[1][:4] == ["mean", "20.00", "25.01", "23.06"]
+    assert paper_table(results, published.TABLE_3, "Table 3") is None
+    assert np.mean([v["nerfacto"][0] for v in published.TABLE_2.values()]) == pytest.approx(21.77, abs=0.01)
+    assert np.mean([v["tidefield"][0] for v in published.TABLE_2.values()]) == pytest.approx(24.43, abs=0.01)
+    assert np.mean([v["tidefield"][0] for v in published.TABLE_3.values()]) == pytest.approx(22.49, abs=0.01)
+    assert np.mean([v["nerfacto"][0] for v in published.TABLE_3.values()]) == pytest.approx(22.30, abs=0.01)
+
+
+def test_a_table_in_every_form():
+    table = Table("A & B", ["scene", "x_1"], [["a_b", "1%"], ["c, d", "-"]], frozenset({(0, 1)}))
+    assert table.markdown().splitlines() == [
+        "### A & B",
+        "",
+        "| scene | x_1 |",
+        "| --- | ---: |",
+        "| a_b | **1%** |",
+        "| c, d | - |",
+    ]
+    assert r"a\_b & \textbf{1\%} \\" in table.latex()
+    assert r"\caption{A \& B}" in table.latex()
+    assert list(csv.reader(table.csv().splitlines())) == [["scene", "x_1"], ["a_b", "1%"], ["c, d", ""]]
+
+
+def test_crops_show_where_methods_differ_and_do_not_overlap():
+    truth = np.full((60, 80, 3), 100, np.uint8)
+    one, other = truth.copy(), truth.copy()
+    one[20:26, 50:56] = 200
+    other[40:44, 12:16] = 160
+    everywhere = np.ones((60, 80), bool)
+    corners = most_different(truth, [one, other], everywhere, 16)
+    middles = [(u + 8, v + 8) for u, v in corners]
+    assert np.hypot(middles[0][0] - 53, middles[0][1] - 23) < 9
+    assert np.hypot(middles[1][0] - 14, middles[1][1] - 42) < 9
+    (u, v), _ = most_different(truth, [other], everywhere, 16)
+    assert np.hypot(u + 8 - 14, v + 8 - 42) < 9
+    left = everywhere & (np.arange(80) < 40)
+    (u, v), _ = most_different(truth, [one, other], left, 16)
+    assert np.hypot(u + 8 - 14, v + 8 - 42) < 9, "what does not count is not shown"
+
+
+def test_nothing_is_drawn_of_nothing(tmp_path: Path):
+    results = read_results(tmp_path, ["a"], ["tidefield"])
+    assert not write_curves(results, tmp_path / "curves.png")
+    assert side_by_side(results, "a", wall.scene(wall.cameras(3), test=(1,))) is None
+
+
+def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_path: Path):
+    data, out = tmp_path / "360_v2", tmp_path / "out"
+    with pytest.raises(SceneError, match="none of bicycle"):
+        mipnerf360(data, out)
+    for name, size in (("garden", "images_4"), ("room", "images_2")):
+        shutil.copytree(disk, data / name)
+        for source in (disk / "images").rglob("*.*"):
+            with Image.open(source) as picture:
+                small = picture.resize((picture.width // int(size[-1]), picture.height // int(size[-1])))
+            target = data / name / size / source.relative_to(disk / "images")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            small.save(target)
+    whole = load_scene(disk)
+    for _ in range(2):  # the second time the links are there
+        scenes = mipnerf360(data, out)
+        assert list(scenes) == ["garden", "room"]
+        for name, factor in (("garden", 4), ("room", 2)):
+            scene = load_scene(scenes[name])
+            assert scene.cameras[0].width == whole.cameras[0].width // factor
+            assert scene.test == tuple(range(0, len(scene.names), 8))
+    shutil.rmtree(data / "room" / "images_2")
+    with pytest.raises(SceneError, match="images_2 is not there"):
+        mipnerf360(data, out)
+
+
+def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(SceneError, match="two scenes are named flats"):
+        named([disk, tmp_path / "elsewhere" / "flats"])
+    (tmp_path / "other").symlink_to(disk)
+    assert named([disk, tmp_path / "other"]) == {"flats": disk, "other": tmp_path / "other"}
+    assert set(MIPNERF360) == set(published.TABLE_2)
+    made = []
+
+    def write(survey: object, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        made.append(folder)
+
+    monkeypatch.setattr("tidefield.compare.protocols.make_survey", lambda *_, **__: None)
+    monkeypatch.setattr("tidefield.compare.protocols.write_survey", write)
+    scenes = tidal_flats(tmp_path / "scenes", 100, [disk])
+    assert set(scenes) == set(published.TABLE_3) | {"flats"}
+    assert len(made) == 5
+    tidal_flats(tmp_path / "scenes", 100, [])
+    assert len(made) == 5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest.MonkeyPatch):
+    called, asked = [], commands(Path("data"), Path("run"), method, SETTINGS)
+    monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
+    for name, words in asked.items():
+        _, module, function = cli.COMMANDS[name]
+        where = f"tidefield.commands.{module}.{function}"
+        monkeypatch.setattr(where, lambda *args, name=name, **options: called.append(name))
+        monkeypatch.setattr(sys, "argv", ["tidefield", *words])
+        cli.main()
+    assert called == list(asked)
+
+
+def test_what_is_missing_is_told_before_anything_is_trained(
+    disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr("tidefield.commands.peers.run_measured", lambda *_: pytest.fail("something was run"))
+    for method, message in (
+        ("nerfacto", "run `tidefield baselines install nerfacto`"),
+        ("splatfacto", "expected CUDA"),
+    ):
+        options = Compare((disk,), methods=("tidefield", method), out=tmp_path / "out", device="cpu")
+        with pytest.raises(RunError, match=message):
+            tidefield.commands.peers.compare(options, Console(quiet=True))
+    monkeypatch.setattr("tidefield.commands.peers.find_spec", lambda name: None)
+    with pytest.raises(RunError, match="matplotlib is not installed"):
+        tidefield.commands.peers.compare(Compare((disk,)), Console(quiet=True))
+
+
+def test_the_record_says_which_device_auto_was() -> None:
+    settings = tidefield.commands.peers._settings(Compare(device="auto"), from_scratch=False)
+    assert settings.device == str(choose_device("auto"))

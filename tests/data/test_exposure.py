@@ -1,0 +1,207 @@
+"""Exposure gains: what is planted is found, and held-out pixels play no part."""
+
+import math
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+import torch
+from shared_data import SHARED
+from torch import Tensor
+
+from tidefield.data.exif import Metadata, read_metadata
+from tidefield.data.exposure import disagreement, estimate_gains
+from tidefield.data.images import Photographs
+from tidefield.data.scene import SparsePoints, every_eighth
+from tidefield.geometry.cameras import Cameras
+
+COUNT, WIDTH, HEIGHT, FOCAL, HEIGHT_M = 17, 96, 72, 80.0, 40.0
+TRAIN, TEST = every_eighth(COUNT)
+
+
+class Watched(Photographs):
+    """Photographs that note which of them were asked for."""
+
+    asked: ClassVar[list[int]] = []
+
+    def __getitem__(self, index: int) -> Tensor:
+        self.asked.append(index)
+        return super().__getitem__(index)
+
+
+def ground(xy: Tensor) -> Tensor:
+    """A smooth, colourful ground: values in 40..120 at gain 1."""
+    phase = torch.tensor([0.0, 1.0, 2.0])
+    return 80 + 20 * torch.sin(xy[..., :1] * 0.11 + phase) + 20 * torch.cos(xy[..., 1:] * 0.13 + phase)
+
+
+def survey(gain: Tensor) -> tuple[Watched, Cameras, SparsePoints]:
+    """A nadir strip, one photograph every 6 m, of the smooth ground, each times its gain."""
+    position = torch.stack([torch.arange(COUNT) * 6.0, torch.zeros(COUNT), torch.full((COUNT,), HEIGHT_M)], 1)
+    down = torch.diag(torch.tensor([1.0, -1.0, -1.0])).expand(COUNT, 3, 3)
+    cameras = Cameras(
+        T_world_camera=torch.cat([down, position[:, :, None]], 2),
+        focal_px=torch.full((COUNT, 2), FOCAL),
+        principal_px=torch.tensor([WIDTH / 2, HEIGHT / 2]).expand(COUNT, 2),
+        size_px=torch.tensor([WIDTH, HEIGHT]).expand(COUNT, 2),
+        near_far=torch.tensor([30.0, 50.0]).expand(COUNT, 2),
+        gain=torch.ones(COUNT, 3),
+    )
+    v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    offset = torch.stack([u - WIDTH / 2, HEIGHT / 2 - v], -1) * HEIGHT_M / FOCAL
+    pixels = [(ground(p[:2] + offset) * g).round().clamp(0, 255).byte() for p, g in zip(position, gain, strict=True)]
+    generator = torch.Generator().manual_seed(3)
+    low, high = torch.tensor([-20.0, -15.0]), torch.tensor([116.0, 15.0])
+    xy = low + (high - low) * torch.rand(900, 2, generator=generator)
+    xyz = torch.cat([xy, torch.zeros(900, 1)], 1)
+    uv, _ = cameras.project(xyz)
+    inside = ((uv > 3) & (uv < torch.tensor([WIDTH - 3.0, HEIGHT - 3.0]))).all(-1)
+    camera, point = inside.nonzero(as_tuple=True)
+    return Watched(tuple(pixels)), cameras, SparsePoints(xyz, torch.ones(900), point, camera, uv[inside])
+
+
+def planted(spread: float = 0.25) -> Tensor:
+    """Gains that wander along the flight, channels apart."""
+    step = torch.arange(COUNT)[:, None] * 0.5 + torch.tensor([0.0, 0.4, 0.9])
+    return torch.exp(spread * torch.sin(step))
+
+
+def relative(gain: Tensor) -> Tensor:
+    return gain / gain[list(TRAIN)].log().mean(0).exp()
+
+
+def test_planted_gains_are_recovered_within_one_percent():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    error = (found / relative(truth)).log().abs()
+    assert error[list(TRAIN)].max() < 0.01
+    assert found[list(TRAIN)].log().mean(0).abs().max() < 1e-5
+
+
+def test_gains_take_away_what_photographs_disagreed_about():
+    photographs, cameras, points = survey(planted())
+    before = disagreement(photographs, points, TRAIN, torch.ones(COUNT, 3))
+    after = disagreement(photographs, points, TRAIN, estimate_gains(photographs, cameras, points, TRAIN))
+    assert before[0] > 0.1
+    assert after[0] < 0.01
+    assert math.isnan(disagreement(photographs, points, TRAIN[:1], torch.ones(COUNT, 3))[0])
+
+
+def test_a_held_out_photograph_is_predicted_by_its_neighbours():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    inner = [i for i in TEST if 0 < i < COUNT - 1]
+    assert (found / relative(truth)).log()[inner].abs().max() < 0.05
+    assert relative(truth).log()[inner].abs().max() > 0.1
+
+
+def test_pixels_of_held_out_photographs_change_no_gain():
+    photographs, cameras, points = survey(planted())
+    before = estimate_gains(photographs, cameras, points, TRAIN)
+    for i in TEST:
+        photographs.colours[i].neg_()  # modulo 256
+    photographs.asked.clear()
+    assert torch.equal(estimate_gains(photographs, cameras, points, TRAIN), before)
+    assert not set(photographs.asked) & set(TEST)
+
+
+def test_outliers_like_moving_water_are_tolerated():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    generator = torch.Generator().manual_seed(5)
+    for picture in photographs.colours:
+        row, column = (int(torch.randint(n, (1,), generator=generator)) for n in (HEIGHT - 30, WIDTH - 30))
+        picture[row : row + 30, column : column + 30] = torch.randint(40, 200, (3,), generator=generator).byte()
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.05
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_black_and_saturated_pixels_are_ignored(value: int):
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    for i in range(3, COUNT, 3):
+        photographs.colours[i][:, : WIDTH // 2] = value
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
+
+
+def test_windows_with_glints_are_ignored_although_their_mean_is_not_clipped():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    for i in range(3, COUNT, 3):
+        photographs.colours[i][::2, : 3 * WIDTH // 4 : 2] = 255
+    found = estimate_gains(photographs, cameras, points, TRAIN)
+    assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
+
+
+def test_photographs_that_share_nothing_lean_on_the_ones_before_and_after():
+    truth = planted()
+    photographs, cameras, points = survey(truth)
+    lonely = 5
+    keep = points.camera_index != lonely
+    cut = SparsePoints(
+        points.xyz_world, points.error_px, points.point_index[keep], points.camera_index[keep], points.uv_px[keep]
+    )
+    found = estimate_gains(photographs, cameras, cut, TRAIN)
+    assert (found / relative(truth)).log()[lonely].abs().max() < 0.08
+
+
+def test_the_exposure_of_a_held_out_photograph_counts():
+    log_exposure = torch.zeros(COUNT, dtype=torch.float64)
+    log_exposure[::2] = 0.6
+    truth = torch.exp(0.5 * log_exposure)[:, None].float().expand(COUNT, 3)
+    photographs, cameras, points = survey(truth)
+    metadata = Metadata(log_exposure, torch.full((COUNT,), math.nan, dtype=torch.float64))
+    error = (estimate_gains(photographs, cameras, points, TRAIN, metadata) / relative(truth)).log().abs()
+    without = (estimate_gains(photographs, cameras, points, TRAIN) / relative(truth)).log().abs()
+    assert error.max() < 0.02
+    assert without[list(TEST)].max() > 0.1
+
+
+def test_exposures_that_the_photographs_contradict_are_left_aside():
+    log_exposure = torch.linspace(-1, 1, COUNT, dtype=torch.float64).flip(0)[torch.arange(COUNT) * 5 % COUNT]
+    photographs, cameras, points = survey(torch.ones(COUNT, 3))
+    metadata = Metadata(log_exposure, torch.full((COUNT,), math.nan, dtype=torch.float64))
+    found = estimate_gains(photographs, cameras, points, TRAIN, metadata)
+    assert found.log().abs().max() < 0.02
+
+
+def test_without_sparse_points_the_exposures_decide_and_else_gains_are_one():
+    photographs, cameras, _ = survey(planted())
+    log_exposure = torch.linspace(0, 1, COUNT, dtype=torch.float64)
+    nothing = torch.full((COUNT,), math.nan, dtype=torch.float64)
+    found = estimate_gains(photographs, cameras, None, TRAIN, Metadata(log_exposure, nothing))
+    assert torch.allclose(found[-1].log() - found[0].log(), torch.full((3,), 0.45), atol=1e-5)
+    assert torch.equal(estimate_gains(photographs, cameras, None, TRAIN), torch.ones(COUNT, 3))
+    assert torch.equal(
+        estimate_gains(photographs, cameras, None, TRAIN, Metadata(nothing, nothing)), torch.ones(COUNT, 3)
+    )
+
+
+SWINDALE = SHARED / "scenes" / "swindale" / "images"
+
+
+@pytest.mark.skipif(not SWINDALE.is_dir(), reason="the swindale photographs are not on this machine")
+def test_exposures_and_times_of_a_real_survey_are_read():
+    metadata = read_metadata([SWINDALE / f"IMG_{n}.jpg" for n in (1481, 1483, 1484)])
+    first, second, third = metadata.log_exposure.tolist()
+    assert first - second == pytest.approx(math.log(2))
+    assert second == third
+    assert metadata.time_s.diff().tolist() == [341.0, 6.0]
+
+
+def test_pictures_without_exif_say_nothing(tmp_path: Path):
+    from PIL import Image
+
+    Image.new("RGB", (8, 8)).save(tmp_path / "plain.png")
+    broken = Image.new("RGB", (8, 8))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x829A] = 0.0
+    exif.get_ifd(0x8769)[0x9003] = "yesterday"
+    broken.save(tmp_path / "odd.jpg", exif=exif)
+    metadata = read_metadata([tmp_path / "plain.png", tmp_path / "odd.jpg"])
+    assert metadata.log_exposure.isnan().all()
+    assert metadata.time_s.isnan().all()

@@ -1,0 +1,152 @@
+"""A ball before a known background, seen from around it."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tidefield.data.depth_prior import surface_prior
+from tidefield.data.hull import Hull, hull_range, visual_hull
+from tidefield.data.images import Photographs
+from tidefield.data.load import load_scene
+from tidefield.geometry.cameras import Cameras, pixel_grid
+
+CENTRE, RADIUS = torch.tensor([5.0, -3.0, 2.0]), 0.8
+
+
+def around(count: int = 24, size: int = 80, distance: float = 4.0) -> Cameras:
+    """Cameras all around the ball, spread evenly over the directions, that look at its middle."""
+    z = 1 - (2 * torch.arange(count) + 1) / count
+    turn = torch.arange(count) * math.pi * (3 - math.sqrt(5))
+    outwards = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
+    forward = -outwards
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.1, 0.2, 1.0]).expand(count, 3)))
+    down = torch.linalg.cross(forward, right)
+    position = CENTRE + distance * outwards
+    return Cameras(
+        T_world_camera=torch.cat([torch.stack([right, down, forward], -1), position[:, :, None]], -1),
+        focal_px=torch.full((count, 2), 1.2 * size),
+        principal_px=torch.full((count, 2), size / 2),
+        size_px=torch.full((count, 2), size),
+        near_far=torch.tensor([[0.5 * distance, 1.5 * distance]]).repeat(count, 1),
+        gain=torch.ones(count, 3),
+    )
+
+
+def front(camera: Cameras) -> Tensor:
+    """True z-depth of the ball in each pixel; nan beside it."""
+    ray = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
+    apart = CENTRE - camera.position_world[0]
+    along, square = ray @ apart, ray.square().sum(-1)
+    root = along.square() - square * (apart.square().sum() - RADIUS**2)
+    return ((along - root.sqrt()) / square).reshape(camera.height, camera.width)
+
+
+def pictures(cameras: Cameras) -> Photographs:
+    alphas = [front(cameras[i]).isfinite().byte() * 255 for i in range(len(cameras))]
+    return Photographs(tuple(torch.zeros(*a.shape, 3, dtype=torch.uint8) for a in alphas), tuple(alphas))
+
+
+def hull_of(cameras: Cameras, train: range) -> Hull:
+    found = visual_hull(cameras, pictures(cameras), train)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("size", [80, 900])
+def test_the_hull_holds_the_ball_and_little_else(size: int):
+    hull = hull_of(around(size=size), range(24))
+    drawn = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0))
+    outwards = torch.nn.functional.normalize(drawn)
+    assert hull.contains(CENTRE + outwards * 0.999 * RADIUS).all()
+    assert hull.contains(CENTRE + outwards * 1.25 * RADIUS).float().mean() < 0.02
+    assert not hull.contains(CENTRE + outwards * 3).any()
+
+
+def test_a_new_views_rays_meet_the_surface_within_the_range():
+    cameras = around(25)
+    hull, new = hull_of(cameras, range(24)), cameras[24]
+    near, far, meets = hull_range(new, hull)
+    truth = front(new)
+    there = truth.isfinite()
+    assert meets[there].all()
+    assert (meets & ~there).float().mean() < 0.06
+    assert ((near <= truth) & (truth <= far))[there].all()
+    assert (truth - near)[there].median() < 0.15
+    assert ((far - near)[there]).max() < 2.6 * RADIUS
+    # Beside it the range is that of all rays that meet it: nothing else is known, and nothing else is there.
+    torch.testing.assert_close(near[0, 0], near.min())
+    torch.testing.assert_close(far[0, 0], far.max())
+
+
+def test_a_view_that_misses_the_hull_has_its_own_range():
+    cameras = around()
+    hull = hull_of(cameras, range(24))
+    away = replace(cameras[0], T_world_camera=cameras[0].T_world_camera * torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    near, far, meets = hull_range(away, hull)
+    assert not meets.any()
+    assert (near == away.near_far[0, 0]).all()
+    assert (far == away.near_far[0, 1]).all()
+
+
+def test_held_out_photographs_leave_no_trace():
+    cameras = around()
+    truth = pictures(cameras)
+    blank = replace(truth, alphas=(*truth.alphas[:20], *(torch.zeros(80, 80, dtype=torch.uint8) for _ in range(4))))
+    one, other = (visual_hull(cameras, photographs, range(20)) for photographs in (truth, blank))
+    assert one is not None
+    assert other is not None
+    assert torch.equal(one.filled, other.filled)
+
+
+def test_nothing_is_known_without_outlines_or_where_they_contradict_each_other():
+    cameras = around()
+    truth = pictures(cameras)
+    assert visual_hull(cameras, replace(truth, alphas=()), range(24)) is None
+    assert visual_hull(cameras, replace(truth, alphas=(None, *truth.alphas[1:])), range(24)) is None
+    assert visual_hull(cameras, truth, range(2)) is None
+    nowhere = tuple(torch.zeros(80, 80, dtype=torch.uint8) for _ in range(24))
+    assert visual_hull(cameras, replace(truth, alphas=nowhere), range(24)) is None
+
+
+def test_the_network_looks_first_within_the_hull():
+    cameras = around(25)
+    hull, new = hull_of(cameras, range(24)), cameras[24]
+    expected, near, far = surface_prior(new, None, cameras, hull)
+    assert expected.shape == (20, 20)
+    middle = front(new)[2::4, 2::4]
+    inside = middle.isfinite() & front(new)[1::4, 1::4].isfinite()
+    assert ((near > 1 / middle) & (1 / middle > far))[inside].all()
+    assert (expected[inside] * middle[inside] - 1).abs().median() < 0.05
+    assert expected[0, 0].isnan()
+    assert near[0, 0] <= near.max()
+
+
+def test_scenes_with_alpha_come_with_a_hull(tmp_path: Path):
+    import json
+
+    from PIL import Image
+
+    cameras = around()
+    (tmp_path / "train").mkdir()
+    frames = []
+    for i, alpha in enumerate(pictures(cameras).alphas):
+        assert alpha is not None
+        Image.fromarray(torch.stack([alpha, alpha // 2, alpha // 3, alpha], -1).numpy()).save(
+            tmp_path / "train" / f"{i}.png"
+        )
+        pose = torch.eye(4)
+        pose[:3] = cameras.T_world_camera[i] * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+        pose[:3, 3] -= CENTRE
+        frames.append({"file_path": f"./train/{i}", "transform_matrix": pose.tolist()})
+    angle = 2 * math.atan(0.5 / 1.2)
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    scene = load_scene(tmp_path)
+    assert scene.points is None
+    assert scene.hull is not None
+    middle = -scene.origin_world.float()
+    assert scene.hull.contains(middle)
+    assert not scene.hull.contains(middle + torch.tensor([0.0, 0.0, 1.5]))

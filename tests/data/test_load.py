@@ -1,0 +1,279 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scenes_on_disk import (
+    BARREL,
+    PINHOLE,
+    UTM,
+    Truth,
+    survey,
+    with_one_larger,
+    write_blender,
+    write_colmap,
+    write_llff,
+    write_pictures,
+    write_transforms,
+)
+from shared_data import SHARED
+
+from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
+from tidefield.errors import SceneError
+
+REAL = SHARED / "scenes"
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def reprojection_px(scene: Scene) -> torch.Tensor:
+    """Distances between observations and where their points project."""
+    points = scene.points
+    assert points is not None
+    uv, depth = scene.cameras.project(points.xyz_world)
+    assert (depth[points.camera_index, points.point_index] > 0).all()
+    return (uv[points.camera_index, points.point_index] - points.uv_px).norm(dim=-1)
+
+
+def assert_poses(scene: Scene, truth: Truth, flat: bool = False) -> None:
+    names = [name.replace("/", "_") if flat else name for name in truth.names]
+    order = np.argsort(names)
+    assert scene.names == tuple(names[i] for i in order)
+    pose = scene.cameras.T_world_camera.double().numpy()
+    np.testing.assert_allclose(pose[:, :, :3], truth.T_world_camera[order][:, :, :3], atol=1e-6)
+    position = pose[:, :, 3] + scene.origin_world.numpy()
+    np.testing.assert_allclose(position, truth.T_world_camera[order][:, :, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_a_colmap_model_is_read_with_its_lenses_removed(tmp_path: Path, text: bool, place: str) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path, truth, text, place)
+    scene = load_scene(tmp_path)
+    assert_poses(scene, truth)
+    assert reprojection_px(scene).max() < 1e-3
+    assert scene.points is not None
+    assert scene.points.error_px.max() < 1e-3
+    assert len(scene.points.uv_px) > 1000
+    assert (scene.points.uv_px < torch.tensor([64, 48])).all()
+    assert scene.test == (0, 8)
+    assert scene.background_rgb is None
+
+
+def test_every_layout_gives_the_same_cameras(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    write_colmap(tmp_path / "colmap", truth)
+    write_transforms(tmp_path / "nerfstudio", truth)
+    write_llff(tmp_path / "llff", truth)
+    expected = load_scene(tmp_path / "colmap").cameras
+    for layout in ("nerfstudio", "llff"):
+        scene = load_scene(tmp_path / layout)
+        assert_poses(scene, truth, flat=layout == "llff")
+        for part in ("T_world_camera", "focal_px", "principal_px", "size_px"):
+            torch.testing.assert_close(getattr(scene.cameras, part), getattr(expected, part))
+
+
+def test_coordinates_as_large_as_a_map_projections_lose_nothing(tmp_path: Path) -> None:
+    truth = survey(BARREL, offset=UTM)
+    write_colmap(tmp_path, truth)
+    scene = load_scene(tmp_path)
+    assert_poses(scene, truth)
+    assert reprojection_px(scene).max() < 1e-3
+
+
+def test_photographs_of_different_sizes_and_cameras_live_in_one_scene(tmp_path: Path) -> None:
+    truth = with_one_larger(survey(BARREL))
+    write_colmap(tmp_path, truth)
+    scene = load_scene(tmp_path)
+    larger = scene.index(truth.names[3])
+    for i in range(9):
+        size = (128, 96) if i == larger else (64, 48)
+        assert scene.cameras.size_px[i].tolist() == list(size)
+        assert scene.photographs[i].shape == (size[1], size[0], 3)
+    assert (scene.photographs[larger].numpy() == truth.pictures[3]).all()
+    assert reprojection_px(scene).max() < 1e-3
+    narrow = load_scene(tmp_path, width=100)
+    assert sorted(set(narrow.cameras.size_px[:, 0].tolist())) == [64, 100]  # reduced, never enlarged
+
+
+def test_a_width_scales_cameras_pictures_and_observations_together(tmp_path: Path) -> None:
+    write_colmap(tmp_path, survey(BARREL))
+    full, half = load_scene(tmp_path), load_scene(tmp_path, width=32)
+    assert half.cameras.size_px.unique(dim=0).tolist() == [[32, 24]]
+    torch.testing.assert_close(half.cameras.focal_px * 2, full.cameras.focal_px)
+    torch.testing.assert_close(half.cameras.principal_px * 2, full.cameras.principal_px)
+    assert half.points is not None
+    assert full.points is not None
+    torch.testing.assert_close(half.points.uv_px * 2, full.points.uv_px)
+    means = full.photographs[2].double().reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))
+    assert (half.photographs[2] - means).abs().max() <= 2  # cubic, where the larger ones were made with Lanczos
+    with pytest.raises(SceneError, match="3 pixels wide"):
+        load_scene(tmp_path, width=3)
+
+
+def test_photographs_reduced_beside_their_model_are_accepted_and_others_refused(tmp_path: Path) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path, truth)
+    for name in truth.names:
+        path = tmp_path / "images" / name
+        Image.open(path).resize((32, 24)).save(path)
+    scene = load_scene(tmp_path)
+    assert scene.cameras.size_px[0].tolist() == [32, 24]
+    assert reprojection_px(scene).max() < 1e-3
+    Image.new("RGB", (48, 64)).save(tmp_path / "images" / truth.names[0])
+    with pytest.raises(SceneError, match=r"photo_8\.png has 48 x 64 pixels, but its camera has 64 x 48.*turned"):
+        load_scene(tmp_path)
+
+
+def test_ranges_hold_what_each_camera_sees_with_room_above_and_below(tmp_path: Path) -> None:
+    write_colmap(tmp_path, survey(BARREL))
+    scene = load_scene(tmp_path)
+    near, far = scene.cameras.near_far.unbind(dim=1)
+    assert ((near > 3) & (near < 6)).all()  # the ground lies 8 to 12 m away, along the axes of tilted cameras
+    assert ((far > 12) & (far < 20)).all()
+
+
+def test_the_layouts_own_split_is_kept(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    files = [f"images/{name}" for name in truth.names]
+    write_transforms(tmp_path, truth, train_filenames=files[:5], val_filenames=files[5:7], test_filenames=files[7:])
+    scene = load_scene(tmp_path)
+    assert {scene.names[i] for i in scene.train} == set(truth.names[:5])
+    assert {scene.names[i] for i in scene.test} == set(truth.names[7:])
+    assert len(scene.names) == 7
+
+
+def test_a_blender_scene_keeps_alpha_split_and_background(tmp_path: Path) -> None:
+    write_blender(tmp_path, {"train": 6, "val": 2, "test": 3})
+    scene = load_scene(tmp_path)
+    assert [scene.names[i] for i in scene.test] == ["test/r_0.png", "test/r_1.png", "test/r_2.png"]
+    assert len(scene.train) == 6
+    assert len(scene.names) == 9
+    assert scene.background_rgb == (1.0, 1.0, 1.0)
+    assert scene.photographs[0][0, 0].tolist() == [255, 255, 255]
+    assert scene.photographs[0][20, 20].tolist() == [200, 100, 0]
+    assert scene.photographs[0][20, 32].tolist() == [227, 177, 127]
+    alpha = scene.photographs.alpha(0)
+    assert alpha is not None
+    assert sorted(alpha.unique().tolist()) == [0, 128, 255]
+    torch.testing.assert_close(scene.cameras.focal_px, torch.full((9, 2), 0.5 * 40 / np.tan(0.35)))
+    torch.testing.assert_close(scene.cameras.near_far, torch.tensor([[2.0, 6.0]]).expand(9, 2))
+    uv, depth = scene.cameras.project((-scene.origin_world[None]).float())  # they all look at the origin
+    torch.testing.assert_close(uv[:, 0], torch.full((9, 2), 20.0))
+    torch.testing.assert_close(depth[:, 0], torch.full((9,), 4.0))
+
+
+def test_llff_bounds_become_ranges_with_a_margin(tmp_path: Path) -> None:
+    write_llff(tmp_path, survey(PINHOLE))
+    near_far = load_scene(tmp_path).cameras.near_far
+    torch.testing.assert_close(near_far, torch.tensor([[6.0, 13.75]]).expand(9, 2))
+
+
+def test_photographs_missing_are_counted_and_named_and_can_be_left_out(tmp_path: Path) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path, truth)
+    gone = [truth.names[i] for i in (0, 4)]
+    for name in gone:
+        (tmp_path / "images" / name).unlink()
+    with pytest.raises(SceneError, match=r"2 of the 9 photographs .*photo_[84]\.png.*--allow-missing"):
+        load_scene(tmp_path)
+    scene = load_scene(tmp_path, allow_missing=True)
+    assert len(scene.names) == 7
+    assert not set(gone) & set(scene.names)
+    assert reprojection_px(scene).max() < 1e-3
+    assert scene.points is not None
+    assert int(scene.points.camera_index.max()) == 6
+
+
+def test_fewer_than_three_photographs_are_refused(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    short = replace(truth, names=truth.names[:2], lenses=truth.lenses[:2], T_world_camera=truth.T_world_camera[:2])
+    write_transforms(tmp_path, replace(short, pictures=truth.pictures[:2]))
+    with pytest.raises(SceneError, match="2 posed photographs: expected at least 3"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("content", [(), ("notes.txt",), ("images/a.png", "images/b.png")])
+def test_a_folder_that_is_no_scene_says_what_was_found_and_what_scenes_look_like(
+    tmp_path: Path, content: tuple[str, ...]
+) -> None:
+    root = tmp_path / "scene"
+    root.mkdir()
+    for name in content:
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).touch()
+    with pytest.raises(SceneError) as caught:
+        load_scene(root)
+    message = str(caught.value)
+    assert f"found: {content[0].split('/')[0] if content else 'nothing'}" in message
+    assert all(layout in message for layout in ("sparse/0", "transforms.json", "transforms_train", "poses_bounds"))
+    with pytest.raises(SceneError, match="not there"):
+        load_scene(root / "nowhere")
+
+
+def _turned(matrix: np.ndarray) -> np.ndarray:
+    return np.diag([1.0, 1.0, -1.0, 1.0]) @ matrix
+
+
+def _scaled(matrix: np.ndarray) -> np.ndarray:
+    return matrix * 1.01
+
+
+def _not_finite(matrix: np.ndarray) -> np.ndarray:
+    return matrix * float("nan")
+
+
+@pytest.mark.parametrize("spoil", [_turned, _scaled, _not_finite])
+def test_poses_that_are_none_are_refused_and_named(tmp_path: Path, spoil: object) -> None:
+    truth = survey(PINHOLE)
+    file = write_transforms(tmp_path, truth)
+    top = json.loads(file.read_text())
+    assert callable(spoil)
+    top["frames"][4]["transform_matrix"] = spoil(np.array(top["frames"][4]["transform_matrix"])).tolist()
+    file.write_text(json.dumps(top))
+    with pytest.raises(SceneError, match=r"the pose of strip_1/photo_4\.png .*(finite|rotation)"):
+        load_scene(tmp_path)
+
+
+def test_rounding_noise_in_rotations_is_mended(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    noise = np.random.default_rng(0).normal(0, 1e-5, (9, 3, 4))
+    write_transforms(tmp_path, replace(truth, T_world_camera=truth.T_world_camera + noise))
+    rotation = load_scene(tmp_path).cameras.T_world_camera[:, :, :3]
+    torch.testing.assert_close(rotation.mT @ rotation, torch.eye(3).expand(9, 3, 3), atol=1e-6, rtol=0)
+
+
+def test_transparent_photographs_of_any_layout_get_a_white_background(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    clear = tuple(np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)]) for picture in truth.pictures)
+    write_transforms(tmp_path, replace(truth, pictures=clear))
+    assert load_scene(tmp_path).background_rgb is None
+    clear[2][:10, :, 3] = 0
+    write_pictures(tmp_path / "images", replace(truth, pictures=clear))
+    scene = load_scene(tmp_path)
+    assert scene.background_rgb == (1.0, 1.0, 1.0)
+    assert (scene.photographs[scene.index(truth.names[2])][:10] == 255).all()
+
+
+@pytest.mark.parametrize("name", ["caliterra", "brighton_beach", "swindale", "turin_lot", "fern", "lego"])
+def test_real_scenes_load_with_sane_ranges_and_points_where_they_were_seen(name: str) -> None:
+    if not (REAL / name).is_dir():
+        pytest.skip(f"{REAL / name} is not there")
+    scene = load_scene(REAL / name, width=100)
+    assert scene.cameras.size_px[:, 0].unique().tolist() == [100]
+    assert torch.isfinite(scene.cameras.near_far).all()
+    assert (scene.cameras.near_far[:, 0] > 0).all()
+    assert (scene.cameras.near_far[:, 0] < scene.cameras.near_far[:, 1]).all()
+    assert min(len(scene.train), len(scene.test)) >= 3
+    if name not in ("fern", "lego"):
+        distance_px = reprojection_px(scene)
+        assert distance_px.max() < 2
+        assert distance_px.median() < 0.1

@@ -1,0 +1,160 @@
+import io
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_wall as wall
+import torch
+from PIL import Image
+from rich.console import Console
+
+from tidefield import __version__
+from tidefield.errors import RunError
+from tidefield.evaluation import evaluate as module
+from tidefield.evaluation.evaluate import evaluate
+from tidefield.evaluation.metrics import METRICS, PSNR_LIMIT_DB, SUFFIXES
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.rendering import Rendering
+
+NAMES = {metric + suffix for metric in METRICS for suffix in SUFFIXES}
+
+
+@pytest.fixture
+def scene():
+    return wall.scene(wall.cameras(3), test=(1,))
+
+
+@pytest.fixture(autouse=True)
+def no_lpips(monkeypatch):
+    monkeypatch.setattr(module, "load_lpips", lambda: {"lpips_alex": "not here", "lpips_vgg": "not here"})
+
+
+def perfect(camera: Cameras) -> Rendering:
+    """The wall itself."""
+    colour = wall.photograph(camera).float() / 255
+    depth = wall.true_depth(camera)
+    return Rendering(colour=colour, depth=depth, opacity=torch.ones_like(depth))
+
+
+def darker(camera: Cameras) -> Rendering:
+    """The wall at an exposure that a colour fit undoes."""
+    return replace(perfect(camera), colour=perfect(camera).colour * 0.8 + 0.05)
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=120)
+
+
+def test_the_report_holds_everything_that_scripts_rely_on(scene, tmp_path):
+    evaluation = evaluate(darker, scene, tmp_path / "out", configuration={"method": "wall"}, console=quiet())
+    report = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert report == evaluation.report
+    assert set(report["per_photograph"]) == {"01.jpg"}
+    for row in (report["mean"], report["per_photograph"]["01.jpg"]):
+        assert set(row) >= NAMES | {"reasons", "seen_share"}
+        missing = {name for name in NAMES if row[name] is None}
+        assert missing == {name for name in NAMES if name.startswith("lpips")}
+        assert row["reasons"] == dict.fromkeys(missing, "not here")
+    assert report["version"] == __version__
+    assert report["configuration"] == {"method": "wall"}
+    assert report["split"] == {"train": ["00.jpg", "02.jpg"], "test": ["01.jpg"]}
+    assert report["width"] == 48
+    assert report["peak_memory_bytes"] > 10_000_000
+    assert report["rays_per_second"] == pytest.approx(48 * 36 / report["seconds_per_frame"])
+
+
+def test_a_colour_fit_undoes_an_exposure(scene, tmp_path):
+    mean = evaluate(darker, scene, tmp_path, configuration={}, console=quiet()).mean
+    assert mean["psnr"] < 25
+    assert mean["psnr_cc"] > 45
+    assert mean["psnr_seen_cc"] > 45
+
+
+def test_a_perfect_method_scores_the_best_values(scene, tmp_path):
+    mean = evaluate(perfect, scene, tmp_path, configuration={}, console=quiet()).mean
+    assert mean["psnr"] == mean["psnr_seen"] == PSNR_LIMIT_DB
+    assert mean["ssim"] == pytest.approx(1)
+    assert mean["flip"] == pytest.approx(0, abs=1e-6)
+
+
+def test_renderings_and_labelled_pictures_are_written(scene, tmp_path):
+    evaluate(darker, scene, tmp_path, configuration={}, console=quiet())
+    with Image.open(tmp_path / "renderings" / "01.png") as picture:
+        bare = np.asarray(picture)
+    expected = (darker(scene.cameras[1]).colour * 255).round().numpy()
+    np.testing.assert_array_equal(bare, expected)
+    with Image.open(tmp_path / "pictures" / "01.png") as labelled:
+        assert labelled.width > 4 * 48
+        assert labelled.height > 36
+
+
+def test_means_are_over_the_photographs_that_have_a_value(tmp_path):
+    # The last camera looks at ground that no training photograph sees.
+    own = wall.cameras(4)
+    pose = own.T_world_camera.clone()
+    pose[3, 0, 3] = 100.0
+    scene = wall.scene(replace(own, T_world_camera=pose), test=(1, 3))
+    report = evaluate(darker, scene, tmp_path, configuration={}, console=quiet()).report
+    seen, unseen = report["per_photograph"]["01.jpg"], report["per_photograph"]["03.jpg"]
+    assert unseen["seen_share"] == 0
+    assert unseen["psnr_seen"] is None
+    assert "psnr_seen" in unseen["reasons"]
+    assert report["mean"]["psnr_seen"] == seen["psnr_seen"]
+    assert report["mean"]["psnr"] == pytest.approx((seen["psnr"] + unseen["psnr"]) / 2)
+
+
+def test_an_evaluation_is_never_overwritten_unasked(scene, tmp_path):
+    (tmp_path / "evaluation.json").write_text("precious")
+    with pytest.raises(RunError, match="choose another, or add --overwrite"):
+        evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())
+    assert (tmp_path / "evaluation.json").read_text() == "precious"
+    assert [path.name for path in tmp_path.iterdir()] == ["evaluation.json"]
+    evaluate(perfect, scene, tmp_path, configuration={}, overwrite=True, console=quiet())
+    assert json.loads((tmp_path / "evaluation.json").read_text())["version"] == __version__
+
+
+def test_a_failed_evaluation_leaves_the_old_report(scene, tmp_path):
+    (tmp_path / "evaluation.json").write_text("precious")
+    with pytest.raises(TypeError):
+        evaluate(perfect, scene, tmp_path, configuration={"not json": {1, 2}}, overwrite=True, console=quiet())
+    assert (tmp_path / "evaluation.json").read_text() == "precious"
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_rendering_that_is_not_finite_is_named(scene, tmp_path):
+    def diverged(camera: Cameras) -> Rendering:
+        return replace(perfect(camera), colour=perfect(camera).colour * torch.nan)
+
+    with pytest.raises(RunError, match=r"01\.jpg holds NaN"):
+        evaluate(diverged, scene, tmp_path, configuration={}, console=quiet())
+
+
+def test_a_scene_without_held_out_photographs_cannot_be_judged(tmp_path):
+    scene = wall.scene(wall.cameras(3), test=())
+    with pytest.raises(RunError, match="holds no photograph out"):
+        evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())
+
+
+def test_an_output_path_that_is_a_file_is_one_clear_error(scene, tmp_path):
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(RunError, match="cannot be written"):
+        evaluate(perfect, scene, tmp_path / "out", configuration={}, console=quiet())
+
+
+def test_the_table_says_what_is_missing_and_why(scene, tmp_path):
+    console = quiet()
+    evaluate(darker, scene, tmp_path, configuration={}, console=console)
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert re.search(r"PSNR dB .*\d\d\.\d\d", text)
+    assert re.search(r"LPIPS VGG .*-", text)
+    assert "No lpips_alex, " in text
+    assert text.count("not here") == 1
+    assert str(tmp_path / "pictures") in text
+
+
+def test_pictures_of_photographs_that_differ_in_their_suffix_only_do_not_collide():
+    names = [str(path) for path in module.picture_names(["a.JPG", "a.png", "strip/b.jpg"])]
+    assert names == ["a.JPG.png", "a.png.png", "strip/b.png"]

@@ -1,0 +1,167 @@
+import pytest
+import torch
+
+from tidefield.errors import RunError
+from tidefield.evaluation import lpips
+from tidefield.evaluation.metrics import score
+
+HAS_TORCHVISION = lpips.prepare_torchvision() is None
+needs_torchvision = pytest.mark.skipif(not HAS_TORCHVISION, reason="torchvision is not installed (the extra [lpips])")
+
+
+@pytest.fixture
+def checkpoints(tmp_path, monkeypatch):
+    """An empty folder where torch hub looks for weights."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture
+def alexnet(checkpoints):
+    """AlexNet with random weights, saved where its trained ones would be."""
+    from torchvision.models import alexnet
+
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        torch.save(alexnet().state_dict(), checkpoints / lpips.BACKBONES["lpips_alex"][1])
+    return checkpoints
+
+
+def noise(seed: int, height: int = 64, width: int = 80) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+
+
+def test_without_torchvision_the_reason_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(lpips, "find_spec", lambda _: None)
+    networks = lpips.load_lpips()
+    assert set(networks) == {"lpips_alex", "lpips_vgg"}
+    assert all(isinstance(reason, str) and "pip install 'tidefield[lpips]'" in reason for reason in networks.values())
+
+
+def test_without_weights_the_reason_names_the_file_and_the_commands(checkpoints, monkeypatch):
+    monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
+    networks = lpips.load_lpips()
+    for metric, (_, file) in lpips.BACKBONES.items():
+        reason = networks[metric]
+        assert isinstance(reason, str)
+        assert "--download-lpips" in reason
+        assert f'curl --create-dirs --output "{checkpoints / file}" {lpips.WEIGHTS_URL}{file}' in reason
+
+
+def test_the_reason_does_not_tell_whose_home_folder_it_was(checkpoints, monkeypatch):
+    monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
+    monkeypatch.setattr(lpips.Path, "home", lambda: checkpoints.parent)
+    reason = lpips.load_lpips()["lpips_vgg"]
+    assert isinstance(reason, str)
+    assert f'--output "$HOME/{checkpoints.name}/vgg16-397923af.pth"' in reason
+    assert str(checkpoints) not in reason
+
+
+def test_a_missing_network_leaves_nulls_with_its_reason_and_all_else_whole():
+    image, truth = noise(1), noise(2)
+    seen = torch.ones(image.shape[:2], dtype=torch.bool)
+    scores = score(image, truth, seen, dict.fromkeys(lpips.BACKBONES, "it is not here"))
+    missing = {name for name, value in scores.values.items() if value is None}
+    assert missing == {metric + s for metric in lpips.BACKBONES for s in ("", "_seen", "_cc", "_seen_cc")}
+    assert {scores.reasons[name] for name in missing} == {"it is not here"}
+
+
+def test_a_download_without_a_connection_says_what_to_do(checkpoints, monkeypatch):
+    def fail(url: str, dst: str, hash_prefix: str) -> None:
+        assert url == lpips.WEIGHTS_URL + "alexnet-owt-7be5be79.pth"
+        assert hash_prefix == "7be5be79"
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(torch.hub, "download_url_to_file", fail)
+    with pytest.raises(RunError, match=r"no route to host.*try again"):
+        lpips.download_lpips_weights()
+
+
+def test_weights_that_are_there_are_not_downloaded_again(checkpoints, monkeypatch):
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("downloaded"))
+    for _, file in lpips.BACKBONES.values():
+        (checkpoints / file).write_bytes(b"there")
+    assert [path.name for path in lpips.download_lpips_weights()] == [file for _, file in lpips.BACKBONES.values()]
+
+
+@needs_torchvision
+def test_a_damaged_file_of_weights_is_a_reason_not_an_error(checkpoints):
+    for content in (b"", b"not weights"):
+        path = checkpoints / lpips.BACKBONES["lpips_alex"][1]
+        path.write_bytes(content)
+        reason = lpips.load_lpips()["lpips_alex"]
+        assert isinstance(reason, str)
+        assert str(path) in reason
+        assert "curl" in reason
+
+
+@needs_torchvision
+def test_a_full_mask_gives_lpips_as_the_library_does(alexnet):
+    from torchmetrics.functional.image.lpips import learned_perceptual_image_patch_similarity
+
+    network = lpips.load_lpips()["lpips_alex"]
+    assert isinstance(network, lpips.Lpips)
+    image, truth = noise(1), noise(2)
+    # torchmetrics finds the same (random) weights in the same place.
+    pair = [x.permute(2, 0, 1)[None] / 255 for x in (image, truth)]
+    expected = float(learned_perceptual_image_patch_similarity(*pair, net_type="alex", normalize=True))
+    everywhere = torch.ones(64, 80, dtype=torch.bool)
+    assert network(image, truth, [everywhere])[0] == pytest.approx(expected, rel=1e-5)
+    assert expected > 0
+    others = [network(image, noise(3), [everywhere])[0], network(image, truth, [everywhere])[0]]
+    assert others[1] == pytest.approx(expected, rel=1e-5)
+    assert others[0] != others[1], "of another truth, other features"
+
+
+@needs_torchvision
+def test_a_mask_keeps_far_differences_out(alexnet):
+    network = lpips.load_lpips()["lpips_alex"]
+    assert isinstance(network, lpips.Lpips)
+    image = noise(1, 128, 256)
+    truth = image.clone()
+    truth[:, 192:] = noise(2, 128, 256)[:, 192:]
+    left, right = torch.zeros(2, 128, 256, dtype=torch.bool)
+    left[:, :64], right[:, 192:] = True, True
+    near, far = network(image, truth, [right, left])
+    assert far < 0.02 * near
+
+
+@needs_torchvision
+def test_loading_leaves_the_random_numbers_alone(alexnet):
+    before = torch.get_rng_state()
+    lpips.load_lpips()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_operators_are_declared_only_when_torchvision_failed_to_register_them(monkeypatch):
+    failures = [RuntimeError("operator torchvision::nms does not exist")]
+    imported, declared = [], []
+
+    def importing(name: str) -> None:
+        imported.append(name)
+        if failures:
+            raise failures.pop()
+
+    monkeypatch.setattr(lpips, "find_spec", lambda _: True)
+    monkeypatch.setattr(lpips, "import_module", importing)
+    monkeypatch.setattr(lpips.sys, "modules", dict(lpips.sys.modules))
+    monkeypatch.setattr(torch.library, "define", lambda name, schema: declared.append(name))
+    assert lpips.prepare_torchvision() is None
+    assert (imported, declared) == (["torchvision"] * 2, ["torchvision::nms", "torchvision::qnms"])
+    assert lpips.prepare_torchvision() is None
+    assert len(declared) == 2
+
+
+def test_a_torchvision_of_another_kind_of_failure_is_a_reason(monkeypatch):
+    def importing(name: str) -> None:
+        raise RuntimeError("compiled with different CUDA versions")
+
+    monkeypatch.setattr(lpips, "find_spec", lambda _: True)
+    monkeypatch.setattr(lpips, "import_module", importing)
+    reason = lpips.load_lpips()["lpips_vgg"]
+    assert isinstance(reason, str)
+    assert "different CUDA versions" in reason
+    assert "pip install --upgrade" in reason

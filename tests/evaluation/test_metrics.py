@@ -1,0 +1,145 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tidefield.evaluation.lpips import BACKBONES
+from tidefield.evaluation.metrics import (
+    METRICS,
+    PSNR_LIMIT_DB,
+    SUFFIXES,
+    colour_fitted,
+    flip_map,
+    psnr,
+    score,
+    ssim_map,
+)
+from tidefield.model.rendering import to_8_bit
+
+NO_LPIPS = dict.fromkeys(BACKBONES, "no weights here")
+
+
+def noise(height: int = 24, width: int = 32, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+
+
+def full(image: torch.Tensor) -> torch.Tensor:
+    return torch.ones(image.shape[:2], dtype=torch.bool)
+
+
+def left_half(image: torch.Tensor) -> torch.Tensor:
+    mask = full(image)
+    mask[:, image.shape[1] // 2 :] = False
+    return mask
+
+
+def test_psnr_of_a_known_offset():
+    truth = torch.full((10, 12, 3), 100, dtype=torch.uint8)
+    assert psnr(truth + 10, truth, full(truth)) == pytest.approx(20 * math.log10(255 / 10))
+
+
+def test_psnr_of_identical_images_is_the_documented_limit():
+    assert psnr(noise(), noise(), full(noise())) == PSNR_LIMIT_DB
+
+
+def test_a_masked_psnr_counts_the_masked_pixels_only():
+    truth = torch.full((10, 12, 3), 100, dtype=torch.uint8)
+    image = truth.clone()
+    image[:, :6] += 10
+    image[:, 6:] += 90
+    assert psnr(image, truth, left_half(truth)) == pytest.approx(20 * math.log10(255 / 10))
+
+
+def test_colours_are_clipped_and_rounded_to_8_bits():
+    colour = torch.tensor([-0.1, 0.4 / 255, 0.6 / 255, 254.4 / 255, 1.7, 0.5]).expand(3, 6).T.reshape(2, 3, 3)
+    assert to_8_bit(colour)[..., 0].flatten().tolist() == [0, 0, 1, 254, 255, 128]
+
+
+def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Eq. 13 written out: an 11x11 Gaussian window around each pixel of one channel, borders mirrored."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    x, y = (np.pad(v, 5, mode="reflect") for v in (x, y))
+    result = np.empty((x.shape[0] - 10, x.shape[1] - 10))
+    for row, column in np.ndindex(*result.shape):
+        a, b = x[row : row + 11, column : column + 11], y[row : row + 11, column : column + 11]
+        mean_a, mean_b = (window * a).sum(), (window * b).sum()
+        var_a, var_b = (window * (a - mean_a) ** 2).sum(), (window * (b - mean_b) ** 2).sum()
+        cov = (window * (a - mean_a) * (b - mean_b)).sum()
+        luminance = (2 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2)
+        result[row, column] = luminance * (2 * cov + 0.03**2) / (var_a + var_b + 0.03**2)
+    return result
+
+
+def test_ssim_is_the_formula_with_an_11_by_11_gaussian():
+    image, truth = noise(13, 15, seed=1), noise(13, 15, seed=2)
+    image = (image // 2 + truth // 2).to(torch.uint8)
+    expected = [brute_force_ssim(image[..., c].numpy() / 255, truth[..., c].numpy() / 255) for c in range(3)]
+    np.testing.assert_allclose(ssim_map(image, truth).numpy(), np.mean(expected, axis=0), atol=1e-6)
+
+
+def test_identical_images_have_ssim_1_and_flip_0():
+    assert ssim_map(noise(), noise()).min() == pytest.approx(1)
+    assert flip_map(noise(), noise()).max() == pytest.approx(0, abs=1e-6)
+
+
+def test_flip_is_largest_where_the_images_differ():
+    truth = torch.full((40, 60, 3), 120, dtype=torch.uint8)
+    image = truth.clone()
+    image[15:25, 25:35] = torch.tensor([250, 20, 20], dtype=torch.uint8)
+    difference = flip_map(image, truth)
+    assert difference[17:23, 27:33].min() > 0.5
+    assert difference[:, :10].max() < 0.01
+
+
+def test_the_colour_fit_recovers_a_known_colour_map():
+    image = noise() // 2 + 50
+    mixing = torch.tensor([[0.8, 0.1, 0.05], [0.05, 0.7, 0.1], [0.0, 0.1, 0.9]], dtype=torch.double)
+    truth = (image.double() @ mixing + torch.tensor([5.0, -7.0, 3.0])).round().to(torch.uint8)
+    assert (colour_fitted(image, truth, full(image)).int() - truth.int()).abs().max() <= 1
+
+
+def test_the_colour_fit_sees_the_masked_pixels_only():
+    image = noise() // 2
+    truth = image.clone()
+    mask = left_half(image)
+    truth[~mask] = 255
+    assert torch.equal(colour_fitted(image, truth, mask), image)
+
+
+def test_the_colour_fit_of_one_flat_colour_is_the_mean_of_the_truth():
+    truth = noise()
+    flat = torch.full_like(truth, 77)
+    expected = truth.double().mean((0, 1)).round().to(torch.uint8).expand_as(truth)
+    assert torch.equal(colour_fitted(flat, truth, full(truth)), expected)
+
+
+def test_a_full_mask_changes_no_metric():
+    scores = score(noise(seed=1), noise(seed=2), full(noise()), NO_LPIPS)
+    for metric in ("psnr", "ssim", "flip"):
+        assert scores.values[metric + "_seen"] == scores.values[metric]
+        assert scores.values[metric + "_seen_cc"] == scores.values[metric + "_cc"]
+
+
+def test_masked_metrics_are_the_mean_of_the_map_over_the_mask():
+    image, truth = noise(seed=1), noise(seed=2)
+    mask = left_half(image)
+    scores = score(image, truth, mask, NO_LPIPS).values
+    assert scores["ssim_seen"] == pytest.approx(float(ssim_map(image, truth)[:, :16].mean()))
+    assert scores["flip_seen"] == pytest.approx(float(flip_map(image, truth)[:, :16].mean()))
+    fitted = colour_fitted(image, truth, mask)
+    assert scores["psnr_seen_cc"] == pytest.approx(psnr(fitted, truth, mask))
+
+
+def test_exactly_the_missing_values_have_a_reason():
+    nothing_seen = torch.zeros(24, 32, dtype=torch.bool)
+    scores = score(noise(seed=1), noise(seed=2), nothing_seen, NO_LPIPS)
+    assert set(scores.values) == {metric + suffix for metric in METRICS for suffix in SUFFIXES}
+    assert set(scores.reasons) == {name for name, value in scores.values.items() if value is None}
+    assert scores.values["psnr_seen"] is None
+    assert "none of this photograph's pixels" in scores.reasons["psnr_seen"]
+    assert scores.values["psnr_cc"] is not None
+    assert "at least 32 pixels" in scores.reasons["lpips_alex"]

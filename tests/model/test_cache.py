@@ -1,0 +1,73 @@
+"""Features kept in blocks: every tile finds what it shows, whatever is forgotten meanwhile."""
+
+import pytest
+import textured_wall as wall
+import torch
+
+from tidefield.config import SWIFT
+from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
+from tidefield.model import cache as shelf
+from tidefield.model.cache import CacheFull, FeatureCache
+from tidefield.model.network import Network
+from tidefield.model.renderer import Renderer
+
+CPU = torch.device("cpu")
+TARGET = 3
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shelf, "BLOCK_PX", 64)
+    monkeypatch.setattr(shelf, "OVERLAP_PX", 32)
+
+
+@pytest.fixture(scope="module")
+def network() -> Network:
+    torch.manual_seed(0)
+    return Network(SWIFT.network).eval()
+
+
+def scene():
+    return wall.scene(wall.cameras(7, 160, 96, step=0.25), (TARGET,))
+
+
+@pytest.mark.usefixtures("small_blocks")
+@torch.inference_mode()
+def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
+    at = scene()
+    seen_uv = torch.tensor([[20.0, 15.0], [60.0, 40.0], [81.0, 48.0], [150.0, 90.0]])
+    view = at.cameras[1]
+    middle = view.position_world + 5 * view.directions_world(seen_uv[None])[0]
+    neighbours = torch.full((len(seen_uv), 1), 1)
+    views = FeatureCache(network, at, CPU).views(Neighbours(neighbours, torch.ones(4, 1, 4)), middle)
+    # Eight pixels around each middle, seen along rays of the view itself.
+    around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
+    directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
+    found = views.read(
+        1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5), detail=True
+    )
+    assert found.valid.all()
+    assert len(views.which.unique()) == 4
+    column, row = around.reshape(-1, 2).long().unbind(-1)
+    truth = at.photographs[1][row.clamp(max=95), column.clamp(max=159)].float() / 255
+    # Bilinear between pixels against the nearest pixel of a smooth wall.
+    assert (found.colours.reshape(-1, 3) - truth).abs().mean() < 0.08
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_what_was_forgotten_is_encoded_again_alike(network: Network):
+    at = scene()
+    roomy, cramped = (Renderer(network, at, SWIFT, CPU) for _ in range(2))
+    cramped.shelf = FeatureCache(network, at, CPU, budget_bytes=1)
+    assert roomy.shelf is not None
+    assert cramped.shelf.slots == SWIFT.network.views + EXTRA_VIEWS < roomy.shelf.slots
+    one, other = (renderer(at.cameras[TARGET]) for renderer in (roomy, cramped))
+    torch.testing.assert_close(one.colour, other.colour, atol=1e-4, rtol=0)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_more_blocks_than_slots_are_refused(network: Network):
+    cramped = FeatureCache(network, scene(), CPU, budget_bytes=1)
+    neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 3]])
+    with pytest.raises(CacheFull):
+        cramped.views(Neighbours(neighbours, torch.ones(2, 5, 4)), torch.zeros(2, 3))

@@ -1,0 +1,260 @@
+"""The boxes together: a textured wall that untrained and randomly weighted networks look at."""
+
+from dataclasses import replace
+
+import pytest
+import textured_wall as wall
+import torch
+from networks import CPU, FIELD, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
+from torch import Tensor, nn
+
+from tidefield.config import PAPER, SWIFT, Config
+from tidefield.data.neighbours import Neighbours
+from tidefield.data.scene import Scene
+from tidefield.data.surface import in_frame
+from tidefield.model.cache import FeatureCache
+from tidefield.model.intervals import Intervals
+from tidefield.model.network import Network, TileRendering, Tiles
+from tidefield.model.renderer import Renderer
+from tidefield.model.stage import place_samples
+
+
+def finite_forward_and_backward(own: Network, result: TileRendering) -> set[str]:
+    """The boxes that learn from a rendering, all of whose values and gradients must be finite."""
+    assert all(part.isfinite().all() for part in outputs(result))
+    sum(part.square().mean() for part in outputs(result)).backward()  # type: ignore[union-attr]
+    for name, parameter in own.named_parameters():
+        assert parameter.grad is None or parameter.grad.isfinite().all(), name
+    return {n.split(".")[0] for n, p in own.named_parameters() if p.grad is not None and p.grad.abs().max() > 0}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("opaque", [True, False])
+def test_every_kind_of_network_is_finite_forward_and_backward(name: str, opaque: bool):
+    own = network(NETWORKS[name], stir=0.02)
+    tiles, views, start = looking(own, scene())
+    result = own(tiles, views, start, opaque, torch.Generator().manual_seed(0))
+    assert result.colour.shape == (2, 256, 3)
+    assert result.depth.shape == result.opacity.shape == (2, 256)
+    assert len(result.expected) == len(result.glimpses) + 1 == len(own.stages)
+    assert (result.opacity <= 1 + 1e-5).all()
+    assert ((result.depth > 3 - 1e-3) & (result.depth < 10 + 1e-2)).all()
+    boxes = ({"encoder"} if own.config.views else set()) | ({"field"} if own.field else set())
+    assert finite_forward_and_backward(own, result) >= boxes | {"stages", "colour"}
+
+
+@pytest.mark.parametrize("name", ["swift", "paper", "swift and field"])
+def test_rays_that_no_view_sees_are_finite_and_only_a_field_can_stop_them(name: str):
+    own, at = network(NETWORKS[name], stir=0.02), scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 100
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose), points=None)
+    tiles, views, start = looking(own, at)
+    result = own(tiles, views, start, True)
+    finite_forward_and_backward(own, result)
+    if own.field:
+        torch.testing.assert_close(result.opacity, torch.ones(2, 256))
+    else:
+        assert not result.opacity.any()
+        assert not result.colour.any()
+
+
+@pytest.mark.parametrize("name", ["swift", "paper"])
+def test_where_views_see_an_opaque_scene_all_light_is_stopped(name: str):
+    own = network(NETWORKS[name], stir=0.02)
+    result = own(*looking(own, scene()), True)
+    torch.testing.assert_close(result.opacity, torch.ones(2, 256), atol=1e-4, rtol=0)
+
+
+def test_a_scene_a_thousand_times_as_large_has_the_same_colours():
+    own, at = network(SWIFT.network, stir=0.02).eval(), scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[:, :, 3] *= 1000
+    assert at.points is not None
+    larger = replace(
+        at,
+        cameras=replace(at.cameras, T_world_camera=pose, near_far=at.cameras.near_far * 1000),
+        points=replace(at.points, xyz_world=at.points.xyz_world * 1000),
+    )
+    with torch.inference_mode():
+        one, other = own(*looking(own, at), True), own(*looking(own, larger), True)
+    torch.testing.assert_close(one.colour, other.colour, atol=2e-3, rtol=0)
+    torch.testing.assert_close(one.depth * 1000, other.depth, atol=0, rtol=2e-3)
+
+
+def depth_errors(config: Config, at: Scene) -> Tensor:
+    """Relative depth errors of a view by an untrained network, where the neighbours see the wall well."""
+    own = network(config.network).eval()
+    rendering = Renderer(own, at, config, CPU)(at.cameras[TARGET])
+    truth = wall.true_depth(at.cameras[TARGET])
+    return ((rendering.depth - truth).abs() / truth)[4:-4, 8:-8]
+
+
+def test_untrained_views_that_agree_find_the_wall_without_any_sparse_points():
+    error = depth_errors(SWIFT, replace(scene(width=96, height=72), points=None))
+    assert error.median() < 0.002
+    assert error.mean() < 0.01
+
+
+def test_an_untrained_network_finds_the_wall_where_sparse_points_tell_of_it():
+    assert depth_errors(SWIFT, scene()).max() < 0.001
+
+
+def test_an_untrained_network_renders_the_wall_from_its_neighbours():
+    at = scene(width=96, height=72)
+    rendering = Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU)(at.cameras[TARGET])
+    truth = at.photographs[TARGET].float() / 255
+    error = (rendering.colour - truth)[4:-4, 8:-8].square().mean()
+    assert -10 * error.log10() > 25
+
+
+def test_what_one_view_alone_sees_is_not_smeared_over_the_depths_it_might_have():
+    at = wall.scene(wall.cameras(7, 96, 72, step=0.5), (TARGET,))
+    own = network(SWIFT.network).eval()
+    with torch.inference_mode():
+        tiles, _, start = looking(own, at, 16, ((40, 28),))
+        wide = replace(start, near=start.expected * 1.5, far=start.expected / 1.5)
+        views = FeatureCache(own, at, CPU).views(
+            Neighbours(torch.tensor([[0]]), torch.ones(1, 1, 4)), torch.zeros(1, 3)
+        )
+        found = own(tiles, views, wide, True).colour.reshape(16, 16, 3)
+    truth = at.photographs[TARGET][28:44, 40:56] / 255
+    assert -10 * (found - truth).square().mean().log10() > 42
+
+
+def test_a_surface_that_no_view_sees_is_not_sought_where_they_see():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 3.0  # the others see nothing of the wall, but what may lie behind it
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose))
+    own = network(SWIFT.network).eval()
+    with torch.inference_mode():
+        tiles, views, start = looking(own, at, 16, ((40, 16),))
+        deep = replace(start, near=start.expected * 1.2, far=start.expected / 3)
+        found = own(tiles, views, deep, True)
+        farther = own(tiles, views, replace(deep, expected=deep.far * 1.2), True)
+    assert found.shown.max() < 0.1
+    assert (found.depth - wall.DEPTH).abs().max() < 0.1
+    assert farther.shown.reshape(16, 16)[:, :6].min() > 0.9, "there they see"
+
+
+def test_what_no_neighbour_sees_is_continued_from_beside_it():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 3.0  # the others are all to the left
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose))
+    own = network(SWIFT.network).eval()
+    view = Renderer(own, at, SWIFT, CPU)(at.cameras[TARGET])
+    uv = torch.stack(torch.meshgrid(torch.arange(48) + 0.5, torch.arange(36) + 0.5, indexing="xy"), -1).reshape(
+        1, -1, 2
+    )
+    camera = at.cameras[TARGET]
+    points = camera.position_world + camera.directions_world(uv)[0] * wall.DEPTH
+    others = at.cameras[[i for i in range(len(at.cameras)) if i != TARGET]]
+    seen = in_frame(others, *others.project(points)).any(0).reshape(36, 48)
+    assert 0.2 < seen.float().mean() < 0.8
+    edge = int(seen[18].nonzero().max())
+    beside = view.colour[:, edge - 6 : edge - 1].mean((0, 1))
+    assert (view.colour[:, edge + 3 :].mean((0, 1)) - beside).abs().max() < 0.15
+    assert (view.depth[:, edge + 3 :] - wall.DEPTH).abs().max() < 0.2
+    assert not Renderer(network(PAPER.network).eval(), at, PAPER, CPU).fills
+
+
+@pytest.mark.parametrize("name", ["swift", "field alone"])
+def test_tiles_do_not_show(name: str):
+    """Four small tiles are the large tile that they cover: margins are rendered, not guessed."""
+    own, at = network(NETWORKS[name], stir=0.02).eval(), scene()
+    with torch.inference_mode():
+        whole = own(*looking(own, at, 16, ((16, 8),)), True).colour.reshape(16, 16, 3)
+        parts = own(*looking(own, at, 8, ((16, 8), (24, 8), (16, 16), (24, 16))), True).colour.reshape(4, 8, 8, 3)
+    upper, lower = torch.cat([parts[0], parts[1]], 1), torch.cat([parts[2], parts[3]], 1)
+    torch.testing.assert_close(torch.cat([upper, lower]), whole, atol=1e-4, rtol=0)
+
+
+def test_a_field_alone_says_the_same_of_a_place_whatever_the_interval_it_is_met_in():
+    """Density per unit of length: twice as many samples through an even fog stop the same light."""
+    config = replace(SMALL_PAPER, views=0, field=FIELD)
+    fine = replace(config, stages=(replace(config.stages[0], samples=48),))
+    few, many = network(config), network(fine)
+    many.load_state_dict(few.state_dict())
+    for own in (few, many):
+        nn.init.zeros_(own.stages[0].density.weight)  # type: ignore[arg-type]
+        nn.init.constant_(own.stages[0].density.bias, -2.0)  # type: ignore[arg-type]
+    at = scene()
+    with torch.inference_mode():
+        one, other = few(*looking(few, at), False).opacity, many(*looking(many, at), False).opacity
+    assert 0.05 < one.mean() < 0.999
+    # The first sample lies in the middle of its part: the light before it is not counted.
+    torch.testing.assert_close(one, other, atol=0.05, rtol=0)
+
+
+def test_without_a_generator_rendering_repeats_and_with_one_it_varies_with_the_seed():
+    own = network(SWIFT.network).eval()
+    given = looking(own, scene())
+    with torch.inference_mode():
+        first, again = own(*given, True), own(*given, True)
+        one, other = (own(*given, True, torch.Generator().manual_seed(s)) for s in (1, 2))
+    assert torch.equal(first.colour, again.colour)
+    assert not torch.equal(one.colour, other.colour)
+
+
+def test_rays_go_through_the_centres_of_a_tiles_squares():
+    tiles = Tiles(scene().cameras[[0]], torch.tensor([[10.0, 20.0]]), 4)
+    assert tiles.rays_px(1, 0)[0, :5].tolist() == [[10.5, 20.5], [11.5, 20.5], [12.5, 20.5], [13.5, 20.5], [10.5, 21.5]]
+    assert tiles.rays_px(2, 0)[0].tolist() == [[11, 21], [13, 21], [11, 23], [13, 23]]
+    margin = tiles.rays_px(4, 1)[0]
+    assert margin.shape == (9, 2)
+    assert margin[[0, 4, 8]].tolist() == [[8, 18], [12, 22], [16, 26]]
+
+
+def test_samples_lie_on_their_pixels_rays_at_their_depths_and_their_lengths_add_up():
+    camera = scene().cameras[[0]]
+    uv = torch.tensor([[[3.5, 40.0], [60.0, 7.5]]])
+    intervals = Intervals(torch.tensor([[1 / 3, 1 / 4]]), torch.tensor([[1 / 9, 1 / 5]]), torch.full((1, 2), torch.nan))
+    place = torch.tensor([0.0, 0.3, 0.8]).expand(1, 2, 3)
+    samples = place_samples(camera, uv, intervals, place)
+    pixels, z = camera.project(samples.points_world[0])
+    torch.testing.assert_close(pixels[0], uv[0].repeat_interleave(3, 0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(z[0], 1 / samples.inverse_depth.flatten())
+    torch.testing.assert_close(samples.inverse_depth, intervals.inverse_depth(place))
+    offset = samples.points_world[0] - camera.position_world
+    torch.testing.assert_close(samples.directions[0], offset / offset.norm(dim=-1, keepdim=True))
+    reach = offset.norm(dim=-1).reshape(2, 3)
+    ratio = reach[:, 0] / torch.tensor([3.0, 4.0])
+    torch.testing.assert_close(samples.delta[0, :, :2], reach.diff(dim=-1))
+    torch.testing.assert_close(reach[:, 0] + samples.delta[0].sum(-1), torch.tensor([9.0, 5.0]) * ratio)
+
+
+def test_a_crop_is_read_as_its_photograph_is():
+    own, at = network(SWIFT.network).eval(), scene()
+    photograph = at.photographs[0].permute(2, 0, 1)[None] / 255
+    with torch.inference_mode():
+        whole = own.encode(photograph).photographs
+        crop = own.encode(photograph[:, :, 7:39, 12:60], torch.tensor([[12.0, 7.0]])).photographs
+    assert (crop.origin_px == torch.tensor([12.5, 7.5])).all()
+    assert whole.stride == crop.stride == 0.5
+    texels = [m.rows.reshape(*m.size[0].flip(0).tolist(), 3) for m in (whole, crop)]
+    torch.testing.assert_close(texels[1][8:-8, 8:-8], texels[0][14:78, 24:120][8:-8, 8:-8])
+    torch.testing.assert_close(texels[0][::2, ::2], photograph[0].permute(1, 2, 0))
+
+
+def test_the_learned_sharpening_keeps_even_areas():
+    own = network(SWIFT.network, stir=0.3)
+    for level, tolerance in ((0.0, 1e-5), (0.7, 1e-5)):
+        encoded = own.encode(torch.full((1, 3, 24, 24), level))
+        for rows in (encoded.photographs.rows, encoded.features[4].rows[:, :3]):
+            torch.testing.assert_close(rows, torch.full_like(rows, level), atol=tolerance, rtol=0)
+
+
+def test_the_papers_network_has_nothing_that_the_paper_does_not_have():
+    ours = ("descriptors", "sharpen", "guide", "match", "metric", "angle")
+    assert not [n for n, _ in network(SMALL_PAPER).named_parameters() if any(part in n for part in ours)]
+    found = [n for n, _ in network(SWIFT.network).named_parameters()]
+    assert all(any(part in n for n in found) for part in ours)
+
+
+def test_densities_come_from_each_sample_alone_without_the_ray_transformer():
+    own = network(replace(SMALL_PAPER, without=("ray transformer",)), stir=0.05)
+    assert not [name for name, _ in own.named_parameters() if "transformer" in name]
+    result = own(*looking(own, scene()), opaque=True)
+    assert finite_forward_and_backward(own, result) >= {"encoder", "stages", "colour"}

@@ -1,0 +1,166 @@
+"""Videos and stills: what is decoded again is what was written, and nothing half done ever carries the final name."""
+
+import itertools
+import os
+import tracemalloc
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tidefield.errors import RunError
+from tidefield.model.rendering import Rendering
+from tidefield.render.stills import depth_picture, to_8bit, write_still
+from tidefield.render.video import write_video
+
+COLOURS = [(200, 30, 40), (30, 180, 60), (40, 60, 210), (128, 128, 128), (250, 240, 230)]
+
+
+def flat(colour: tuple[int, int, int], height: int = 48, width: int = 64) -> np.ndarray:
+    return np.broadcast_to(np.array(colour, dtype=np.uint8), (height, width, 3)).copy()
+
+
+def rendering(height: int = 24, width: int = 32) -> Rendering:
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.linspace(2.0, 8.0, width).expand(height, width).clone()
+    opacity = torch.ones(height, width)
+    opacity[:, -4:] = 0.1
+    return Rendering(torch.rand(height, width, 3, generator=generator), depth, opacity)
+
+
+def decode(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_a_video_comes_back_with_its_frames_size_speed_and_colours(tmp_path: Path):
+    path = tmp_path / "new" / "clip.mp4"
+    done: list[int] = []
+    count = write_video((flat(c) for c in COLOURS), path, 25.0, progress=done.append)
+    assert count == len(COLOURS)
+    assert done == [1, 2, 3, 4, 5]
+    frames = decode(path)
+    assert len(frames) == len(COLOURS)
+    for frame, colour in zip(frames, COLOURS, strict=True):
+        assert frame.shape == (48, 64, 3)
+        assert np.abs(frame.astype(int) - colour).max() <= 4
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
+        assert (context.colorspace, context.color_primaries, context.color_range) == (1, 1, 1)
+        assert stream.average_rate == 25
+        assert float(stream.duration * stream.time_base) == pytest.approx(0.2)
+
+
+def test_the_index_lies_before_the_pictures_so_that_browsers_start_at_once(tmp_path: Path):
+    write_video((flat(c) for c in COLOURS), tmp_path / "clip.mp4", 24.0)
+    content = (tmp_path / "clip.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+def test_renderings_are_frames_and_odd_sizes_are_made_even(tmp_path: Path):
+    view = Rendering(torch.full((33, 47, 3), 0.5), torch.ones(33, 47), torch.ones(33, 47))
+    write_video([view, view], tmp_path / "odd.mp4", 29.97)
+    frames = decode(tmp_path / "odd.mp4")
+    assert [frame.shape for frame in frames] == [(34, 48, 3)] * 2
+    assert np.abs(frames[0].astype(int) - 128).max() <= 4
+
+
+def test_a_video_that_is_there_is_kept_unless_asked(tmp_path: Path):
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"precious")
+
+    def untouched():
+        yield pytest.fail("no frame should be rendered for a name that is taken")
+
+    with pytest.raises(RunError, match=r"clip\.mp4 is there already.*--overwrite"):
+        write_video(untouched(), path, 24.0)
+    assert path.read_bytes() == b"precious"
+    write_video([flat(COLOURS[0])], path, 24.0, overwrite=True)
+    assert len(decode(path)) == 1
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError])
+def test_an_interruption_leaves_nothing_behind_and_keeps_what_was_there(tmp_path: Path, interruption: type):
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"precious")
+
+    def frames():
+        yield flat(COLOURS[0])
+        yield flat(COLOURS[1])
+        raise interruption
+
+    with pytest.raises(interruption):
+        write_video(frames(), path, 24.0, overwrite=True)
+    assert os.listdir(tmp_path) == ["clip.mp4"]
+    assert path.read_bytes() == b"precious"
+
+
+def test_no_frames_and_other_formats_are_refused(tmp_path: Path):
+    with pytest.raises(RunError, match="no frames"):
+        write_video([], tmp_path / "clip.mp4", 24.0)
+    with pytest.raises(RunError, match=r"clip\.avi: expected a name that ends in \.mp4"):
+        write_video([flat(COLOURS[0])], tmp_path / "clip.avi", 24.0)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_is_one_clear_error(tmp_path: Path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(RunError, match="cannot be written"):
+        write_video([flat(COLOURS[0])], tmp_path / "file" / "clip.mp4", 24.0)
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path):
+    picture = flat(COLOURS[0], 90, 160)
+    peaks = []
+    for count in (20, 200):
+        tracemalloc.start()
+        write_video((picture + 0 for _ in itertools.repeat(None, count)), tmp_path / f"{count}.mp4", 24.0)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 2 * picture.nbytes
+
+
+def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
+    view = rendering()
+    colour, depths, look = write_still(view, tmp_path / "DJI_0001.png")
+    assert [p.name for p in (colour, depths, look)] == ["DJI_0001.png", "DJI_0001_depth.npy", "DJI_0001_depth.png"]
+    assert np.array_equal(np.asarray(Image.open(colour)), to_8bit(view.colour))
+    depth = np.load(depths)
+    assert depth.dtype == np.float32
+    assert np.isnan(depth[:, -4:]).all()
+    assert np.array_equal(depth[:, :-4], view.depth.numpy()[:, :-4])
+    with Image.open(look) as picture:
+        assert 2.0 <= float(picture.text["near"]) < 2.2
+        assert 7.0 < float(picture.text["far"]) <= 8.0
+        assert picture.size == (32, 24)
+    assert sorted(os.listdir(tmp_path)) == ["DJI_0001.png", "DJI_0001_depth.npy", "DJI_0001_depth.png"]
+
+
+def test_depth_goes_from_red_to_blue_and_nothing_is_black():
+    picture = depth_picture(rendering()).astype(int)
+    assert picture[0, 0, 0] > picture[0, 0, 2]
+    assert picture[0, -6, 2] > picture[0, -6, 0]
+    assert (picture[:, -4:] == 0).all()
+    empty = Rendering(torch.zeros(2, 2, 3), torch.zeros(2, 2), torch.zeros(2, 2))
+    assert (depth_picture(empty) == 0).all()
+
+
+def test_a_still_replaces_nothing_unless_asked(tmp_path: Path):
+    (tmp_path / "view_depth.npy").write_bytes(b"precious")
+    with pytest.raises(RunError, match=r"view_depth\.npy is there already"):
+        write_still(rendering(), tmp_path / "view.png")
+    assert os.listdir(tmp_path) == ["view_depth.npy"]
+    write_still(rendering(), tmp_path / "view.png", overwrite=True)
+    assert len(os.listdir(tmp_path)) == 3
+    with pytest.raises(RunError, match=r"view\.jpg: expected a name that ends in \.png"):
+        write_still(rendering(), tmp_path / "view.jpg")
+
+
+def test_colours_are_rounded_to_8_bits_not_cut():
+    colour = torch.tensor([[[0.0, 1.0, 0.5], [1.7, -0.3, 0.4999 / 255]]])
+    assert to_8bit(colour).tolist() == [[[0, 255, 128], [255, 0, 0]]]

@@ -1,0 +1,165 @@
+"""Ground control of ODM's gcp_list.txt, and what is wrong with it."""
+
+from pathlib import Path
+
+import pytest
+from camera_files import exif, photograph, real_survey, survey_folder
+from PIL.ExifTags import Base
+from pyproj import Transformer
+
+from tidefield.errors import SurveyError
+from tidefield.survey.io.control import read_control
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.survey import Control, Mark
+
+UTM = "EPSG:32615"
+POINTS = [(576640.25, 5188050.5, 183.1), (576650.75, 5188060.25, 184.2)]
+
+
+def control(folder: Path, text: str, name: str = "gcp_list.txt") -> tuple[Control, list[str]]:
+    """Read a control file of the photographs in a folder."""
+    path = folder / name
+    path.write_bytes(text.encode())
+    survey = read_survey(folder, control=path)
+    assert survey.control is not None
+    again, remarks = read_control(path, survey.photographs)
+    assert again == survey.control
+    assert set(remarks) <= set(survey.remarks)
+    return again, remarks
+
+
+def line(point: int, uv: tuple[float, float], rest: str, separator: str = " ") -> str:
+    return separator.join([*map(str, POINTS[point]), *map(str, uv), rest]) + "\n"
+
+
+def test_the_control_of_swindale_is_found_by_itself():
+    survey = read_survey(real_survey("swindale"))
+    assert survey.control is not None
+    assert survey.control.crs == "EPSG:27700"
+    assert len(survey.control.points) == 10
+    assert len(survey.control.marks) == 36
+    assert survey.control.points["StkdT_12385"] == (351139.7462, 512875.7537, 264.3243)
+    assert survey.control.marks[0] == Mark("StkdT_12385", "IMG_1429.jpg", (1205.21, 768.45))
+
+
+@pytest.mark.parametrize("header", [UTM, "epsg:32615", "WGS84 UTM 15N", "+proj=utm +zone=15 +datum=WGS84 +units=m"])
+@pytest.mark.parametrize("separator", [" ", "\t"])
+def test_a_list_is_read_with_any_header_and_separator(tmp_path, header, separator):
+    text = "\ufeff# surveyed in May\n" + header + "\r\n\n# two points\n"
+    text += line(0, (10.5, 20.25), f"DJI_0000.JPG{separator}A", separator)
+    text += line(0, (12, 21), f"DJI_0001.JPG{separator}A", separator)
+    text += line(1, (30, 40), f"dji_0001{separator}B 2", separator)
+    found, remarks = control(survey_folder(tmp_path), text)
+    assert remarks == []
+    second = "B 2" if separator == "\t" else "B"  # further words are ODM's extras
+    assert found.points == {"A": POINTS[0], second: POINTS[1]}
+    assert found.marks == (
+        Mark("A", "DJI_0000.JPG", (10.5, 20.25)),
+        Mark("A", "DJI_0001.JPG", (12.0, 21.0)),
+        Mark(second, "DJI_0001.JPG", (30.0, 40.0)),
+    )
+
+
+def test_points_without_names_are_told_apart_by_their_places(tmp_path):
+    lines = line(0, (1, 2), "DJI_0000.JPG") + line(1, (3, 4), "DJI_0000.JPG") + line(0, (5, 6), "DJI_0001.JPG")
+    found, _ = control(survey_folder(tmp_path), UTM + "\n" + lines)
+    assert found.points == {"point 1": POINTS[0], "point 2": POINTS[1]}
+    assert [mark.point for mark in found.marks] == ["point 1", "point 2", "point 1"]
+
+
+def test_names_with_spaces_are_those_of_photographs(tmp_path):
+    for name in ("Watt Süd 1.jpg", "sub/Watt Süd 2.jpg", "Watt.jpg"):
+        photograph(tmp_path / name)
+    lines = line(0, (1, 2), "Watt Süd 1.jpg") + line(1, (1, 3), "sub/Watt Süd 2.jpg  P 7") + line(1, (4, 5), "Watt P")
+    found, _ = control(tmp_path, UTM + "\n" + lines)
+    assert [(mark.point, mark.photograph) for mark in found.marks] == [
+        ("point 1", "Watt Süd 1.jpg"),
+        ("P", "sub/Watt Süd 2.jpg"),
+        ("P", "Watt.jpg"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("orientation", "upright"), [(1, (10.0, 20.0)), (3, (54.0, 28.0)), (6, (28.0, 10.0)), (8, (20.0, 54.0))]
+)
+def test_marks_are_for_the_picture_as_it_is_stored(tmp_path, orientation, upright):
+    survey_folder(tmp_path, place=None)
+    photograph(tmp_path / "turned.jpg", (64, 48), exif({Base.Orientation: orientation}))
+    found, _ = control(tmp_path, UTM + "\n" + line(0, (10, 20), "turned.jpg A"))
+    assert found.marks == (Mark("A", "turned.jpg", upright),)
+
+
+def test_marks_in_photographs_that_are_not_there_are_left_out_and_named(tmp_path):
+    lines = line(0, (1, 2), "DJI_0000.JPG A") + line(1, (3, 4), "IMG 7.JPG B") + line(0, (5, 6), "gone.JPG A")
+    found, remarks = control(survey_folder(tmp_path), UTM + "\n" + lines)
+    assert list(found.points) == ["A"]
+    assert len(found.marks) == 1
+    assert remarks == ["gcp_list.txt marks points in photographs that are not there (left out): IMG 7.JPG, gone.JPG."]
+
+
+def test_marks_outside_their_photograph_are_left_out_and_named(tmp_path):
+    lines = (line(0, uv, f"DJI_000{index}.JPG A") for index, uv in enumerate(((1, 2), (3, 4), (70, 4))))
+    found, remarks = control(survey_folder(tmp_path), UTM + "\n" + "".join(lines))
+    assert len(found.marks) == 2
+    outside = "the mark of A at (70, 4) is outside of DJI_0002.JPG (64 x 48 pixels)"
+    assert remarks == [f"gcp_list.txt: {outside} and is left out."]
+
+
+def test_the_same_line_twice_is_one_mark(tmp_path):
+    found, _ = control(survey_folder(tmp_path), UTM + "\n" + 2 * line(0, (1, 2), "DJI_0000.JPG A"))
+    assert len(found.marks) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the first line of .* is '': expected a projected or geographic coordinate reference system"),
+        (line(0, (1, 2), "DJI_0000.JPG A"), "the first line .* write one"),
+        ("EPSG:99999\n" + line(0, (1, 2), "DJI_0000.JPG A"), "is 'EPSG:99999': expected a projected or geographic"),
+        (UTM, "has no ground control points: expected `x y z px py image"),
+        (UTM + "\n1 2 3 4 DJI_0000.JPG A", "line 2 is '1 2 3 4 DJI_0000.JPG A': expected `x y z px py image"),
+        (UTM + "\n1 2 nan 4 5 DJI_0000.JPG A", "line 2 is .*: expected `x y z px py image"),
+        (UTM + "\n1 2 3 4 5", "line 2 is '1 2 3 4 5': expected"),
+        (
+            UTM + "\n" + line(0, (1, 2), "a.JPG A") + line(0, (3, 4), "b 1.JPG A"),
+            r"marks points in 2 photographs \(a.JPG, b 1.JPG\), none of which is there",
+        ),
+        (
+            UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + line(1, (3, 4), "DJI_0001.JPG A"),
+            r"line 3 puts the point A at \(576650.75, .*line 2 at \(576640.25.*expected one place per point",
+        ),
+        (
+            UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + line(0, (3, 4), "DJI_0000.JPG A"),
+            "line 3 marks A in DJI_0000.JPG a second time",
+        ),
+        (
+            UTM + "\n" + line(0, (1205, 768), "DJI_0000.JPG A"),
+            r"1 of 1 marks are outside .*\(64 x 48 pixels\).*reduced since, divide the marks",
+        ),
+        ("EPSG:27700\n" + line(0, (1, 2), "DJI_0000.JPG A"), "from the photographs|nowhere near the photographs"),
+    ],
+)
+def test_a_list_that_cannot_be_right_is_an_error(tmp_path, text, message):
+    with pytest.raises(SurveyError, match=message):
+        control(survey_folder(tmp_path), text)
+
+
+def test_another_encoding_and_a_missing_file_are_errors(tmp_path):
+    survey_folder(tmp_path)
+    (tmp_path / "gcp_list.txt").write_bytes((UTM + "\n" + line(0, (1, 2), "Süd.jpg A")).encode("utf-16"))
+    with pytest.raises(SurveyError, match=r"gcp_list.txt is not in UTF-8"):
+        read_survey(tmp_path)
+    with pytest.raises(SurveyError, match=r"none.txt cannot be read"):
+        read_survey(tmp_path, control=tmp_path / "none.txt")
+
+
+def test_the_last_digit_of_a_printed_coordinate_makes_no_second_place(tmp_path):
+    again = line(0, (3, 4), "DJI_0001.JPG A").replace("183.1", "183.1004")
+    found, _ = control(survey_folder(tmp_path), UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + again)
+    assert found.points == {"A": POINTS[0]}
+
+
+def test_control_in_degrees_is_longitude_before_latitude(tmp_path):
+    x, y = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(*POINTS[0][:2])
+    found, _ = control(survey_folder(tmp_path), f"EPSG:4326\n{x:.8f} {y:.8f} 183.1 1 2 DJI_0000.JPG A\n")
+    assert found.points["A"][0] == pytest.approx(-92, abs=0.1)

@@ -1,0 +1,104 @@
+"""Photographs in a scene: copied where nothing changes, upright and evened where something does."""
+
+from pathlib import Path
+
+import camera_files
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from PIL.ExifTags import Base
+
+from tidefield.survey.colour import Evening
+from tidefield.survey.copy_images import place_photographs, tangent_map
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.io.pictures import upright
+from tidefield.survey.survey import Photograph
+
+SIZE = (64, 48)
+LENS = pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=48, params=[50, 32, 24, 0.1], camera_id=1)
+TURNED = pycolmap.Camera(model="SIMPLE_RADIAL", width=48, height=64, params=[50, 24, 32, 0.1], camera_id=2)
+LENSES = [LENS, LENS, TURNED]
+
+
+def quiet(done: int, whole: int) -> None:
+    assert 0 <= done <= whole
+
+
+def evening(gains: list[float], helps: bool = True, falloff: float = 0.0) -> Evening:
+    gain = np.outer(gains, np.ones(3))
+    return Evening(gain, np.full((3, 3), [falloff, 0, 0]), 0.2, 0.1, 0.1, helps, falloff != 0)
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> tuple[Photograph, ...]:
+    """A JPEG, a PNG in a sub-folder, and a JPEG that stands on its side."""
+    camera_files.photograph(tmp_path / "card" / "a b.jpg", SIZE, camera_files.exif({Base.Model: "M1"}))
+    camera_files.photograph(tmp_path / "card" / "flight é" / "b.png", SIZE)
+    camera_files.photograph(tmp_path / "card" / "turned.jpg", SIZE, camera_files.exif({Base.Orientation: 6}))
+    return read_survey(tmp_path / "card").photographs
+
+
+def test_what_needs_no_change_is_copied_and_the_rest_stands_upright(photographs, tmp_path: Path):
+    place_photographs(photographs, tmp_path / "images", None, LENSES, quiet)
+    for photograph in photographs[:2]:
+        assert (tmp_path / "images" / photograph.name).read_bytes() == photograph.path.read_bytes()
+    with Image.open(tmp_path / "images" / "turned.jpg") as picture:
+        assert picture.size == (48, 64)
+        assert picture.getexif()[Base.Orientation] == 1
+        difference = np.asarray(picture).astype(int) - upright(photographs[2])
+    assert np.abs(difference).mean() < 2
+
+
+def test_gains_that_do_not_help_change_nothing(photographs, tmp_path: Path):
+    place_photographs(photographs, tmp_path / "images", evening([2, 1, 1], helps=False), LENSES, quiet)
+    assert (tmp_path / "images" / "a b.jpg").read_bytes() == photographs[0].path.read_bytes()
+
+
+def test_gains_are_divided_out_and_the_exif_stays(photographs, tmp_path: Path):
+    place_photographs(photographs, tmp_path / "images", evening([0.8, 1.25, 1.0]), LENSES, quiet)
+    for photograph, gain in zip(photographs, (0.8, 1.25, 1.0), strict=True):
+        with Image.open(tmp_path / "images" / photograph.name) as picture:
+            ours = np.asarray(picture).astype(float)
+        true = np.clip(upright(photograph) / gain, 0, 255)
+        assert np.abs(ours - true).mean() < 2
+    with Image.open(tmp_path / "images" / "a b.jpg") as picture:
+        assert picture.getexif()[Base.Model] == "M1"
+
+
+def test_the_falloff_brightens_the_corners(photographs, tmp_path: Path):
+    place_photographs(photographs, tmp_path / "images", evening([1, 1, 1], falloff=-0.5), LENSES, quiet)
+    with Image.open(tmp_path / "images" / "flight é" / "b.png") as picture:
+        ours = np.asarray(picture).astype(float)
+    before = upright(photographs[1]).astype(float)
+    tangent = np.asarray(LENS.cam_from_img(np.array([[0.5, 0.5]])))[0]
+    assert ours[24, 32] == pytest.approx(before[24, 32], abs=1)
+    np.testing.assert_allclose(ours[0, 0], np.minimum(before[0, 0] * np.exp(0.5 * (tangent**2).sum()), 255), atol=2)
+
+
+def test_tiffs_stay_tiffs(tmp_path: Path):
+    for k in range(3):
+        camera_files.photograph(tmp_path / "card" / f"{k}.tif", SIZE)
+    photographs = read_survey(tmp_path / "card").photographs
+    place_photographs(photographs, tmp_path / "images", evening([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
+    with Image.open(tmp_path / "images" / "0.tif") as picture:
+        assert picture.format == "TIFF"
+        np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
+
+
+def test_what_an_earlier_run_left_goes(photographs, tmp_path: Path):
+    (tmp_path / "images" / "old").mkdir(parents=True)
+    (tmp_path / "images" / "old" / "gone.jpg").write_bytes(b"x")
+    place_photographs(photographs, tmp_path / "images", None, LENSES, quiet)
+    found = {path.relative_to(tmp_path / "images").as_posix() for path in (tmp_path / "images").rglob("*.*")}
+    assert found == {photograph.name for photograph in photographs}
+    assert not (tmp_path / "images" / "old").exists()
+
+
+def test_angles_between_the_grid_are_those_of_the_lens():
+    lens = pycolmap.Camera(model="RADIAL", width=403, height=301, params=[320, 200, 150, -0.2, 0.1], camera_id=1)
+    found = tangent_map(lens)
+    assert found.shape == (301, 403)
+    for u, v in ((10, 20), (200, 150), (390, 290), (333, 40)):
+        true = np.linalg.norm(np.asarray(lens.cam_from_img(np.array([[u + 0.5, v + 0.5]])))[0])
+        assert found[v, u] == pytest.approx(true, abs=0.01)

@@ -1,0 +1,96 @@
+"""Features and cameras in the database: what is known of lenses enters, and what is there is not done again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import textured_wall as wall
+from located_surveys import unlocated_photograph
+from PIL import Image
+
+from tidefield.errors import DeviceError
+from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, first_camera, lens_groups, opened
+from tidefield.survey.survey import LensPrior, Photograph
+
+OPTIONS, CPU = FeatureOptions(side_px=400, count=200), pycolmap.Device.cpu
+
+
+@pytest.fixture
+def wall_photographs(tmp_path: Path) -> list[Photograph]:
+    """Three pictures of the textured wall with some noise on it for SIFT to find."""
+    cameras, rng = wall.cameras(3, width=240, height=180), np.random.default_rng(0)
+    spots = rng.integers(0, 60, (18, 24, 3))
+    made = []
+    for k in range(3):
+        pixels = np.clip(wall.photograph(cameras[k]).numpy() + np.kron(spots, np.ones((10, 10, 1))), 0, 255)
+        Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / f"{k:04d}.png")
+        made.append(replace(unlocated_photograph(k, None), path=tmp_path / f"{k:04d}.png", width=240, height=180))
+    return made
+
+
+def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs: list[Photograph], tmp_path: Path):
+    calls: list[tuple[int, int]] = []
+    total = extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: calls.append((done, whole)))
+    halved = extract(wall_photographs, tmp_path / "b.db", replace(OPTIONS, side_px=120), CPU, lambda done, whole: None)
+    assert calls[-1] == (3, 3)
+    assert total > halved > 0
+    for name in ("a.db", "b.db"):
+        with opened(tmp_path / name) as db:
+            for image in db.read_all_images():
+                keypoints = np.asarray(db.read_keypoints(image.image_id))
+                assert (np.diff(keypoints[:, 2]) <= 0).all()
+                assert (keypoints[:, :2] >= 0).all()
+                assert keypoints[:, 0].max() > 150
+                assert (keypoints[:, :2] <= [240, 180]).all()
+                assert np.asarray(db.read_descriptors(image.image_id).data).shape == (len(keypoints), 128)
+
+
+def test_what_is_in_the_database_is_kept_and_the_rest_is_added(wall_photographs: list[Photograph], tmp_path: Path):
+    calls: list[tuple[int, int]] = []
+    extract(wall_photographs[:2], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
+    extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: calls.append((done, whole)))
+    assert calls == [(3, 3)]
+    with opened(tmp_path / "a.db") as db:
+        assert db.num_images() == 3
+        assert db.num_cameras() == db.num_rigs() == 1
+        assert db.num_frames() == 3
+
+
+def test_photographs_of_one_camera_size_and_zoom_share_a_lens():
+    own = [unlocated_photograph(k, None) for k in range(5)]
+    own[1] = replace(own[1], camera="Maker B")
+    own[2] = replace(own[2], width=800)
+    own[3] = replace(own[3], focal_mm=12.0)
+    assert lens_groups(own) == [0, 1, 2, 3, 0]
+
+
+def test_a_nominal_focal_length_is_a_prior_and_none_is_a_guess():
+    known = replace(unlocated_photograph(0, None), lens=LensPrior(350.0, None, None, "EXIF", trusted=False))
+    assert first_camera(known).has_prior_focal_length
+    assert first_camera(known).params.tolist() == [350, 350, 200, 150, 0, 0, 0, 0]
+    assert not first_camera(unlocated_photograph(0, None)).has_prior_focal_length
+    assert first_camera(unlocated_photograph(0, None)).focal_length_x == 480
+
+
+def test_the_makers_calibration_acts_as_its_five_terms_do():
+    lens = LensPrior(400.0, (210.0, 140.0), (-0.4, 0.37, 0.002, -0.001, -0.26), "maker", trusted=True)
+    camera = first_camera(replace(unlocated_photograph(0, None), lens=lens))
+    assert camera.params[:4].tolist() == [400, 400, 210, 140]
+    xy = np.array([[x, y] for x in np.linspace(-0.5, 0.45, 7) for y in np.linspace(-0.35, 0.35, 5)])
+    k1, k2, p1, p2, k3 = lens.distortion
+    r2 = (xy**2).sum(1)
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x, y = xy.T
+    tangential = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], 1)
+    true = (xy * radial[:, None] + tangential) * 400 + [210, 140]
+    found = np.asarray(camera.img_from_cam(np.column_stack([xy, np.ones(len(xy))])))
+    assert np.abs(found - true).max() < 0.35
+
+
+def test_a_device_that_pycolmap_does_not_have_is_an_error():
+    assert choose_device("auto") == pycolmap.Device.auto
+    assert choose_device("cpu") == pycolmap.Device.cpu
+    with pytest.raises(DeviceError, match="expected one of auto, cpu"):
+        choose_device("mps")

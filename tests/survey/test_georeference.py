@@ -1,0 +1,261 @@
+"""Models laid onto the Earth by the positions of their cameras, right and wrong ones."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
+
+from tidefield.errors import SurveyError
+from tidefield.survey.georeference.alignment import camera_centres, find_down
+from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.survey import Survey
+
+
+def quiet(done: int, whole: int) -> None:
+    assert 0 <= done <= whole
+
+
+def located(flight, survey: Survey | None = None):
+    """A copy of the flight's model in a frame of its own, laid onto the Earth, and what is said of it."""
+    model = in_a_frame_of_its_own(flight.model)
+    return model, georeference(model, survey or flight.survey, quiet)
+
+
+def moved(survey: Survey, changes: dict[str, dict]) -> Survey:
+    """The survey with some of its photographs' positions changed; None for no position."""
+    photographs = [
+        replace(p, position=changes[p.name] and replace(p.position, **changes[p.name])) if p.name in changes else p
+        for p in survey.photographs
+    ]
+    return replace(survey, photographs=tuple(photographs))
+
+
+def all_moved(survey: Survey, change) -> Survey:
+    return moved(survey, {p.name: change(p.position) for p in survey.photographs})
+
+
+def off_m(flight, model, frame) -> np.ndarray:
+    """How far the cameras lie from the truth, by way of longitude and latitude."""
+    centres = camera_centres(model)
+    names = sorted(centres)
+    truth = frame.from_geographic(FRAME.to_geographic(flight.centres_world))
+    order = [int(name.split()[-1][:3]) for name in names]
+    return np.array([centres[name] for name in names]) - truth[order]
+
+
+def test_exact_positions_place_the_model_exactly():
+    flight = fly(noise_px=0.0)
+    model, found = located(flight)
+    assert found.source == "GPS"
+    assert found.frame is not None
+    assert found.frame.epsg == 32630
+    assert found.frame.vertical_datum.startswith("mean sea level")
+    assert np.abs(off_m(flight, model, found.frame)).max() < 0.01
+    assert found.gps.horizontal_rms_m < 0.01
+    assert found.left_out == found.notes == ()
+    np.testing.assert_allclose(found.world_from_model.scale, 25, rtol=1e-4)
+    assert abs(np.median([point.xyz[2] for point in model.points3D.values()])) < 1.0, "the origin is on the ground"
+
+
+def test_noisy_positions_place_the_model_better_than_any_of_them():
+    flight = fly(lines=4, each=8, position_m=2.0)
+    model, found = located(flight)
+    off = off_m(flight, model, found.frame)
+    assert np.sqrt((off**2).mean()) < 1.0
+    assert found.gps_used.horizontal_rms_m == pytest.approx(2.0 * math.sqrt(2), rel=0.25)
+    assert found.gps_used.vertical_rms_m == pytest.approx(2.0, rel=0.35)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 0.0005])
+def test_one_position_that_is_far_off_is_named_and_not_used(degrees):
+    flight = fly(position_m=1.0)
+    name = name_of(7)
+    survey = moved(flight.survey, {name: {"latitude_deg": 54.51 + degrees}})
+    model, found = located(flight, survey)
+    assert [(item.kind, item.name) for item in found.left_out] == [("GPS", name)]
+    assert ("km" if degrees == 1 else " m") in found.left_out[0].reason
+    assert np.abs(off_m(flight, model, found.frame)).max() < 3.0
+    assert name in found.gps.names
+    assert name not in found.gps_used.names
+
+
+def test_a_third_of_the_positions_may_be_wrong():
+    flight = fly(lines=4, each=6, position_m=1.0)
+    generator = np.random.default_rng(0)
+    wrong = [name_of(i) for i in (0, 3, 4, 9, 13, 15, 20, 23)]
+    survey = moved(flight.survey, {n: {"latitude_deg": 54.51 + generator.uniform(0.002, 0.01)} for n in wrong})
+    model, found = located(flight, survey)
+    assert sorted(item.name for item in found.left_out) == wrong
+    assert np.abs(off_m(flight, model, found.frame)).max() < 3.0
+
+
+def test_what_receivers_state_decides_which_positions_count():
+    flight = fly(lines=3, each=6, position_m=0.01)
+    generator = np.random.default_rng(5)
+    states = {}
+    for i, each in enumerate(flight.survey.photographs):
+        poor = i % 2 == 0
+        north = each.position.latitude_deg + (generator.normal(0, 4) + 3 if poor else 0) / 111_000
+        states[each.name] = {"latitude_deg": north, "horizontal_m": 4.0 if poor else 0.02, "vertical_m": 0.04}
+    model, found = located(flight, moved(flight.survey, states))
+    assert np.abs(off_m(flight, model, found.frame)).max() < 0.1
+
+
+def test_a_single_line_of_flight_is_kept_upright_by_its_photographs():
+    flight = fly(lines=1, each=12, position_m=1.0)
+    model, found = located(flight)
+    assert any("vertical" in note and "mean viewing direction" in note for note in found.notes)
+    down = find_down(model, flight.survey.photographs).direction_model
+    assert down[2] < -math.cos(math.radians(4))
+    assert np.abs(off_m(flight, model, found.frame)).max() < 4.0
+
+
+def test_a_single_line_of_flight_is_kept_upright_by_its_gimbal_where_there_is_one():
+    flight = fly(lines=1, each=12, position_m=1.0)
+    gimbals = []
+    for i, each in enumerate(flight.survey.photographs):
+        R = flight.model.image(i + 1).cam_from_world().rotation.matrix()
+        pitch = math.degrees(math.asin(R[2, 2]))
+        roll = math.degrees(math.atan2(-R[0, 2], -R[1, 2]))
+        gimbals.append(replace(each, gimbal_deg=(0.0, pitch, roll)))
+    model, found = located(flight, replace(flight.survey, photographs=tuple(gimbals)))
+    assert any("gimbal" in note for note in found.notes)
+    down = np.array([model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(12)])
+    truth = np.array([flight.model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(12)])
+    assert np.abs(down[:, 2] - truth[:, 2]).max() < 0.01
+
+
+def test_heights_that_are_missing_come_from_above_take_off_or_from_level_flight():
+    flight = fly(lines=3, each=6, position_m=0.5)
+    without = all_moved(flight.survey, lambda position: {"height_m": math.nan})
+    model, found = located(flight, without)
+    assert "mean height of flight" in found.frame.vertical_datum
+    heights = np.array([centre[2] for centre in camera_centres(model).values()])
+    assert abs(heights.mean() - found.frame.height_m * -1) < 5
+    above = tuple(
+        replace(p, relative_altitude_m=float(flight.centres_world[i, 2])) for i, p in enumerate(without.photographs)
+    )
+    model, found = located(flight, replace(without, photographs=above))
+    assert found.frame.vertical_datum == "the place of take-off"
+    assert found.gps_used.vertical_rms_m < 1.0
+
+
+@pytest.mark.parametrize("left", [0, 2])
+def test_without_positions_the_model_is_upright_and_says_that_it_is_nowhere(left):
+    flight = fly()
+    survey = moved(flight.survey, {name_of(i): None for i in range(left, 15)})
+    model, found = located(flight, survey)
+    assert (found.source, found.frame) == ("none", None)
+    assert "not georeferenced" in found.notes[0]
+    assert found.world_from_model.scale == 1
+    forward = np.mean([model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(15)], axis=0)
+    assert forward[2] < -0.99
+    assert np.abs(np.median([point.xyz for point in model.points3D.values()], axis=0)).max() < 0.5
+
+
+def test_positions_that_are_all_the_same_place_nothing():
+    flight = fly()
+    _, found = located(flight, all_moved(flight.survey, lambda p: {"latitude_deg": 54.5, "longitude_deg": -2.75}))
+    assert found.source == "none"
+    assert "do not follow" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: {"latitude_deg": p.longitude_deg, "longitude_deg": p.latitude_deg}, "are swapped"),
+        (lambda p: {"longitude_deg": -p.longitude_deg}, "sign of one of the two"),
+        (lambda p: {"latitude_deg": -p.latitude_deg}, "sign of one of the two"),
+    ],
+)
+def test_positions_that_mirror_the_survey_are_an_error_that_says_how(change, words):
+    flight = fly(lines=4, position_m=1.0)
+    with pytest.raises(SurveyError, match=words):
+        located(flight, all_moved(flight.survey, change))
+
+
+def test_positions_on_both_sides_of_the_date_line_are_next_to_each_other():
+    flight = fly(noise_px=0.0)
+    east = 180.0 - flight.survey.photographs[7].position.longitude_deg
+    survey = all_moved(
+        flight.survey,
+        lambda p: {"longitude_deg": (p.longitude_deg + east + 180) % 360 - 180},
+    )
+    assert len({p.position.longitude_deg > 0 for p in survey.photographs}) == 2
+    _, found = located(flight, survey)
+    assert found.frame.epsg in (32601, 32660)
+    assert found.gps.horizontal_rms_m < 0.05
+
+
+def test_zeros_are_no_positions():
+    flight = fly(noise_px=0.0)
+    survey = moved(flight.survey, {name_of(3): {"latitude_deg": 0.0, "longitude_deg": 0.0}})
+    _, found = located(flight, survey)
+    assert [(item.kind, item.name) for item in found.left_out] == [("GPS", name_of(3))]
+    assert found.gps.horizontal_rms_m < 0.01
+
+
+def differential(survey: Survey) -> Survey:
+    return all_moved(survey, lambda position: {"horizontal_m": 0.015, "vertical_m": 0.025})
+
+
+@pytest.fixture(scope="module")
+def bowl():
+    """A survey that was reconstructed with the wrong distortion, and is bent; its positions are good to 2 cm."""
+    lens = [FOCAL, FOCAL, WIDTH / 2 - 4, HEIGHT / 2 + 6, -0.03, 0.01, 0.002, -0.001]
+    camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=lens, camera_id=1)
+    true = fly(lines=4, each=7, position_m=0.015, camera=camera)
+    model = pycolmap.Reconstruction(true.model)
+    model.cameras[1].model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    model.cameras[1].params = [FOCAL, WIDTH / 2, HEIGHT / 2, 0.02]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(model, options)
+    return replace(true, model=model), true.model
+
+
+def ground_off_m(truth, model, frame) -> np.ndarray:
+    numbers = sorted(truth.points3D)
+    there = frame.from_geographic(FRAME.to_geographic(np.array([truth.points3D[k].xyz for k in numbers])))
+    return np.array([model.points3D[k].xyz for k in numbers]) - there
+
+
+def test_differential_positions_take_out_the_bend_that_others_leave(bowl):
+    flight, truth = bowl
+    model, found = located(flight)
+    bent = ground_off_m(truth, model, found.frame)
+    assert found.notes == ()
+    model, found = located(flight, differential(flight.survey))
+    straight = ground_off_m(truth, model, found.frame)
+    assert "adjusted to their differential positions" in found.notes[0]
+    assert found.gps.horizontal_rms_m < 0.05
+    assert np.median(np.abs(straight[:, 2])) < 0.15
+    assert np.median(np.abs(straight[:, 2])) < 0.4 * np.median(np.abs(bent[:, 2]))
+    assert model.cameras[1].params[0] == pytest.approx(FOCAL), "positions at one height do not tell it"
+
+
+def test_a_differential_position_that_is_worse_than_it_states_is_not_followed(bowl):
+    flight, _ = bowl
+    survey = differential(flight.survey)
+    place = next(p.position for p in survey.photographs if p.name == name_of(9))
+    _, found = located(flight, moved(survey, {name_of(9): {"height_m": place.height_m + 1.2}}))
+    assert any(name_of(9) in note and "worse than they state" in note for note in found.notes)
+    assert found.gps.horizontal_rms_m < 0.05
+    others = [i for i, name in enumerate(found.gps.names) if name != name_of(9)]
+    assert np.abs(found.gps.error_m[others]).max() < 0.1
+
+
+def test_differential_positions_help_where_there_is_control_too(bowl):
+    flight, truth = bowl
+    survey = replace(
+        differential(flight.survey), control=with_control(replace(flight, model=truth), CONTROL[:3]).control
+    )
+    model, found = located(flight, survey)
+    assert found.source == "ground control"
+    assert "differential" in found.notes[0]
+    numbers = sorted(truth.points3D)
+    there = found.frame.from_crs(FRAME.to_crs(np.array([truth.points3D[k].xyz for k in numbers])))
+    assert np.median(np.abs(np.array([model.points3D[k].xyz for k in numbers]) - there)[:, 2]) < 0.15

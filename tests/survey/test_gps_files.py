@@ -1,0 +1,220 @@
+"""Positions from files beside photographs: tables of many makes, ODM's geo.txt, and which of two sources counts."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+from camera_files import BRIGHTON, exif, named, photograph, survey_folder
+from pyproj import Transformer
+
+from tidefield.errors import SurveyError
+from tidefield.survey.io.gps_files import read_gps_file
+from tidefield.survey.io.names import Names
+from tidefield.survey.io.photographs import read_survey
+
+NAMES = Names(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
+
+
+def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image_name,lat,lon,gps_height\nDJI_0001.JPG,54.5,-2.75,344.17\n",
+        "\ufeffFilename;Longitude [deg];Latitude [deg];Altitude (m)\r\ndji_0001;-2,75;54,5;344,17\r\n",
+        "#Label\tX/Longitude\tY/Latitude\tZ/Altitude\nDJI_0001.jpg\t-2.75\t54.5\t344.17\n",
+        "z,y,x,name\n344.17,54.5,-2.75,C:\\flight\\DJI_0001.JPG\n",
+        '# made by a receiver\nName,Latitude,Longitude,Elevation,Note\n"DJI_0001.DNG", 54.5, -2.75, 344.17, "a, b"\n\n',
+    ],
+)
+def test_tables_of_many_makes_say_the_same(tmp_path, text):
+    found = read_gps_file(written(tmp_path, text), NAMES)
+    assert list(found) == ["DJI_0001.JPG"]
+    position = found["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg, position.height_m) == (54.5, -2.75, 344.17)
+    assert (position.datum, position.source) == ("unknown", "gps.csv")
+    assert math.isnan(position.horizontal_m)
+
+
+def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
+    text = (
+        "Filename,Latitude,Longitude,Altitude,Accuracy Horizontal [m],Accuracy Vertical [m]\n"
+        "DJI_0001,54.5,-2.75,,0.02,0\nDJI_0002,54.6,-2.75,300\nother.jpg,1,2,3,4,5\nWatt# Süd 3.jpeg,1,2,3,,\n"
+        '"Watt, Süd 3.jpeg",,,1,,\n'
+    )
+    found = read_gps_file(written(tmp_path, text), NAMES)
+    first = found["DJI_0001.JPG"].position
+    assert first.horizontal_m == 0.02
+    assert math.isnan(first.height_m)
+    assert math.isnan(first.vertical_m)
+    assert found["100MEDIA/DJI_0002.JPG"].position.height_m == 300
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "begins with 'nothing': expected a header such as image_name,lat,lon,gps_height"),
+        ("DJI_0001,54.5,-2.75\n", "begins with 'DJI_0001,54.5,-2.75': expected a header"),
+        ("name,lat,lon\nDJI_0001,54.5,west\n", "line 2 has 'west': expected a number"),
+        ("name,lat,lon\nDJI_0001,512875.75,351139.75\n", "line 2 says .* metres belong under the EPSG code"),
+        ("name,lat,lon\nDJI_0001,54.5,2\nDJI_0001,54.6,2\n", "line 3 gives DJI_0001.JPG a second position"),
+        ("name,lat,lon\nIMG_1,54.5,2\n", "names none of the photographs"),
+    ],
+)
+def test_a_table_that_cannot_be_understood_is_an_error(tmp_path, text, message):
+    with pytest.raises(SurveyError, match=message):
+        read_gps_file(written(tmp_path, text), NAMES)
+
+
+def test_a_table_in_another_encoding_is_an_error(tmp_path):
+    (tmp_path / "gps.csv").write_bytes("name,lat,lon\nSüd.jpg,54.5,2\n".encode("latin-1"))
+    with pytest.raises(SurveyError, match=r"gps.csv is not in UTF-8"):
+        read_gps_file(tmp_path / "gps.csv", NAMES)
+    with pytest.raises(SurveyError, match=r"none.csv cannot be read"):
+        read_gps_file(tmp_path / "none.csv", NAMES)
+
+
+def test_a_short_name_of_two_photographs_is_an_error(tmp_path):
+    names = Names(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG"])
+    path = written(tmp_path, "name,lat,lon\nDJI_0001.JPG,54.5,2\n")
+    with pytest.raises(SurveyError, match=r"DJI_0001.JPG names 2 photographs .*write its folder, too"):
+        read_gps_file(path, names)
+    found = read_gps_file(written(tmp_path, "name,lat,lon\n101media\\DJI_0001.JPG,54.5,2\n"), names)
+    assert list(found) == ["101MEDIA/DJI_0001.JPG"]
+
+
+@pytest.mark.parametrize(
+    ("header", "datum"),
+    [
+        ("EPSG:32630", "unknown"),
+        ("WGS84 UTM 30N", "unknown"),
+        ("+proj=utm +zone=30 +datum=WGS84 +units=m +no_defs", "unknown"),
+        ("EPSG:32630+5773", "mean sea level"),
+    ],
+)
+def test_a_geo_txt_in_metres_becomes_degrees(tmp_path, header, datum):
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32630", always_xy=True).transform(-2.75, 54.5)
+    text = f"# of the office\n{header}\nDJI_0001.JPG {x} {y} 344.17\nWatt, Süd 3.jpeg {x} {y}\nother.jpg 1 2 3\n"
+    found = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    assert list(found) == ["DJI_0001.JPG", "Watt, Süd 3.jpeg"]
+    position = found["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg) == pytest.approx((54.5, -2.75), abs=1e-9)
+    assert (position.height_m, position.datum, position.source) == (344.17, datum, "geo.txt")
+    assert math.isnan(found["Watt, Süd 3.jpeg"].position.height_m)
+
+
+def test_angles_and_accuracies_of_a_geo_txt_are_read(tmp_path):
+    text = (
+        "EPSG:4326\nDJI_0001.JPG -2.75 54.5 344 90 5 1 0.02 0.04 extra\n"
+        "DJI_0002 -2.75 54.5 344 0 0 0 0.02 0.04\nWatt, Süd 3.jpeg\t-2.75\t54.5\tNaN\n"
+    )
+    found = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    first, second = found["DJI_0001.JPG"], found["100MEDIA/DJI_0002.JPG"]
+    assert first.gimbal_deg == (90, -85, 1)
+    assert (first.position.horizontal_m, first.position.vertical_m) == (0.02, 0.04)
+    assert second.gimbal_deg is None  # three zeros stand for angles that are not available
+    assert math.isnan(found["Watt, Süd 3.jpeg"].position.height_m)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the first line of .*geo.txt is '': expected a projected or geographic coordinate reference system"),
+        ("DJI_0001.JPG -2.75 54.5\n", "is 'DJI_0001.JPG -2.75 54.5': expected a projected or geographic"),
+        ("EPSG:4978\nDJI_0001.JPG 1 2 3\n", "is 'EPSG:4978': expected a projected or geographic"),
+        ("EPSG:4326\nDJI_0001.JPG here there\n", "line 2 is 'DJI_0001.JPG here there': expected image_name x y"),
+        ("EPSG:27700\nDJI_0001.JPG 1e12 1e12 3\n", "line 2 says .*: expected coordinates in 'EPSG:27700'"),
+        ("EPSG:4326\nIMG_1.JPG 1 2 3\n", "names none of the photographs"),
+    ],
+)
+def test_a_geo_txt_that_cannot_be_understood_is_an_error(tmp_path, text, message):
+    with pytest.raises(SurveyError, match=message):
+        read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+
+
+def test_a_file_beside_the_photographs_fills_in_what_exif_lacks(tmp_path):
+    survey_folder(tmp_path, count=3)
+    photograph(tmp_path / "x.jpg")
+    written(tmp_path, f"name,lat,lon\nDJI_0000,46.9,-91.9\nx,{BRIGHTON[0]},{BRIGHTON[1]}\n", "GPS.CSV")
+    survey = read_survey(tmp_path)
+    sources = [photograph.position and photograph.position.source for photograph in survey.photographs]
+    assert sources == ["EXIF", "EXIF", "EXIF", "GPS.CSV"]
+    assert survey.remarks == ()
+
+
+def test_a_file_that_is_given_counts_more_than_exif(tmp_path):
+    survey_folder(tmp_path / "photographs", count=4)
+    path = written(tmp_path, "EPSG:4326\nDJI_0000.JPG -91.99 46.84 200 10 0 0\n", "better.txt")
+    survey = read_survey(tmp_path / "photographs", gps=path)
+    first, second = survey.photographs[:2]
+    assert first.position is not None
+    assert (first.position.source, first.position.longitude_deg) == ("better.txt", -91.99)
+    assert first.gimbal_deg == (10, -90, 0)
+    assert second.position is not None
+    assert second.position.source == "EXIF"
+    with pytest.raises(SurveyError, match=r"nowhere.csv cannot be read"):
+        read_survey(tmp_path / "photographs", gps=tmp_path / "nowhere.csv")
+
+
+def moved(folder: Path, **places: tuple[float, float]) -> Path:
+    """Six photographs close together, and some elsewhere."""
+    survey_folder(folder, count=6)
+    for name, place in places.items():
+        photograph(folder / f"{name}.jpg", table=exif(place=place))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((0.0, 0.0), "it is zero: the receiver had no fix"),
+        ((-91.9946, 46.8426), "its latitude is beyond the poles: latitude and longitude are swapped"),
+        ((46.8426, -300.0), "it is no place on the Earth"),
+        ((47.74, -91.9946), "it is 100 km from the others"),
+    ],
+)
+def test_a_position_that_cannot_be_right_is_left_out_and_the_photograph_named(tmp_path, place, reason):
+    survey = read_survey(moved(tmp_path, odd=place))
+    assert named(survey, "odd.jpg").position is None
+    assert sum(photograph.position is not None for photograph in survey.photographs) == 6
+    remark = next(remark for remark in survey.remarks if remark.startswith("The position of odd.jpg"))
+    assert reason in remark
+    assert any(remark.startswith("1 of 7 photographs have no position: odd.jpg") for remark in survey.remarks)
+
+
+def test_latitude_and_longitude_that_are_swapped_are_told_by_the_others(tmp_path):
+    for index in range(5):
+        photograph(tmp_path / f"{index}.jpg", table=exif(place=(45.03, 7.62 + 1e-4 * index)))
+    photograph(tmp_path / "odd.jpg", table=exif(place=(7.62, 45.03)))
+    survey = read_survey(tmp_path)
+    assert named(survey, "odd.jpg").position is None
+    assert re.search("odd.jpg.* km from the others: latitude and longitude are swapped", survey.remarks[0])
+
+
+def test_a_file_helps_where_exif_is_impossible(tmp_path):
+    written(moved(tmp_path, odd=(0.0, 0.0)), f"name,lat,lon\nodd,{BRIGHTON[0]},{BRIGHTON[1]}\n")
+    odd = named(read_survey(tmp_path), "odd.jpg")
+    assert odd.position is not None
+    assert odd.position.source == "gps.csv"
+
+
+def test_two_places_keep_their_positions_and_are_pointed_out(tmp_path):
+    elsewhere = {f"x{index}": (47.74, -91.99 + 1e-4 * index) for index in range(4)}
+    survey = read_survey(moved(tmp_path, **elsewhere))
+    assert all(photograph.position for photograph in survey.photographs)
+    assert "4 of the 10 positions lie 100 km and more from the others (x0.jpg" in survey.remarks[0]
+    assert "two places" in survey.remarks[0]
+
+
+def test_a_survey_on_the_date_line_is_one_place(tmp_path):
+    for index, longitude in enumerate((179.9995, 179.9998, -179.9999, -179.9996)):
+        photograph(tmp_path / f"{index}.jpg", table=exif(place=(-16.5, longitude)))
+    survey = read_survey(tmp_path)
+    assert survey.remarks == ()
+    assert all(photograph.position for photograph in survey.photographs)

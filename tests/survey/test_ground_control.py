@@ -1,0 +1,251 @@
+"""Models laid onto ground control and adjusted to it; what is wrong with the control is found and named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
+
+from tidefield.errors import SurveyError
+from tidefield.survey.georeference.adjustment import reliable
+from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.survey import Control, Survey
+
+
+def quiet(done: int, whole: int) -> None:
+    assert 0 <= done <= whole
+
+
+def located(flight, survey: Survey):
+    model = in_a_frame_of_its_own(flight.model)
+    return model, georeference(model, survey, quiet)
+
+
+def without_positions(survey: Survey) -> Survey:
+    return replace(survey, photographs=tuple(replace(p, position=None) for p in survey.photographs))
+
+
+def with_marks(survey: Survey, change) -> Survey:
+    """The survey with each mark replaced by what `change` makes of it; None takes it away."""
+    assert survey.control is not None
+    marks = [changed for mark in survey.control.marks if (changed := change(mark)) is not None]
+    return replace(survey, control=replace(survey.control, marks=tuple(marks)))
+
+
+def only_marks(survey: Survey, point: str, count: int) -> Survey:
+    """The survey with only the first few marks of a point."""
+    assert survey.control is not None
+    kept = [mark for mark in survey.control.marks if mark.point == point][:count]
+    return with_marks(survey, lambda mark: mark if mark.point != point or mark in kept else None)
+
+
+def off_m(flight, model, found) -> np.ndarray:
+    """Errors of the sparse points that the photographs were adjusted to nothing but each other at."""
+    truth = np.array([flight.model.points3D[k].xyz for k in sorted(flight.model.points3D)])
+    there = found.frame.from_crs(FRAME.to_crs(truth))
+    return np.array([model.points3D[k].xyz for k in sorted(model.points3D)]) - there
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return fly(position_m=2.0)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A survey through a lens with distortion, reconstructed as if it had none and were 3% longer."""
+    lens = [1.0 * FOCAL, FOCAL, WIDTH / 2 - 4, HEIGHT / 2 + 6, -0.03, 0.01, 0.002, -0.001]
+    true = fly(
+        camera=pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=lens, camera_id=1), position_m=2.0
+    )
+    survey = with_control(true)
+    model = pycolmap.Reconstruction(true.model)
+    model.cameras[1].model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    model.cameras[1].params = [1.03 * FOCAL, WIDTH / 2, HEIGHT / 2, -0.02]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(model, options)
+    return true, model, survey
+
+
+@pytest.mark.parametrize("positions", [True, False])
+def test_the_model_meets_the_control_whether_or_not_there_are_positions(flight, positions):
+    survey = with_control(flight)
+    model, found = located(flight, survey if positions else without_positions(survey))
+    assert found.source == "ground control"
+    assert found.frame.epsg == 27700
+    off = off_m(flight, model, found)
+    assert np.median(np.linalg.norm(off[:, :2], axis=1)) < 0.05
+    assert np.median(np.abs(off[:, 2])) < 0.10
+    assert found.control.horizontal_rms_m < 0.03
+    assert found.check.names == tuple(f"G{k}" for k in range(1, 9))
+    assert 0.005 < found.check.horizontal_rms_m < 0.06
+    assert 0.005 < found.check.vertical_rms_m < 0.15
+    assert found.left_out == ()
+    assert len(found.gps.names) == (15 if positions else 0)
+
+
+def test_the_points_of_the_control_do_not_stay_in_the_model(flight):
+    model, _ = located(flight, with_control(flight))
+    assert model.num_points3D() == flight.model.num_points3D()
+    for number in flight.model.reg_image_ids():
+        assert len(model.image(number).points2D) == len(flight.model.image(number).points2D)
+    assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
+
+
+def test_a_shift_that_all_positions_share_is_told_and_does_no_harm(flight):
+    lifted = tuple(
+        replace(p, position=replace(p.position, height_m=p.position.height_m + 48)) for p in flight.survey.photographs
+    )
+    survey = replace(with_control(flight), photographs=lifted)
+    model, found = located(flight, survey)
+    assert found.gps.median_m[2] == pytest.approx(-48, abs=2)
+    assert np.abs(off_m(flight, model, found)).max() < 1.0
+
+
+@pytest.mark.parametrize("marks", [2, 3, 4])
+@pytest.mark.parametrize("positions", [True, False])
+def test_a_mark_that_is_moved_by_200_pixels_is_found_named_and_left_out(flight, marks, positions):
+    survey = only_marks(with_control(flight), "G3", marks)
+    if not positions:
+        survey = without_positions(survey)
+    assert survey.control is not None
+    wrong = next(mark for mark in survey.control.marks if mark.point == "G3")
+    away = replace(wrong, uv_px=(wrong.uv_px[0] + 120, wrong.uv_px[1] - 160))
+    model, found = located(flight, with_marks(survey, lambda mark: away if mark == wrong else mark))
+    assert [(item.kind, item.name) for item in found.left_out] == [("mark", f"G3 in {wrong.photograph}")]
+    assert int(found.left_out[0].reason.split()[2]) == pytest.approx(200, abs=5)
+    assert np.abs(off_m(flight, model, found)).max() < 1.0
+    assert ("G3" in found.check.names) == (marks > 2)
+
+
+def test_a_point_that_was_surveyed_wrongly_is_found_named_and_left_out(flight):
+    survey = with_control(flight)
+    assert survey.control is not None
+    east, north, up = survey.control.points["G2"]
+    points = survey.control.points | {"G2": (east, north - 2.0, up + 4.0)}
+    model, found = located(flight, replace(survey, control=replace(survey.control, points=points)))
+    assert [(item.kind, item.name) for item in found.left_out] == [("control point", "G2")]
+    assert "4.5 m from where it was surveyed" in found.left_out[0].reason
+    assert "-4.0" in found.left_out[0].reason
+    assert "G2" not in found.check.names
+    assert np.abs(off_m(flight, model, found)).max() < 1.0
+
+
+def test_a_point_that_is_half_a_metre_off_is_told_from_the_others_by_leaving_it_out():
+    flight = fly(lines=4, each=6, position_m=2.0)
+    survey = with_control(flight, np.r_[CONTROL, [[-15, -35], [15, 38]]])
+    assert survey.control is not None
+    east, north, up = survey.control.points["G5"]
+    points = survey.control.points | {"G5": (east + 0.5, north, up + 0.9)}
+    _, found = located(flight, replace(survey, control=replace(survey.control, points=points)))
+    assert [(item.kind, item.name) for item in found.left_out] == [("control point", "G5")]
+
+
+def test_a_point_one_of_whose_three_marks_agrees_by_chance_is_left_out_whole(flight):
+    survey = only_marks(with_control(flight), "G6", 3)
+    assert survey.control is not None
+    one, *others = [mark for mark in survey.control.marks if mark.point == "G6"]
+    moved = {
+        mark: replace(mark, uv_px=(mark.uv_px[0] + 90, mark.uv_px[1] + 40 - 80 * i)) for i, mark in enumerate(others)
+    }
+    _, found = located(flight, with_marks(survey, lambda mark: moved.get(mark, mark)))
+    assert {item.name for item in found.left_out} == {f"G6 in {mark.photograph}" for mark in (one, *others)}
+    assert "G6" not in found.control.names
+
+
+def test_matches_that_fit_far_worse_than_most_are_not_adjusted_to(flight):
+    model = pycolmap.Reconstruction(flight.model)
+    wrong = {}
+    for number in sorted(model.point3D_ids())[::15]:
+        element = model.points3D[number].track.elements[0]
+        wrong[number] = element.image_id
+        model.images[element.image_id].points2D[element.point2D_idx].xy += (5.0, -3.0)
+    sound = reliable(model)
+    assert len(wrong) > 15
+    for number, image in wrong.items():
+        assert not sound.exists_point3D(number) or image not in seen_by(sound, number)
+    assert sound.compute_num_observations() > 0.85 * model.compute_num_observations()
+    assert model.num_points3D() == flight.model.num_points3D()
+
+
+def seen_by(model: pycolmap.Reconstruction, number: int) -> set[int]:
+    return {element.image_id for element in model.points3D[number].track.elements}
+
+
+def test_points_that_one_photograph_shows_are_used_and_said_not_to_be_checked(flight):
+    survey = only_marks(only_marks(with_control(flight), "G1", 1), "G4", 1)
+    _, found = located(flight, survey)
+    assert found.check.names == ("G2", "G3", "G5", "G6", "G7", "G8")
+    assert any("G1, G4" in note and "not checked" in note for note in found.notes)
+
+
+def test_control_takes_out_the_bend_that_a_wrong_lens_leaves(bent):
+    true, model, survey = bent
+    turned = in_a_frame_of_its_own(model)
+    found = georeference(turned, survey, quiet)
+    off = off_m(true, turned, found)
+    assert any("corrected the lens" in note for note in found.notes)
+    assert turned.cameras[1].model == pycolmap.CameraModelId.OPENCV
+    np.testing.assert_allclose(turned.cameras[1].params[:4], [FOCAL, FOCAL, WIDTH / 2 - 4, HEIGHT / 2 + 6], atol=8)
+    assert np.sqrt((off[:, :2] ** 2).sum(1).mean()) < 0.1
+    assert np.sqrt((off[:, 2] ** 2).mean()) < 0.2
+    positions_only = in_a_frame_of_its_own(model)
+    without = georeference(positions_only, replace(survey, control=None), quiet)
+    worse = off_m(true, positions_only, without)
+    assert np.sqrt((worse[:, 2] ** 2).mean()) > 3 * np.sqrt((off[:, 2] ** 2).mean())
+
+
+def test_two_points_move_what_the_positions_have_placed(flight):
+    survey = with_control(flight, CONTROL[:2])
+    model, found = located(flight, survey)
+    assert found.control.names == ("G1", "G2")
+    assert found.check.names == ()
+    assert any("Fewer than three" in note for note in found.notes)
+    assert np.abs(off_m(flight, model, found)).max() < 3.0
+    assert found.control.horizontal_rms_m < 0.5
+
+
+def test_two_points_are_enough_without_positions_where_the_photographs_hold_the_vertical(flight):
+    model, found = located(flight, without_positions(with_control(flight, CONTROL[:2])))
+    assert np.linalg.norm(off_m(flight, model, found)[:, :2], axis=1).mean() < 5.0
+
+
+def test_points_on_one_line_do_not_turn_the_model_over(flight):
+    line = np.column_stack([np.linspace(-35, 35, 5), np.zeros(5)])
+    model, found = located(flight, with_control(flight, line))
+    assert np.abs(off_m(flight, model, found)).max() < 5.0
+
+
+def test_one_point_without_positions_is_too_few(flight):
+    survey = without_positions(with_control(flight, CONTROL[:1]))
+    with pytest.raises(SurveyError, match="expected three such points"):
+        located(flight, survey)
+
+
+def test_points_that_are_mixed_up_are_an_error(flight):
+    survey = with_control(flight)
+    assert survey.control is not None
+    names = sorted(survey.control.points)
+    mixed = dict(zip(names, [survey.control.points[n] for n in [*names[3:], *names[:3]]], strict=True))
+    with pytest.raises(SurveyError, match="marks of ground control fit together"):
+        located(flight, replace(survey, control=replace(survey.control, points=mixed)))
+
+
+def test_control_in_another_system_is_an_error_that_says_which(flight):
+    survey = with_control(flight)
+    assert survey.control is not None
+    wrong = Control("EPSG:32630", survey.control.points, survey.control.marks)
+    with pytest.raises(SurveyError, match=r"lie [\d,]+ km from the photographs.*EPSG:27700"):
+        located(flight, replace(survey, control=wrong))
+
+
+def test_marks_in_photographs_that_were_not_placed_are_named_and_the_rest_used(flight):
+    survey = with_control(flight)
+    astray = with_marks(survey, lambda m: replace(m, photograph="lost.jpg") if m.photograph == name_of(2) else m)
+    _, found = located(flight, astray)
+    assert found.left_out
+    assert all(item.kind == "mark" and "lost.jpg" in item.name for item in found.left_out)
+    with pytest.raises(SurveyError, match="could not be placed"):
+        located(flight, with_marks(survey, lambda m: replace(m, photograph="lost.jpg")))

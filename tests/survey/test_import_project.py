@@ -1,0 +1,233 @@
+import logging
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from opensfm_projects import reconstruction, tracks_of, write_opensfm, write_tracks
+from PIL import Image
+from scenes_on_disk import (
+    BARREL,
+    PINHOLE,
+    UTM,
+    Truth,
+    survey,
+    with_one_larger,
+    write_blender,
+    write_colmap,
+    write_llff,
+    write_transforms,
+)
+
+from tidefield.data.georeference import read_georeference
+from tidefield.data.load import load_scene, read_posed
+from tidefield.data.readers.posed import Observations
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError, SceneError
+from tidefield.survey import import_project as convert
+from tidefield.survey.import_project import import_project
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def write_project(root: Path, kind: str = "brown", tracks: bool = True) -> None:
+    top = reconstruction(kind)
+    write_opensfm(root, top)
+    if tracks:
+        write_tracks(root / "tracks.csv", tracks_of(top))
+
+
+def assert_same(own: Scene, other: Scene) -> None:
+    """The same but for what no scene on disk can say."""
+    assert own.names == other.names
+    for part in ("T_world_camera", "focal_px", "principal_px", "size_px"):
+        torch.testing.assert_close(getattr(own.cameras, part), getattr(other.cameras, part))
+    torch.testing.assert_close(own.origin_world, other.origin_world)
+    for mine, theirs in zip(own.photographs.colours, other.photographs.colours, strict=True):
+        assert torch.equal(mine, theirs)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("truth", [survey(BARREL), with_one_larger(survey(BARREL)), survey(PINHOLE, offset=UTM)])
+def test_a_colmap_scene_is_imported_as_it_is(tmp_path: Path, truth: Truth, text: bool) -> None:
+    write_colmap(tmp_path / "theirs", truth, text)
+    made = import_project(tmp_path / "theirs", tmp_path / "ours")
+    theirs, ours = read_posed(tmp_path / "theirs", False), read_posed(tmp_path / "ours", False)
+    np.testing.assert_allclose(ours.T_world_camera, theirs.T_world_camera, atol=1e-8)
+    assert (ours.names, ours.lenses) == (theirs.names, theirs.lenses)
+    assert ours.points is not None
+    assert theirs.points is not None
+
+    def observed(points: Observations) -> set[tuple[float, ...]]:
+        seen = np.concatenate([points.xyz_world[points.point_index], points.photograph_index[:, None], points.uv_px], 1)
+        return set(map(tuple, seen))
+
+    assert observed(ours.points) == observed(theirs.points)
+    assert (made.photographs, made.held_out, made.cameras) == (9, 2, len(set(truth.lenses)))
+    assert (made.points, made.observations) == (len(theirs.points.xyz_world), len(theirs.points.uv_px))
+    assert_same(load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs"))
+
+
+@pytest.mark.parametrize("kind", ["perspective", "brown", "radial"])
+def test_an_opensfm_project_becomes_a_colmap_model_that_agrees_with_itself(tmp_path: Path, kind: str) -> None:
+    write_project(tmp_path / "project", kind)
+    made = import_project(tmp_path / "project", tmp_path / "scene")
+    model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
+    assert model.num_reg_images() == made.photographs == 9
+    assert model.compute_num_observations() == made.observations > 1000
+    assert max(point.error for point in model.points3D.values()) < 1e-6
+    expected = "FULL_OPENCV" if kind == "brown" else "OPENCV"  # only brown has a sixth order
+    assert {camera.model_name for camera in model.cameras.values()} == {expected}
+    colours = [point["color"] for point in reconstruction(kind)["points"].values()]
+    assert [point.color.tolist() for _, point in sorted(model.points3D.items())] == colours
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 1e-6
+    assert_same(load_scene(tmp_path / "scene"), load_scene(tmp_path / "project"))
+
+
+def test_points_that_nobody_is_known_to_have_seen_are_kept(tmp_path: Path) -> None:
+    write_project(tmp_path / "project", tracks=False)
+    made = import_project(tmp_path / "project", tmp_path / "scene")
+    assert (made.points, made.observations) == (600, 0)
+    ours, theirs = load_scene(tmp_path / "scene"), load_scene(tmp_path / "project")
+    assert ours.points is None
+    torch.testing.assert_close(ours.cameras.near_far, theirs.cameras.near_far)
+    posed = read_posed(tmp_path / "scene", False)
+    assert posed.points is not None
+    assert posed.points.rgb is not None
+    own = np.concatenate([posed.points.xyz_world, posed.points.rgb], axis=1)
+    truth = {(*point["coordinates"], *point["color"]) for point in reconstruction()["points"].values()}
+    assert set(map(tuple, own.tolist())) == truth
+
+
+def test_scenes_of_other_layouts_are_imported_and_told_what_is_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_transforms(tmp_path / "nerfstudio", survey(BARREL))
+    write_llff(tmp_path / "llff", survey(PINHOLE))
+    write_blender(tmp_path / "blender", {"train": 6, "test": 3})
+    with caplog.at_level(logging.WARNING, logger="tidefield"):
+        for layout in ("nerfstudio", "llff", "blender"):
+            import_project(tmp_path / layout, tmp_path / f"{layout}-scene")
+            assert_same(load_scene(tmp_path / f"{layout}-scene"), load_scene(tmp_path / layout))
+    told = [record.getMessage() for record in caplog.records]
+    assert [Path(message.split()[0]).name for message in told] == ["llff", "blender", "blender"]
+    assert sum("every eighth held out instead" in message for message in told) == 1
+
+
+def test_a_georeferenced_project_hands_on_where_it_is(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    assert import_project(tmp_path / "project", tmp_path / "a").georeference is None
+    (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
+    import_project(tmp_path / "project", tmp_path / "b")
+    import_project(tmp_path / "b", tmp_path / "c")
+    for name in "bc":
+        located = read_georeference(tmp_path / name)
+        assert located is not None
+        assert located.frame is not None
+        assert located.source == "project"
+        np.testing.assert_allclose(located.frame.to_geographic(np.zeros((1, 3))), [[-3.0, 4.5, 2.0]], atol=1e-9)
+        assert located.frame.crs == "EPSG:32630"
+        assert '"orientation_override": "none"' in (tmp_path / name / "transforms.json").read_text()
+    assert not (tmp_path / "a" / "georeference.json").exists()
+
+
+def test_photographs_are_copied_or_linked_untouched(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    write_colmap(tmp_path / "theirs", truth)
+    disk = tmp_path / "disk"
+    (tmp_path / "theirs" / "images").rename(disk)
+    (tmp_path / "theirs" / "images").symlink_to(disk)
+    calls: list[tuple[int, int]] = []
+    import_project(tmp_path / "theirs", tmp_path / "copied", progress=lambda *so_far: calls.append(so_far))
+    import_project(tmp_path / "theirs", tmp_path / "linked", link=True)
+    assert calls == [(i, 9) for i in range(1, 10)]
+    for name in truth.names:
+        copy, link = (tmp_path / kind / "images" / name for kind in ("copied", "linked"))
+        assert copy.read_bytes() == (disk / name).read_bytes()
+        assert not copy.samefile(disk / name)
+        assert link.samefile(disk / name)
+        assert not link.is_symlink()
+
+
+def test_photographs_reduced_beside_their_model_get_cameras_of_their_size(tmp_path: Path) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path / "theirs", truth)
+    for name in truth.names:
+        path = tmp_path / "theirs" / "images" / name
+        Image.open(path).resize((32, 24)).save(path)
+    import_project(tmp_path / "theirs", tmp_path / "ours")
+    model = pycolmap.Reconstruction(str(tmp_path / "ours" / "sparse" / "0"))
+    assert {(camera.width, camera.height) for camera in model.cameras.values()} == {(32, 24)}
+    assert model.compute_mean_reprojection_error() < 1e-6
+    Image.new("RGB", (48, 64)).save(tmp_path / "theirs" / "images" / truth.names[0])
+    with pytest.raises(SceneError, match="48 x 64 pixels, but its camera has 64 x 48"):
+        import_project(tmp_path / "theirs", tmp_path / "refused")
+
+
+def test_names_of_windows_become_folders(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    write_colmap(tmp_path / "theirs", replace(truth, names=tuple(name.replace("/", "\\") for name in truth.names)))
+    shutil.rmtree(tmp_path / "theirs" / "images")
+    write_colmap(tmp_path / "plain", truth)
+    (tmp_path / "plain" / "images").rename(tmp_path / "theirs" / "images")
+    import_project(tmp_path / "theirs", tmp_path / "ours")
+    assert load_scene(tmp_path / "ours").names == tuple(sorted(truth.names))
+
+
+def test_a_photograph_named_twice_is_refused(tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    write_transforms(tmp_path / "theirs", replace(truth, names=(*truth.names[:8], truth.names[0])))
+    with pytest.raises(SceneError, match=r"strip_0/photo_8\.png twice"):
+        import_project(tmp_path / "theirs", tmp_path / "ours")
+
+
+def test_missing_photographs_are_left_out_on_request(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    (tmp_path / "project" / "images" / "DJI_0003.png").unlink()
+    with pytest.raises(SceneError, match="--allow-missing"):
+        import_project(tmp_path / "project", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+    assert import_project(tmp_path / "project", tmp_path / "scene", allow_missing=True).photographs == 8
+    assert len(load_scene(tmp_path / "scene").names) == 8
+
+
+def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    (tmp_path / "scene").mkdir()
+    with pytest.raises(RunError, match=r"scene is there already: expected a new name; choose one$"):
+        import_project(tmp_path / "project", tmp_path / "scene")
+    assert os.listdir(tmp_path / "scene") == []
+
+
+def test_an_import_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_project(tmp_path / "project")
+
+    def stumble(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_project(tmp_path / "project", tmp_path / "scene", progress=stumble)
+    assert os.listdir(tmp_path) == ["project"]
+
+    def across(*_: object) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(convert.os, "link", across)
+    with pytest.raises(RunError, match=r"cannot be linked \(Invalid cross-device link\).*leave --link out"):
+        import_project(tmp_path / "project", tmp_path / "scene", link=True)
+    assert os.listdir(tmp_path) == ["project"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_one_clear_error(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="cannot be written"):
+        import_project(tmp_path / "project", tmp_path / "file" / "scene")

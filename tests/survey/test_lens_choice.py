@@ -1,0 +1,143 @@
+"""A lens gets the terms of distortion that it has, and none that would bend the model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
+
+from tidefield.survey.georeference.adjustment import adjustment_options
+from tidefield.survey.sfm.lens_choice import SPREAD_DEG, TERMS, Choice, Trial, best_of, choose_lens, told
+from tidefield.survey.survey import LensPrior
+
+
+def quiet(done: int, whole: int) -> None:
+    assert 0 <= done <= whole
+
+
+def camera(k1: float, k2: float, p1: float = 0.0, p2: float = 0.0) -> pycolmap.Camera:
+    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, k1, k2, p1, p2]
+    return pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+
+
+@pytest.mark.parametrize(
+    ("own", "lens"),
+    [
+        (camera(-0.08, 0.0), "SIMPLE_RADIAL"),
+        (camera(-0.25, 0.2), "RADIAL"),
+        (camera(-0.25, 0.2, 0.004, -0.003), "OPENCV"),
+    ],
+)
+def test_the_terms_that_a_lens_has_are_found(own: pycolmap.Camera, lens: str):
+    flight = fly(camera=own, noise_px=0.2)
+    model = pycolmap.Reconstruction(flight.model)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    trials = choice.trials
+    assert not choice.freed
+    assert [trial.lens for trial in trials if trial is not trials[-1]] == [name for name in TERMS if name != lens]
+    assert trials[-1].lens == lens
+    (found,) = model.cameras.values()
+    assert found.model_name == lens
+    assert found.focal_length_x == FOCAL
+    assert model.compute_mean_reprojection_error() < 0.3
+    true = np.asarray(own.params[4:])[: TERMS[lens]]
+    np.testing.assert_allclose(np.asarray(found.params)[-TERMS[lens] :], true, atol=0.02)
+
+
+def test_without_enough_positions_matches_alone_decide():
+    flight = fly(camera=camera(-0.25, 0.2), noise_px=0.2)
+    trials = choose_lens(pycolmap.Reconstruction(flight.model), flight.survey.photographs[:3], True, quiet).trials
+    assert trials[-1].lens == "RADIAL"
+    assert all(trial.off_m is None for trial in trials)
+
+
+def test_an_unknown_focal_length_is_refined():
+    flight = fly(lines=4, each=6)
+    model = pycolmap.Reconstruction(flight.model)
+    (own,) = model.cameras.values()
+    own.params = [1.1 * FOCAL, *own.params[1:]]
+    choice = choose_lens(model, flight.survey.photographs, False, quiet)
+    (found,) = model.cameras.values()
+    assert choice.freed
+    assert "heights may be wrong" in told(choice)[0]
+    assert found.focal_length_x != pytest.approx(1.1 * FOCAL, rel=1e-3)
+    assert model.compute_mean_reprojection_error() < 0.45
+
+
+@pytest.mark.parametrize(
+    ("errors", "offs", "lens"),
+    [
+        ((0.50, 0.45, 0.40), (0.6, 0.6, 0.6), "OPENCV"),
+        ((0.50, 0.45, 0.449), (0.6, 0.6, 0.6), "RADIAL"),
+        ((0.50, 0.45, 0.40), (0.6, 0.7, 0.7), "SIMPLE_RADIAL"),
+        ((0.50, 0.45, 0.40), (0.6, 0.7, 0.6), "OPENCV"),
+        ((0.50, 0.45, 0.40), (None, None, None), "OPENCV"),
+    ],
+)
+def test_a_richer_lens_must_be_worth_it_and_not_bend_the_model(errors, offs, lens):
+    trials = [Trial(*values, FOCAL) for values in zip(TERMS, errors, offs, strict=True)]
+    assert best_of(trials).lens == lens
+
+
+def test_the_surveyor_is_told_where_positions_spoke_against_a_richer_lens():
+    simple, radial, full = (
+        Trial(*values, FOCAL)
+        for values in (("SIMPLE_RADIAL", 0.46, 0.59), ("RADIAL", 0.43, 0.65), ("OPENCV", 0.42, 0.67))
+    )
+    (sentence,) = told(Choice((radial, full, simple), known=True, freed=False, spread_deg=3.0))
+    assert "0.42 px instead of 0.46" in sentence
+    assert "0.67 m instead of 0.59" in sentence
+    assert told(Choice((simple, radial, full), known=True, freed=False, spread_deg=3.0)) == ()
+
+
+def test_a_wrong_focal_length_is_corrected_where_the_photographs_look_in_different_directions():
+    flight = fly(lines=4, each=6, tilt_deg=25.0, noise_px=0.2)
+    model = adjusted_with(flight, 1.04 * FOCAL)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    assert choice.spread_deg > SPREAD_DEG
+    assert choice.freed
+    assert model.cameras[1].focal_length_x == pytest.approx(FOCAL, rel=0.005)
+    assert f"refined from {1.04 * FOCAL:.1f} to" in told(choice)[0]
+
+
+def test_photographs_straight_down_keep_the_focal_length_that_is_stated():
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    model = adjusted_with(flight, 1.04 * FOCAL)
+    choice = choose_lens(model, flight.survey.photographs, True, quiet)
+    assert choice.spread_deg < SPREAD_DEG
+    assert not choice.freed
+    assert model.cameras[1].focal_length_x == pytest.approx(1.04 * FOCAL)
+
+
+def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
+    """As structure from motion leaves it that was told a wrong focal length."""
+    model = pycolmap.Reconstruction(flight.model)
+    model.cameras[1].params = [focal_px, *model.cameras[1].params[1:]]
+    options = adjustment_options()
+    options.refine_principal_point = False
+    pycolmap.bundle_adjustment(model, options)
+    return model
+
+
+@pytest.mark.parametrize(("true", "design", "used"), [(1.0, 1.04, 1.0), (1.04, 1.0, 1.0), (1.04, 1.035, 1.04)])
+def test_of_two_stated_focal_lengths_the_one_is_held_whose_flight_height_is_the_drones(true, design, used):
+    """The stated calibration is `true` times the real focal length; the drone's own height is right."""
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    lens = LensPrior(true * FOCAL, None, None, "DJI dewarp data", True, design * FOCAL)
+    heights = [
+        place[2] - float(np.median([p.xyz[2] for p in flight.model.points3D.values()]))
+        for place in flight.centres_world
+    ]
+    photographs = [
+        replace(p, lens=lens, relative_altitude_m=h) for p, h in zip(flight.survey.photographs, heights, strict=True)
+    ]
+    model = adjusted_with(flight, true * FOCAL)
+    choice = choose_lens(model, photographs, True, quiet)
+    assert model.cameras[1].focal_length_x == pytest.approx(used * FOCAL)
+    if design == 1.035:
+        assert choice.heights is None
+    else:
+        assert ("the design one was used" if true > design else "the calibrated one was used") in told(choice)[0]
+        assert choice.heights is not None
+        assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)

@@ -1,0 +1,197 @@
+"""What cameras and drones write beside the pixels is read as it was meant."""
+
+import math
+
+import pytest
+from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, survey_folder, xmp
+from PIL.ExifTags import GPS, Base
+
+from tidefield.survey.io.photographs import read_survey
+
+
+def test_a_canon_without_gps_takes_its_positions_from_the_table_beside():
+    first = read_survey(real_survey("swindale")).photographs[0]
+    assert first.position is not None
+    assert (first.position.latitude_deg, first.position.longitude_deg) == (54.5096294, -2.7570267)
+    assert first.position.source == "gps.csv"
+    assert first.lens is not None
+    assert first.lens.focal_px == pytest.approx(4.3 / 25.4 * 6557.377)
+
+
+def test_an_orientation_that_does_not_exist_is_upright(tmp_path):
+    assert one(tmp_path, table=exif({Base.Orientation: 9})).orientation == 1
+
+
+def test_exposure_time_and_body_are_read(tmp_path):
+    tags = {
+        Base.Make: "Canon",
+        Base.Model: "Canon EOS R5",
+        Base.ExposureTime: 1 / 400,
+        Base.ISOSpeedRatings: 200,
+        Base.FNumber: 4.0,
+        Base.FocalLength: 35.0,
+        Base.DateTimeOriginal: "2024:05:06 07:08:09",
+        Base.SubsecTimeOriginal: "25",
+        Base.BodySerialNumber: "0815",
+    }
+    read = one(tmp_path, table=exif(tags))
+    assert (read.camera, read.serial, read.focal_mm) == ("Canon EOS R5", "0815", 35.0)
+    assert read.log_exposure == pytest.approx(math.log(200 / 400 / 16), rel=1e-5)
+    assert read.time_s == pytest.approx(1714979289.25)
+
+
+def test_a_photograph_that_says_nothing_is_a_photograph(tmp_path):
+    read = one(tmp_path)
+    assert (read.camera, read.serial, read.lens, read.position, read.gimbal_deg) == ("", "", None, None, None)
+    assert all(map(math.isnan, (read.focal_mm, read.time_s, read.log_exposure, read.relative_altitude_m)))
+
+
+@pytest.mark.parametrize("date", ["0000:00:00 00:00:00", "yesterday", ""])
+def test_a_clock_that_was_never_set_gives_no_time(tmp_path, date):
+    assert math.isnan(one(tmp_path, table=exif({Base.DateTimeOriginal: date})).time_s)
+
+
+def test_positions_in_the_south_and_west_under_the_sea_have_their_signs(tmp_path):
+    gps = {GPS.GPSHPositioningError: 1.5}
+    read = one(tmp_path, table=exif(place=(-39.375, -71.1), height_m=-3.5, gps=gps)).position
+    assert read is not None
+    assert (read.latitude_deg, read.longitude_deg, read.height_m) == pytest.approx((-39.375, -71.1, -3.5))
+    assert read.horizontal_m == 1.5
+    assert math.isnan(read.vertical_m)
+    assert read.datum == "mean sea level"
+
+
+@pytest.mark.parametrize(
+    ("reference", "version", "height_m", "datum"),
+    [
+        (0, b"0230", 5.0, "mean sea level"),
+        (1, b"0230", -5.0, "mean sea level"),
+        (0, b"0300", 5.0, "ellipsoid"),
+        (1, b"0300", -5.0, "ellipsoid"),
+        (2, b"0300", 5.0, "mean sea level"),
+        (3, b"0300", -5.0, "mean sea level"),
+        (7, b"0300", 5.0, "unknown"),
+    ],
+)
+def test_what_a_height_counts_from_depends_on_the_version_of_exif(tmp_path, reference, version, height_m, datum):
+    table = exif({Base.ExifVersion: version}, {GPS.GPSAltitude: 5.0, GPS.GPSAltitudeRef: bytes([reference])}, BRIGHTON)
+    read = one(tmp_path, table=table).position
+    assert read is not None
+    assert (read.height_m, read.datum) == (height_m, datum)
+
+
+def test_an_rtk_drone_under_the_ellipsoid_keeps_its_sign(tmp_path):
+    packet = xmp(
+        {
+            "AbsoluteAltitude": "-12.50",
+            "RelativeAltitude": "+30.10",
+            "RtkFlag": "50",
+            "RtkStdLon": "0.012",
+            "RtkStdLat": "0.015",
+            "RtkStdHgt": "0.03",
+            "GimbalYawDegree": "-179.9",
+            "GimbalPitchDegree": "-90.00",
+            "GimbalRollDegree": "+0.00",
+        }
+    )
+    read = one(tmp_path, table=exif(place=BRIGHTON, height_m=4294954.796), packet=packet)
+    assert read.position is not None
+    assert read.position.height_m == -12.5  # EXIF's number has overflowed
+    assert (read.position.horizontal_m, read.position.vertical_m) == (0.015, 0.03)
+    assert read.position.datum == "ellipsoid"
+    assert read.relative_altitude_m == 30.1
+    assert read.gimbal_deg == (-179.9, -90.0, 0.0)
+
+
+def test_deviations_without_a_position_fix_are_not_believed(tmp_path):
+    packet = xmp({"RtkFlag": "0", "RtkStdLon": "0.01", "RtkStdLat": "0.01", "RtkStdHgt": "0.01"})
+    read = one(tmp_path, table=exif(place=BRIGHTON), packet=packet).position
+    assert read is not None
+    assert math.isnan(read.horizontal_m)
+    assert math.isnan(read.vertical_m)
+
+
+def test_xmp_gives_a_position_where_exif_has_none(tmp_path):
+    packet = xmp({"GpsLatitude": "46.8426", "GpsLongtitude": "-91.9946"})
+    read = one(tmp_path, packet=packet).position
+    assert read is not None
+    assert (read.latitude_deg, read.longitude_deg, read.source) == (46.8426, -91.9946, "XMP")
+
+
+def test_pix4d_tags_give_angles_and_accuracies(tmp_path):
+    packet = xmp(
+        {
+            "Camera:Yaw": "90",
+            "Camera:Pitch": "10",
+            "Camera:Roll": "-2",
+            "Camera:GPSXYAccuracy": "0.02",
+            "Camera:GPSZAccuracy": "4/100",
+            "Camera:AboveGroundAltitude": "120",
+        }
+    )
+    read = one(tmp_path, table=exif(place=BRIGHTON), packet=packet)
+    assert read.gimbal_deg == (90.0, -80.0, -2.0)
+    assert read.position is not None
+    assert (read.position.horizontal_m, read.position.vertical_m) == (0.02, 0.04)
+    assert read.relative_altitude_m == 120.0
+
+
+def test_angles_in_a_structure_are_found(tmp_path):
+    inner = (
+        '<drone-dji:CameraOrientationNED rdf:parseType="Resource"><drone-dji:Yaw>12.5</drone-dji:Yaw>'
+        "<drone-dji:Pitch>-88</drone-dji:Pitch><drone-dji:Roll>1</drone-dji:Roll></drone-dji:CameraOrientationNED>"
+    )
+    assert one(tmp_path, packet=xmp({}, inner)).gimbal_deg == (12.5, -88.0, 1.0)
+
+
+def test_three_zero_angles_are_no_angles(tmp_path):
+    packet = xmp({"GimbalYawDegree": "+0.00", "GimbalPitchDegree": "+0.00", "GimbalRollDegree": "+0.00"})
+    assert one(tmp_path, packet=packet).gimbal_deg is None
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b'<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>',
+        b"<x:xmpmeta>",
+        b"\xff\xfe\x00\xd8",
+        b"<x/>" + b" " * 0 + b"<!--" + b"a" * 60000,
+    ],
+)
+def test_xmp_that_is_damaged_or_malicious_is_not_read_and_named(tmp_path, packet):
+    survey_folder(tmp_path, count=2)
+    photograph(tmp_path / "odd.jpg", packet=packet)
+    survey = read_survey(tmp_path)
+    assert any("XMP metadata of odd.jpg is damaged" in remark for remark in survey.remarks)
+    assert named(survey, "odd.jpg").gimbal_deg is None
+
+
+def test_damaged_numbers_are_unknown(tmp_path):
+    tags = {Base.FocalLength: 0, Base.FocalLengthIn35mmFilm: 0, Base.ExposureTime: 0, Base.ISOSpeedRatings: 0}
+    read = one(tmp_path, table=exif(tags))
+    assert read.lens is None
+    assert math.isnan(read.log_exposure)
+    assert math.isnan(read.focal_mm)
+
+
+def test_exif_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
+    survey_folder(tmp_path, count=2)
+    path = photograph(tmp_path / "this.jpg", table=exif({Base.Make: "DJI", Base.FocalLength: 3.61}, place=BRIGHTON))
+    data = path.read_bytes()
+    start = data.index(b"Exif\0\0")
+    path.write_bytes(data[: start + 40] + b"\xff" * 60 + data[start + 100 :])
+    read = named(read_survey(tmp_path), "this.jpg")
+    assert (read.width, read.height) == (64, 48)
+    assert read.position is None or math.isnan(read.focal_mm)
+
+
+def test_png_and_tiff_have_exif_too(tmp_path):
+    survey_folder(tmp_path, count=2)
+    for name in ("a.png", "b.tif"):
+        photograph(tmp_path / name, table=exif({Base.Make: "DJI", Base.Orientation: 8}, place=BRIGHTON))
+    survey = read_survey(tmp_path)
+    for name in ("a.png", "b.tif"):
+        read = named(survey, name)
+        assert (read.camera, read.orientation, read.width) == ("DJI", 8, 48)
+        assert read.position is not None
+        assert read.position.latitude_deg == pytest.approx(BRIGHTON[0])

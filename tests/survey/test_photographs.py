@@ -1,0 +1,142 @@
+"""Folders of photographs become surveys, and what is wrong with them is said."""
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from camera_files import exif, named, one, photograph, real_survey, survey_folder
+from PIL import Image
+from PIL.ExifTags import Base
+
+from tidefield.errors import SurveyError
+from tidefield.survey.io.photographs import read_survey
+
+
+def test_three_real_surveys_are_read_whole_and_without_remarks():
+    for name, count in (("brighton_beach", 18), ("turin_lot", 32), ("swindale", 79)):
+        survey = read_survey(real_survey(name))
+        assert len(survey.photographs) == count
+        assert survey.remarks == ()
+        assert all(photograph.position and photograph.lens for photograph in survey.photographs)
+        assert all(math.isfinite(photograph.time_s + photograph.log_exposure) for photograph in survey.photographs)
+
+
+def test_photographs_are_found_in_sub_folders_whatever_their_suffix_and_name(tmp_path):
+    names = ["100MEDIA/DJI 0001.JPG", "101MEDIA/DJI 0001.JPG", "Watt, Süd/Priel №3.jpeg", "b.TIFF", "潮汐.png"]
+    for name in names:
+        photograph(tmp_path / name)
+    for name in (".cache/x.jpg", "@eaDir/x.jpg", "scene/images/x.jpg", "._DJI 0001.JPG", "odm_orthophoto/x.tif"):
+        photograph(tmp_path / name)
+    (tmp_path / "scene/sparse/0").mkdir(parents=True)
+    (tmp_path / "notes.txt").write_text("windy")
+    survey = read_survey(tmp_path)
+    assert [photograph.name for photograph in survey.photographs] == sorted(names)
+    assert all(photograph.path.is_file() for photograph in survey.photographs)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photograph_has_the_size_at_which_it_stands_upright(tmp_path, orientation):
+    turned = one(tmp_path, size=(64, 48), table=exif({Base.Orientation: orientation}))
+    assert turned.orientation == orientation
+    assert (turned.width, turned.height) == ((64, 48) if orientation < 5 else (48, 64))
+
+
+def test_raw_files_alone_are_to_be_developed_first(tmp_path):
+    for name in ("a.DNG", "b.cr3", "sub/c.NEF"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"II*\0")
+    with pytest.raises(SurveyError, match=r"3 camera raw files \(a.DNG, b.cr3, sub/c.NEF\).*develop them first"):
+        read_survey(tmp_path)
+
+
+def test_raw_files_beside_photographs_are_named(tmp_path):
+    (survey_folder(tmp_path) / "DJI_0001.DNG").write_bytes(b"II*\0")
+    survey = read_survey(tmp_path)
+    assert len(survey.photographs) == 4
+    assert any("DJI_0001.DNG" in remark and "develop" in remark for remark in survey.remarks)
+
+
+def test_a_folder_that_is_none_or_has_no_photographs_is_an_error(tmp_path):
+    with pytest.raises(SurveyError, match="is nothing: expected a folder"):
+        read_survey(tmp_path / "gone")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SurveyError, match="is a file: expected a folder"):
+        read_survey(tmp_path / "file")
+    with pytest.raises(SurveyError, match="has no photographs"):
+        read_survey(tmp_path)
+    (tmp_path / "a.HEIC").write_bytes(b"")
+    with pytest.raises(SurveyError, match=r"pictures of other kinds \(a.HEIC\)"):
+        read_survey(tmp_path)
+
+
+def test_two_photographs_are_too_few(tmp_path):
+    with pytest.raises(SurveyError, match="has 2 photographs that can be read: expected at least 3"):
+        read_survey(survey_folder(tmp_path, count=2))
+
+
+def spoil(folder: Path) -> list[str]:
+    """Files that cannot be read, each in its way."""
+    for name in ("cut.jpg", "cut.png", "cut_too.tif"):
+        path = photograph(folder / name, size=(200, 150))
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    (folder / "cut.jpg").rename(folder / "truncated.jpg")
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / "page.jpg").write_text("<html>not found</html>")
+    (folder / "header.jpg").write_bytes(b"\xff\xd8\xff")
+    return ["cut.png", "cut_too.tif", "empty.jpg", "header.jpg", "page.jpg", "truncated.jpg"]
+
+
+def test_files_that_cannot_be_read_are_left_out_and_named(tmp_path):
+    spoiled = spoil(survey_folder(tmp_path))
+    survey = read_survey(tmp_path)
+    assert len(survey.photographs) == 4
+    for name in spoiled:
+        assert any(f"Left out: {tmp_path / name} cannot be read" in remark for remark in survey.remarks), name
+    assert any("empty.jpg cannot be read (it is empty)" in remark for remark in survey.remarks)
+    assert any("truncated.jpg cannot be read (its end is missing)" in remark for remark in survey.remarks)
+
+
+def test_too_few_files_that_can_be_read_is_an_error_that_names_the_others(tmp_path):
+    spoil(survey_folder(tmp_path, count=1))
+    with pytest.raises(SurveyError, match=r"has 1 photographs that can be read(.|\n)*empty.jpg"):
+        read_survey(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_file_of_somebody_else_is_left_out(tmp_path):
+    (survey_folder(tmp_path) / "DJI_0000.JPG").chmod(0)
+    assert any("DJI_0000.JPG cannot be read (Permission denied)" in r for r in read_survey(tmp_path).remarks)
+
+
+@pytest.mark.parametrize("other", ["DJI_0001.png", "dji_0001.jpg", "DJI_0001.JPEG"])
+def test_two_files_of_one_name_are_an_error(tmp_path, other):
+    photograph(survey_folder(tmp_path) / other)
+    with pytest.raises(SurveyError, match=r"DJI_0001.JPG.* differ in their suffix or in upper and lower case"):
+        read_survey(tmp_path)
+
+
+def test_the_end_mark_of_a_thumbnail_does_not_make_a_truncated_photograph_whole(tmp_path):
+    path = photograph(survey_folder(tmp_path) / "with thumbnail.jpg", size=(200, 150))
+    data = path.read_bytes()
+    thumbnail = photograph(tmp_path / "thumb.jpg").read_bytes()
+    segment = b"\xff\xe5" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    path.write_bytes(data[:2] + segment + data[2:])
+    assert named(read_survey(tmp_path), "with thumbnail.jpg").width == 200
+    path.write_bytes((data[:2] + segment + data[2:])[:-1000])
+    assert any("with thumbnail.jpg cannot be read (its end" in remark for remark in read_survey(tmp_path).remarks)
+
+
+def test_equal_surveys_are_equal_however_many_threads_read_them(tmp_path):
+    survey_folder(tmp_path, count=20)
+    first, second = (read_survey(tmp_path) for _ in range(2))
+    assert [repr(p) for p in first.photographs] == [repr(p) for p in second.photographs]
+    assert replace(first, photographs=()) == replace(second, photographs=())
+
+
+def test_the_first_of_several_pictures_in_a_file_is_the_photograph(tmp_path):
+    survey_folder(tmp_path, count=2)
+    pictures = [Image.new("RGB", size) for size in ((80, 60), (40, 30))]
+    pictures[0].save(tmp_path / "m.jpg", format="MPO", save_all=True, append_images=pictures[1:])
+    assert (named(read_survey(tmp_path), "m.jpg").width) == 80

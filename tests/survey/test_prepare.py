@@ -1,0 +1,183 @@
+"""`tidefield prepare`, from photograph files to a scene that trains."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import ground_flight
+import numpy as np
+import pycolmap
+import pytest
+from ground_flight import ABOVE, FOCAL, Flight, fly
+from rich.console import Console
+
+from tidefield.data.georeference import read_georeference
+from tidefield.data.load import load_scene
+from tidefield.errors import RunError, SurveyError
+from tidefield.survey.findings import findings
+from tidefield.survey.georeference.alignment import camera_centres
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.prepare import Prepared, PrepareOptions, prepare
+from tidefield.survey.report import write_report
+from tidefield.survey.sfm.features import FeatureOptions
+
+GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
+WISHES = PrepareOptions(features=FeatureOptions(count=1500))
+
+
+def run(folder: Path, scene: Path, wishes: PrepareOptions = WISHES) -> Prepared:
+    return prepare(read_survey(folder), scene, wishes, pycolmap.Device.cpu, Console(quiet=True))
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    return fly(tmp_path_factory.mktemp("card") / "DCIM ä", gains=GAINS)
+
+
+@pytest.fixture(scope="module")
+def made(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Prepared]:
+    scene = tmp_path_factory.mktemp("made") / "scene"
+    return scene, run(flight.folder, scene)
+
+
+def position_error_m(scene: Path, flight: Flight) -> np.ndarray:
+    """How far the cameras lie from the truth, by way of longitude and latitude."""
+    located = read_georeference(scene)
+    assert located is not None
+    assert located.frame is not None
+    centres = camera_centres(pycolmap.Reconstruction(scene / "sparse" / "0"))
+    truth = located.frame.from_geographic(ground_flight.FRAME.to_geographic(flight.position_world))
+    return np.array([centres[name] for name in flight.names]) - truth
+
+
+def test_every_photograph_is_placed_in_metres_where_it_was_taken(made: tuple[Path, Prepared], flight: Flight):
+    scene, prepared = made
+    assert prepared.models == [sorted(flight.names)]
+    assert np.abs(position_error_m(scene, flight)).max() < 0.15
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    assert model.compute_mean_reprojection_error() < 0.6
+    camera = next(iter(model.cameras.values()))
+    assert camera.focal_length_x == pytest.approx(FOCAL, rel=0.01)
+
+
+def test_the_scene_loads_with_its_split_and_colours_that_agree(made: tuple[Path, Prepared]):
+    scene, prepared = made
+    loaded = load_scene(scene)
+    assert len(loaded.train) + len(loaded.test) == 12
+    assert loaded.points is not None
+    assert prepared.evening is not None
+    assert prepared.evening.helps
+    assert prepared.evening.after < 0.4 * prepared.evening.before
+    relative = np.log(prepared.evening.gain / GAINS)
+    np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.03)
+    # What is left for the loader to even out is next to nothing.
+    assert loaded.cameras.gain.log().abs().max() < 0.05
+
+
+def test_nerfstudio_finds_the_same_photographs(made: tuple[Path, Prepared]):
+    scene, _ = made
+    written = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
+    assert {frame["file_path"] for frame in written["frames"]} == {f"images/flight {k:03d}.jpg" for k in range(12)}
+    assert (scene / written["ply_file_path"]).exists()
+
+
+def test_the_report_tells_what_was_found(made: tuple[Path, Prepared]):
+    scene, prepared = made
+    report = write_report(findings(prepared, scene, {"colour": "auto"}), scene)
+    table = json.loads(report.table.read_text(encoding="utf-8"))
+    assert table["reconstruction_statistics"]["reconstructed_shots_count"] == 12
+    assert table["tidefield"]["resolution"]["height_above_ground"]["mean"] == pytest.approx(ABOVE, rel=0.03)
+    assert table["tidefield"]["colour"]["applied"]
+    assert report.map is not None
+    assert "flight 003.jpg" in report.page.read_text(encoding="utf-8")
+
+
+def test_nothing_is_done_twice_and_a_changed_option_redoes_only_what_depends_on_it(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path
+):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*") if path.is_file()}
+    again = run(flight.folder, scene)
+    assert again.models == made[1].models
+    unchanged = {path for path, at in before.items() if path.stat().st_mtime_ns == at}
+    assert unchanged >= set(before) - {scene / "prepare" / "stages.json"}
+    plain = run(flight.folder, scene, replace(WISHES, colour="off"))
+    assert plain.evening is None
+    assert (scene / "prepare" / "database.db").stat().st_mtime_ns == before[scene / "prepare" / "database.db"]
+    name = flight.names[0]
+    assert (scene / "images" / name).read_bytes() == (flight.folder / name).read_bytes()
+    assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
+
+
+def test_a_stage_that_was_broken_off_goes_on(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import tidefield.survey.sfm.features as features
+
+    original, written = features._write, []
+
+    def breaks_at_the_seventh(db, photograph, *rest):
+        written.append(photograph.name)
+        if len(written) == 7:
+            raise KeyboardInterrupt
+        original(db, photograph, *rest)
+
+    monkeypatch.setattr(features, "_write", breaks_at_the_seventh)
+    with pytest.raises(KeyboardInterrupt):
+        run(flight.folder, tmp_path / "scene")
+    prepared = run(flight.folder, tmp_path / "scene")
+    assert len(prepared.models[0]) == 12
+    assert written == [*flight.names[:7], *flight.names[6:]]
+
+
+def test_photographs_of_two_places_make_the_larger_one_and_name_the_others(flight: Flight, tmp_path: Path):
+    folder = shutil.copytree(flight.folder, tmp_path / "both")
+    other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
+    prepared = run(folder, tmp_path / "scene")
+    assert prepared.models[0] == sorted(flight.names)
+    told = {item.name: item.reason for item in findings(prepared, tmp_path / "scene", {}).left_out}
+    assert set(told) == set(other.names)
+    if len(prepared.models) > 1:
+        assert set(prepared.models[1]) <= set(other.names)
+        assert "of a place that nothing connects" in told[prepared.models[1][0]]
+
+
+def test_photographs_that_show_nothing_in_common_are_an_error(tmp_path: Path):
+    for k in range(4):
+        fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=k)
+    with pytest.raises(SurveyError, match="overlap"):
+        run(tmp_path / "card", tmp_path / "scene")
+
+
+def test_a_folder_with_something_else_in_it_is_left_alone(flight: Flight, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(RunError, match="something else"):
+        run(flight.folder, tmp_path / "mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
+    with pytest.raises(RunError, match="holds the photographs"):
+        run(flight.folder, flight.folder)
+    with pytest.raises(RunError, match="holds the photographs"):
+        run(flight.folder, flight.folder.parent)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="is a file"):
+        run(flight.folder, tmp_path / "file")
+
+
+def test_rotated_photographs_stand_upright_in_the_scene(flight: Flight, tmp_path: Path):
+    from PIL import ExifTags, Image
+
+    folder = shutil.copytree(flight.folder, tmp_path / "card")
+    for name in flight.names[::2]:
+        with Image.open(folder / name) as picture:
+            table = picture.getexif()
+            table[ExifTags.Base.Orientation] = 6  # upright after a quarter turn clockwise
+            turned = picture.transpose(Image.Transpose.ROTATE_90)
+            turned.save(folder / name, quality=95, exif=table)
+    prepared = run(folder, tmp_path / "scene", replace(WISHES, colour="off"))
+    assert len(prepared.models[0]) == 12
+    for name in flight.names[:2]:
+        with Image.open(tmp_path / "scene" / "images" / name) as picture:
+            assert picture.size == (400, 300)
+            assert picture.getexif().get(ExifTags.Base.Orientation, 1) == 1
+    assert np.abs(position_error_m(tmp_path / "scene", flight)).max() < 0.3

@@ -1,0 +1,287 @@
+"""Bad photographs are told from good ones by stated measures, on a made survey and on real ones."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_files import BRIGHTON, exif, photograph, real_survey, survey_folder, texture, xmp
+from PIL import Image
+
+from tidefield.errors import SurveyError
+from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.io.pictures import upright
+from tidefield.survey.quality.measures import sharpness
+from tidefield.survey.quality.off_survey import off_survey
+from tidefield.survey.quality.verdicts import Verdict, judge, keep
+from tidefield.survey.survey import Control, Mark, Survey
+
+SIZE = (400, 300)
+GROUND = texture((1800, 900), seed=7)
+
+
+def view(left: int, top: int = 100) -> np.ndarray:
+    """What a camera sees from one place over the made ground."""
+    return GROUND[top : top + SIZE[1], left : left + SIZE[0]]
+
+
+def with_light(pixels: np.ndarray, factor: float) -> np.ndarray:
+    """The same photograph with as many times the light."""
+    values = pixels / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4) * factor
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.clip(np.round(encoded * 255), 0, 255).astype(np.uint8)
+
+
+def moved(pixels: np.ndarray, length_px: int, angle_deg: float) -> np.ndarray:
+    """Blurred by a movement along one direction, with the sensor's noise on top."""
+    kernel = np.zeros((2 * length_px + 1,) * 2, np.float32)
+    for along in np.linspace(-length_px / 2, length_px / 2, 16 * length_px):
+        x, y = (length_px + along * part for part in (math.cos(angle_deg), math.sin(angle_deg)))
+        kernel += np.maximum(0, 1 - np.abs(np.arange(len(kernel)) - x)) * np.maximum(
+            0, 1 - np.abs(np.arange(len(kernel)) - y)
+        ).reshape(-1, 1)
+    blurred = cv2.filter2D(pixels, -1, kernel / kernel.sum()).astype(np.float64)
+    return np.clip(blurred + np.random.default_rng(0).normal(0, 1.5, pixels.shape), 0, 255).astype(np.uint8)
+
+
+def hovering(pixels: np.ndarray) -> np.ndarray:
+    """The same place a moment later: a few pixels aside, a little turned, a little darker, with other noise."""
+    height, width = pixels.shape[:2]
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), 0.8, 1.005) + np.array([[0, 0, 0.006 * width], [0, 0, 2]])
+    moved_on = cv2.warpAffine(pixels, turn, (width, height), borderMode=cv2.BORDER_REFLECT)
+    noise = np.random.default_rng(1).normal(0, 3, pixels.shape)
+    return np.clip(moved_on * 0.85 + noise, 0, 255).astype(np.uint8)
+
+
+def flight(folder: Path, count: int = 10, **others: np.ndarray) -> Survey:
+    """A strip of photographs that overlap by two thirds, and others."""
+    for index in range(count):
+        place = BRIGHTON[0] + 1.2e-4 * index, BRIGHTON[1]
+        photograph(folder / f"f{index:02d}.jpg", table=exif(place=place), pixels=view(130 * index))
+    for name, pixels in others.items():
+        photograph(folder / f"{name}.jpg", pixels=pixels)
+    return read_survey(folder)
+
+
+def left_out(survey: Survey) -> dict[str, str]:
+    return {verdict.name: verdict.left_out for verdict in judge(survey) if verdict.left_out}
+
+
+def test_a_good_flight_is_kept_whole_and_progress_is_told(tmp_path):
+    survey = flight(tmp_path)
+    told = []
+    verdicts = judge(survey, lambda done, of: told.append((done, of)))
+    assert [verdict.name for verdict in verdicts] == [photograph.name for photograph in survey.photographs]
+    assert all(verdict.left_out is None and verdict.measures for verdict in verdicts)
+    assert told == [(index, 10) for index in range(1, 11)]
+    assert keep(survey, verdicts) == survey
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, 45, 90, 120])
+def test_a_photograph_blurred_by_movement_is_found_whatever_the_direction(tmp_path, angle_deg):
+    found = left_out(flight(tmp_path, blurred=moved(view(500, 300), 6, math.radians(angle_deg))))
+    assert list(found) == ["blurred.jpg"]
+    assert found["blurred.jpg"].startswith("blurred: its sharpness is 0.")
+    assert "is the limit" in found["blurred.jpg"]
+
+
+def test_a_photograph_out_of_focus_is_found(tmp_path):
+    assert list(left_out(flight(tmp_path, soft=cv2.GaussianBlur(view(500, 300), (0, 0), 2.5)))) == ["soft.jpg"]
+
+
+def test_smooth_mud_is_not_blurred(tmp_path):
+    smooth = cv2.GaussianBlur(view(500, 300).astype(np.float32), (0, 0), 6)
+    mud = 120 + 0.5 * (smooth - smooth.mean())
+    for index in range(40):  # shells and runnels, in a seventh of the picture
+        x, y = 20 + 9 * (index % 20), 40 + 130 * (index // 20)
+        mud[y : y + 3, x : x + 3] += 40
+    noise = np.random.default_rng(3).normal(0, 1.5, mud.shape)
+    bare = np.full_like(mud, 120) + noise
+    survey = flight(tmp_path, mud=np.clip(mud + noise, 0, 255).astype(np.uint8), bare=bare.astype(np.uint8))
+    verdicts = {verdict.name: verdict for verdict in judge(survey)}
+    assert verdicts["mud.jpg"].left_out is None
+    bare_measures = verdicts["bare.jpg"].measures
+    assert bare_measures is not None
+    assert math.isnan(bare_measures.sharpness)  # nothing to judge by: it is flat, not blurred
+    assert (verdicts["bare.jpg"].left_out or "").startswith("flat")
+
+
+def test_noise_and_contrast_do_not_change_sharpness():
+    grey = GROUND[:600, :800, 1].astype(np.float32)
+    noisy = grey + np.random.default_rng(2).normal(0, 1.5, grey.shape).astype(np.float32)
+    assert sharpness(noisy) == pytest.approx(sharpness(grey), rel=0.15)
+    assert sharpness(100 + 0.5 * (grey - 100)) == pytest.approx(sharpness(grey), rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [0.02, 0.1])
+def test_a_dark_photograph_is_under_exposed(tmp_path, factor):
+    found = left_out(flight(tmp_path, dark=with_light(view(500, 300), factor)))
+    assert list(found) == ["dark.jpg"]
+    assert found["dark.jpg"].startswith("under-exposed: ")
+
+
+@pytest.mark.parametrize("factor", [6, 20])
+def test_a_bright_photograph_is_over_exposed(tmp_path, factor):
+    found = left_out(flight(tmp_path, bright=with_light(view(500, 300), factor)))
+    assert list(found) == ["bright.jpg"]
+    assert found["bright.jpg"].startswith("over-exposed: ")
+    assert "the limit" in found["bright.jpg"]
+
+
+def test_one_stop_more_or_less_is_kept(tmp_path):
+    assert not left_out(flight(tmp_path, less=with_light(view(500, 300), 0.5), more=with_light(view(900, 300), 2)))
+
+
+def test_of_a_hovering_drone_the_sharpest_photograph_is_kept(tmp_path):
+    later = cv2.GaussianBlur(hovering(view(130 * 4)), (0, 0), 0.5)
+    found = left_out(flight(tmp_path, later=later, softer=cv2.GaussianBlur(later, (0, 0), 0.5), copy=view(130 * 7)))
+    assert sorted(found) == ["f07.jpg", "later.jpg", "softer.jpg"]
+    for name in ("later.jpg", "softer.jpg"):
+        assert found[name].startswith("duplicate: it shows what f04.jpg shows, shifted by 0.")
+    assert found["f07.jpg"].startswith("duplicate: it shows what copy.jpg shows, shifted by 0.0%")
+
+
+def test_a_blurred_duplicate_does_not_put_out_the_sharp_one(tmp_path):
+    found = left_out(flight(tmp_path, blurred=moved(view(130 * 4), 8, 0.3)))
+    assert list(found) == ["blurred.jpg"]
+    assert found["blurred.jpg"].startswith("blurred")
+
+
+def sky(share: float) -> np.ndarray:
+    """A landscape from the side: bright sky over ground."""
+    pixels = view(500, 300).copy()
+    rows = round(share * SIZE[1])
+    pixels[:rows] = np.linspace(235, 205, rows)[:, None, None].astype(np.uint8)
+    return pixels
+
+
+def test_a_photograph_of_the_sky_is_found_by_its_looks(tmp_path):
+    found = left_out(flight(tmp_path, sky=sky(0.5), strip=sky(0.2)))
+    assert list(found) == ["sky.jpg"]
+    assert found["sky.jpg"].startswith("horizon: 5") or found["sky.jpg"].startswith("horizon: 4")
+
+
+@pytest.mark.parametrize(("pitch_deg", "share", "out"), [("-5", 0.45, True), ("-90", 0.45, False), ("-5", 0.0, False)])
+def test_a_gimbal_is_believed_where_the_picture_bears_it_out(tmp_path, pitch_deg, share, out):
+    angles = {"GimbalYawDegree": "10", "GimbalPitchDegree": pitch_deg, "GimbalRollDegree": "0"}
+    flight(tmp_path)
+    photograph(tmp_path / "g.jpg", packet=xmp(angles), pixels=sky(share))
+    found = left_out(read_survey(tmp_path))
+    assert list(found) == (["g.jpg"] if out else [])
+    assert all("above the horizon" in reason for reason in found.values())
+
+
+def test_photographs_away_from_the_survey_are_found(tmp_path):
+    survey = flight(tmp_path, away=view(500, 400), low=view(900, 400))
+    photographs = [replace(p, relative_altitude_m=40.0) for p in survey.photographs]
+    first = next(p.position for p in photographs if p.position)
+    for index, p in enumerate(photographs):
+        if p.name == "away.jpg":
+            photographs[index] = replace(p, position=replace(first, longitude_deg=first.longitude_deg + 0.01))
+        elif p.name == "low.jpg":
+            photographs[index] = replace(p, position=first, relative_altitude_m=2.0)
+    found = left_out(replace(survey, photographs=tuple(photographs)))
+    assert sorted(found) == ["away.jpg", "low.jpg"]
+    assert found["away.jpg"].startswith("off the survey: it was taken 76")
+    assert "2 m above the place of take-off, the others at 40 m" in found["low.jpg"]
+
+
+def test_a_second_field_and_a_low_flight_are_parts_of_the_survey(tmp_path):
+    survey = flight(tmp_path)
+    first = survey.photographs[0].position
+    assert first is not None
+    photographs = [
+        replace(
+            p,
+            position=p.position and replace(p.position, longitude_deg=first.longitude_deg + (0.01 if index > 6 else 0)),
+            relative_altitude_m=10.0 if index in (2, 3) else 60.0,
+        )
+        for index, p in enumerate(survey.photographs)
+    ]
+    assert not left_out(replace(survey, photographs=tuple(photographs)))
+
+
+def test_a_survey_of_many_fields_is_one_survey(tmp_path):
+    survey = flight(tmp_path)
+    fields = []
+    for field in range(30):
+        for taken in survey.photographs:
+            assert taken.position is not None
+            east = replace(taken.position, longitude_deg=taken.position.longitude_deg + 0.01 * field)
+            fields.append(replace(taken, name=f"{field:02d}/{taken.name}", position=east))
+    assert off_survey(fields) == {}
+
+
+def test_a_flat_set_is_one_clear_error(tmp_path):
+    for index in range(5):
+        photograph(tmp_path / f"{index}.jpg", pixels=np.full((*SIZE[::-1], 3), 128, np.uint8))
+    survey = read_survey(tmp_path)
+    verdicts = judge(survey)
+    with pytest.raises(SurveyError, match=r"0 of the 5 photographs .*\(5 flat; such as 0.jpg, flat: .*--keep-all"):
+        keep(survey, verdicts)
+    assert keep(survey, verdicts, keep_all=True) == survey
+
+
+def test_what_cannot_be_decoded_is_left_out_even_when_all_are_to_be_kept(tmp_path):
+    survey = flight(tmp_path, odd=view(500, 300))
+    data = bytearray((tmp_path / "odd.jpg").read_bytes())
+    (tmp_path / "odd.jpg").write_bytes(data[:3000])  # after the survey was read
+    control = Control(
+        "EPSG:4326",
+        {"A": (0.0, 0.0, 0.0), "B": (0.0, 0.0, 1.0)},
+        (Mark("A", "odd.jpg", (1.0, 2.0)), Mark("B", "odd.jpg", (1.0, 2.0)), Mark("B", "f01.jpg", (3.0, 4.0))),
+    )
+    survey = replace(survey, control=control)
+    verdicts = judge(survey)
+    odd = next(verdict for verdict in verdicts if verdict.name == "odd.jpg")
+    assert odd.measures is None
+    assert (odd.left_out or "").startswith("undecodable: ")
+    kept = keep(survey, verdicts, keep_all=True)
+    assert len(kept.photographs) == 10
+    assert kept.control is not None
+    assert list(kept.control.points) == ["B"]
+    assert [mark.photograph for mark in kept.control.marks] == ["f01.jpg"]
+
+
+def test_tiny_photographs_are_judged_by_what_they_have(tmp_path):
+    assert all(isinstance(verdict, Verdict) for verdict in judge(read_survey(survey_folder(tmp_path))))
+
+
+@pytest.mark.parametrize(("name", "count"), [("brighton_beach", 18), ("turin_lot", 32), ("swindale", 79)])
+def test_every_photograph_of_the_real_surveys_is_kept(name, count):
+    survey = read_survey(real_survey(name))
+    kept = keep(survey, judge(survey))
+    assert len(kept.photographs) == count
+    assert kept == survey
+
+
+@pytest.mark.parametrize("name", ["brighton_beach", "turin_lot"])
+def test_defects_made_of_real_photographs_are_found(name, tmp_path):
+    survey = read_survey(real_survey(name))
+    # The same six photographs of every survey, so that the test is quick; each defect takes the place of one of them.
+    chosen = survey.photographs[1:13]
+    defects = {
+        1: lambda pixels: moved(pixels, 6, 0.5),
+        3: lambda pixels: with_light(pixels, 0.05),
+        5: lambda pixels: with_light(pixels, 6),
+        7: lambda pixels: np.full_like(pixels, 90),
+    }
+    photographs = []
+    for index, taken in enumerate(chosen):
+        if index in defects:
+            path = tmp_path / taken.name.replace(".jpg", ".png")
+            Image.fromarray(defects[index](upright(taken))).save(path, compress_level=1)
+            taken = replace(taken, path=path)
+        photographs.append(taken)
+    path = tmp_path / "later.png"
+    Image.fromarray(hovering(upright(chosen[9]))).save(path, compress_level=1)
+    photographs.append(replace(chosen[9], path=path, name="later.png"))
+    found = left_out(replace(survey, photographs=tuple(photographs)))
+    kinds = {chosen[1]: "blurred", chosen[3]: "under-exposed", chosen[5]: "over-exposed", chosen[7]: "flat"}
+    assert found.keys() == {photograph.name for photograph in kinds} | {"later.png"}
+    for taken, kind in kinds.items():
+        assert found[taken.name].startswith(kind)
+    assert found["later.png"].startswith(f"duplicate: it shows what {chosen[9].name} shows")

@@ -1,0 +1,339 @@
+"""The files of a report: the page, its numbers and the map for a GIS."""
+
+import json
+import math
+import re
+import time
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from flat_surveys import AHEAD, ASIDE, FRAME, GSD, findings, flat_ground, flight, photograph, reconstruction
+
+from tidefield.errors import RunError
+from tidefield.survey.report import Change, ColourEvening, ColourExample, LeftOut, Residuals, write_report
+from tidefield.survey.report.ground import signed_area
+from tidefield.survey.report.numbers import duration, plain
+from tidefield.survey.survey import Survey
+
+NASTY = '<script>alert(1)</script> & "O\'Brien" ümlaut.JPG'
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+LOADING = {"src", "href", "data", "action", "poster", "srcset", "xlink:href"}
+
+
+class Reader(HTMLParser):
+    """Checks that tags balance, and keeps what a test asks for."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.seen, self.loads, self.values, self.text, self.ids = [], [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.seen.append((tag, attrs))
+        self.loads += [value for name, value in attrs.items() if name in LOADING]
+        self.ids += [attrs["id"]] if "id" in attrs else []
+        if tag == "data":
+            self.values.append(float(attrs["value"]))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def count(self, tag):
+        return sum(seen == tag for seen, _ in self.seen)
+
+
+def residuals(kind, count=5, seed=0, **more):
+    generator = np.random.default_rng(seed)
+    names = tuple(f"{kind} {i}" for i in range(count))
+    stated = np.c_[generator.uniform(0, 60, (count, 2)), np.zeros(count)]
+    values = {"kind": kind, "title": f"{kind} positions", "names": names, "used": np.ones(count, bool)}
+    values |= {"east_north_up_m": generator.normal(0, 0.02, (count, 3)), "stated_world": stated}
+    return Residuals(**(values | more))
+
+
+def full():
+    """Findings with something of everything, and untrusted names."""
+    position = flight()
+    picture = np.full((90, 120, 3), 128, np.uint8)
+    survey = findings(position).survey
+    lost = [photograph(100 + i, place) for i, place in enumerate(position[:3] + np.array([20.0, -20, 0]))]
+    lost[0] = replace(lost[0], name=NASTY)
+    far = replace(lost[2].position, latitude_deg=-lost[2].position.latitude_deg)
+    lost[2] = replace(lost[2], position=far)
+    everyone = tuple(sorted((*survey.photographs, *lost), key=lambda p: p.name))
+    return findings(
+        position,
+        title="Flats <b>& sons</b>",
+        survey=Survey(survey.folder, everyone, None),
+        placed_by="GPS of 18 photographs",
+        residuals=(
+            residuals("gps", 18),
+            residuals(
+                "control", 4, 1, used=np.array([True, True, True, False]), remarks=(f"A mark in {NASTY} moved.",)
+            ),
+            residuals("check", 3, 2),
+        ),
+        left_out=(
+            LeftOut(NASTY, "quality", "blurred <i>", {"sharpness": 0.1}, picture),
+            LeftOut(lost[1].name, "poses", "too few matches", {"matches": math.nan}, None),
+            LeftOut(lost[2].name, "reading", "cut short"),
+        ),
+        models=(18, 4),
+        colour=ColourEvening(
+            True, "Evened.", (Change("Difference", 21.0, 6.0, "%"),), (ColourExample(NASTY, picture, picture),)
+        ),
+        seconds={"features": 75.0, "mapping": 3700.0},
+        options={"control": NASTY},
+        versions={"tidefield": "1"},
+        remarks=("Mind the <gap>.",),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write_report(full(), tmp_path_factory.mktemp("report"))
+
+
+@pytest.fixture(scope="module")
+def html(written):
+    return written.page.read_text(encoding="utf-8")
+
+
+def test_the_page_is_well_formed_and_every_id_is_its_own(html):
+    page = Reader(html)
+    assert html.lstrip().lower().startswith("<!doctype html>")
+    assert len(page.ids) == len(set(page.ids))
+    named = {attrs["aria-labelledby"] for _, attrs in page.seen if "aria-labelledby" in attrs}
+    assert {part for name in named for part in name.split()} <= set(page.ids)
+
+
+def test_the_page_loads_nothing_and_runs_nothing(html):
+    page = Reader(html)
+    assert page.count("script") == page.count("link") == page.count("iframe") == 0
+    assert all(load.startswith("data:image/") for load in page.loads)
+    assert "@import" not in html
+    assert all(target == "#frame" for target in re.findall(r"url\(([^)]*)\)", html))
+    assert not any(name.startswith("on") for _, attrs in page.seen for name in attrs)
+    assert "http://" not in html
+    assert "https://" not in html
+
+
+def test_names_are_shown_as_they_are_and_never_run(html):
+    page = Reader(html)
+    assert "<script" not in html.lower()
+    assert page.count("b") == page.count("gap") == 0
+    shown = "".join(page.text)
+    assert NASTY in shown
+    assert "Flats <b>& sons</b>" in shown
+    assert "blurred <i>" in shown
+    assert any(attrs.get("alt") == f"Thumbnail of {NASTY}" for _, attrs in page.seen)
+
+
+def test_pictures_have_words_and_tables_have_captions_and_heads(html):
+    page = Reader(html)
+    assert all(attrs.get("alt") for tag, attrs in page.seen if tag == "img")
+    for tag, attrs in page.seen:
+        if tag == "svg":
+            assert attrs.get("aria-hidden") or (
+                attrs["role"] == "img" and ("aria-label" in attrs or "aria-labelledby" in attrs)
+            )
+        if tag == "th":
+            assert attrs["scope"] in ("row", "col")
+    assert page.count("table") == page.count("caption")
+
+
+def test_every_number_of_the_page_is_in_the_json(written, html):
+    def numbers_in(value):
+        if isinstance(value, dict):
+            value = list(value.values())
+        return [n for item in value for n in numbers_in(item)] if isinstance(value, list) else [value]
+
+    table = json.loads(written.table.read_text(encoding="utf-8"))
+    assert table == json.loads(json.dumps(written.numbers))
+    known = {float(n) for n in numbers_in(table) if isinstance(n, int | float)}
+    shown = Reader(html).values
+    assert len(shown) > 40
+    assert set(shown) <= known
+
+
+def test_the_page_says_what_the_survey_was_made_to_be(html):
+    text = " ".join("".join(Reader(html).text).split()).replace("\u00a0", " ")
+    assert "18 of 21 photographs are in the model" in text
+    assert f"{100 * GSD:.1f} cm/px" in text
+    assert "80% forward and 50% side overlap" in text
+    assert "reprojection error is 0.50 px" in text
+    assert "Mind the <gap>." in text
+    assert "2, of 18 and 4 photographs" in text
+
+
+def test_the_json_has_the_names_and_meanings_of_opensfm(written):
+    table = written.numbers
+    shots = table["reconstruction_statistics"]
+    assert shots["reconstructed_shots_count"] == 18
+    assert shots["initial_shots_count"] == 21
+    assert shots["components"] == 2
+    assert shots["has_gps"]
+    assert shots["has_gcp"]
+    assert shots["reprojection_error_pixels"] == pytest.approx(0.5)
+    assert sum(shots["histogram_track_length"].values()) == shots["reconstructed_points_count"]
+    total = sum(int(length) * count for length, count in shots["histogram_track_length"].items())
+    assert shots["observations_count"] == total
+    assert shots["average_track_length"] == pytest.approx(total / shots["reconstructed_points_count"])
+    assert table["odm_processing_statistics"] == {
+        "total_time": 3775.0,
+        "total_time_human": "1 h 2 min",
+        "average_gsd": pytest.approx(100 * GSD),
+    }
+    assert table["processing_statistics"]["area"] == pytest.approx(5 * AHEAD * 2 * ASIDE)
+    assert table["processing_statistics"]["date"] == "04/05/2026 at 12:30:00"
+    assert table["processing_statistics"]["steps_times"]["Total Time"] == 3775.0
+    lens = table["camera_errors"]["Maker Drone"]
+    assert lens["initial_values"]["focal_x"] == lens["optimized_values"]["focal_x"] == pytest.approx(0.75)
+    assert lens["optimized_values"]["c_x"] == 0
+
+
+def test_errors_count_only_what_was_used(tmp_path):
+    errors = np.array([[3.0, 4, 0], [-3, -4, 2], [100, 100, 100]])
+    used = np.array([True, True, False])
+    found = findings(residuals=(residuals("check", 3, east_north_up_m=errors, used=used),))
+    check = write_report(found, tmp_path).numbers["check_errors"]
+    assert check["mean"] == {"x": 0, "y": 0, "z": 1}
+    assert check["error"] == pytest.approx({"x": 3, "y": 4, "z": math.sqrt(2)})
+    assert check["rms_horizontal"] == pytest.approx(5)
+    assert check["largest_vertical"] == 2
+    assert (check["count"], check["not_used"]) == (2, 1)
+
+
+def test_a_point_that_was_not_found_is_listed_and_drawn_nowhere(tmp_path):
+    errors = np.array([[0.01, 0.02, 0.03], [np.nan] * 3])
+    found = findings(residuals=(residuals("check", 2, east_north_up_m=errors, used=np.array([True, False])),))
+    html = write_report(found, tmp_path).page.read_text(encoding="utf-8")
+    shapes = [value for _, attrs in Reader(html).seen for value in attrs.values() if value]
+    assert not any("nan" in value.lower() for value in shapes)
+    assert "check 1" in "".join(Reader(html).text)
+
+
+def test_the_map_for_a_gis_keeps_to_rfc_7946_and_lies_where_the_world_does(written):
+    collection = json.loads(written.map.read_text(encoding="utf-8"))
+    assert collection["type"] == "FeatureCollection"
+    kinds: dict[str, list] = {}
+    for feature in collection["features"]:
+        assert feature["type"] == "Feature"
+        kinds.setdefault(feature["properties"]["kind"], []).append(feature)
+    assert {kind: len(features) for kind, features in kinds.items()} == {
+        "area covered": 1,
+        "footprint": 18,
+        "camera": 18,
+        "control point": 4,
+        "check point": 3,
+    }
+    cameras = np.array([feature["geometry"]["coordinates"] for feature in kinds["camera"]])
+    there = FRAME.from_geographic(np.c_[cameras, [f["properties"]["height_m"] for f in kinds["camera"]]])
+    np.testing.assert_allclose(there, flight(), atol=2e-3)
+    assert [f["properties"]["flight_order"] for f in kinds["camera"]] == list(range(1, 19))
+    rings = [feature["geometry"]["coordinates"][0] for feature in kinds["footprint"]]
+    outer = kinds["area covered"][0]["geometry"]["coordinates"]
+    assert len(outer) == 1
+    for ring in (*rings, outer[0][0]):
+        assert ring[0] == ring[-1]
+        assert signed_area(np.array(ring)) > 0
+    world = FRAME.from_geographic(np.c_[np.array(rings[0]), np.zeros(len(rings[0]))])
+    assert signed_area(world[:-1, :2]) == pytest.approx(80 * 60, rel=1e-3)
+    area = kinds["area covered"][0]["properties"]["area_m2"]
+    assert area == pytest.approx((5 * AHEAD + 80) * (2 * ASIDE + 60), rel=0.01)
+
+
+def test_a_model_that_lies_nowhere_has_no_map_and_an_earlier_one_goes(tmp_path):
+    first = write_report(findings(), tmp_path)
+    assert first.map is not None
+    second = write_report(findings(frame=None), tmp_path)
+    assert second.map is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
+    text = second.page.read_text(encoding="utf-8")
+    Reader(text)
+    assert "in its own unit" in text
+    assert "cm/px" not in text
+    assert second.numbers["odm_processing_statistics"]["average_gsd"] is None
+
+
+def test_a_survey_is_warned_of_thin_overlap_and_of_a_doubtful_focal_length(tmp_path):
+    thin = flight(2, 4) * (3, 1.5, 1)
+    found = findings(thin)
+    read = found.survey.photographs
+    lens = replace(read[0].lens, focal_px=500.0)
+    survey = replace(found.survey, photographs=tuple(replace(p, lens=lens) for p in read))
+    said = " ".join(write_report(replace(found, survey=survey), tmp_path).numbers["tidefield"]["remarks"])
+    assert "seen by three photographs or more" in said
+    assert "forward overlap, 40%" in said
+    assert "side overlap, 25%" in said
+    assert "focal length came out +20%" in said
+    assert "No surveyed points" in said
+
+
+def test_a_good_survey_with_check_points_is_warned_of_nothing(tmp_path):
+    checked = findings(flight(5, 12), residuals=(residuals("control"), residuals("check")))
+    assert write_report(checked, tmp_path).numbers["tidefield"]["remarks"] == []
+
+
+def test_a_photograph_a_hundred_kilometres_off_does_not_shrink_the_map(tmp_path):
+    position = flight()
+    stray = photograph(200, np.array([100_000.0, 0, 60]))
+    found = findings(position)
+    survey = replace(found.survey, photographs=(*found.survey.photographs, stray))
+    near = write_report(found, tmp_path / "near").page.read_text(encoding="utf-8")
+    left_out = (LeftOut(stray.name, "quality", "its GPS lies 100 km away"),)
+    far = write_report(replace(found, survey=survey, left_out=left_out), tmp_path / "far").page.read_text(
+        encoding="utf-8"
+    )
+    assert re.search(r'class="map" viewBox="[^"]*"', near)[0] == re.search(r'class="map" viewBox="[^"]*"', far)[0]
+
+
+def test_a_folder_that_cannot_be_written_to_is_an_error_of_the_run(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="cannot be written"):
+        write_report(findings(), tmp_path / "file")
+
+
+def test_two_thousand_photographs_make_a_page_that_can_be_sent(tmp_path):
+    position = flight(40, 50)
+    picture = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+    lost = tuple(LeftOut(f"lost {i}.JPG", "quality", "blurred", {}, picture) for i in range(500))
+    model = reconstruction(position, flat_ground(position, a_photograph=8))
+    found = findings(position, left_out=lost, reconstruction=model)
+    start = time.process_time()
+    report = write_report(found, tmp_path)
+    assert time.process_time() - start < 20  # a few seconds without the checks of types
+    assert report.page.stat().st_size < 5e6
+    assert Reader(report.page.read_text(encoding="utf-8")).count("figure") < 60
+
+
+def test_numbers_become_plain_and_spans_become_words():
+    assert plain({"a": np.float64(2), 3: [np.nan, np.int64(1)], "b": np.array([1.0, np.inf]), "c": np.bool_(True)}) == {
+        "a": 2.0,
+        "3": [None, 1],
+        "b": [1.0, None],
+        "c": True,
+    }
+    assert [duration(s) for s in (0.04, 59.4, 60.0, 3599.7, 7384.0)] == [
+        "0.0 s",
+        "59 s",
+        "1 min 0 s",
+        "1 h 0 min",
+        "2 h 3 min",
+    ]

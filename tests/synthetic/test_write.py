@@ -1,0 +1,94 @@
+"""A synthetic survey on disk: COLMAP reads it, this package reads it, and the truth lies beside it."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from tidefield.data.load import load_scene
+from tidefield.errors import SceneError
+from tidefield.synthetic import Survey, make_survey, write_survey
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    return make_survey("river_mouths", seed=2, views=9, width=120, supersample=1)
+
+
+@pytest.fixture(scope="module")
+def folder(survey: Survey, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("synthetic") / "scene"
+    write_survey(survey, folder)
+    return folder
+
+
+def test_colmap_opens_it_and_its_points_reproject_within_a_pixel(folder: Path, survey: Survey) -> None:
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    assert model.num_reg_images() == 9
+    assert model.num_points3D() == len(survey.points.xyz_world) > 200
+    assert model.compute_num_observations() == len(survey.points.uv_px)
+    stated = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    errors = np.array([point.error for point in model.points3D.values()])
+    assert errors.mean() == pytest.approx(stated, rel=1e-2)
+    assert 0.1 < errors.mean() < 0.45
+    assert errors.max() < 1.5
+    assert min(point.track.length() for point in model.points3D.values()) >= 2
+
+
+def test_sparse_points_lie_where_the_surface_is(survey: Survey) -> None:
+    seen = survey.cameras.project(survey.points.xyz_world)[1][survey.points.camera_index, survey.points.point_index]
+    column, row = survey.points.uv_px.floor().long().T
+    depth = survey.depth[survey.points.camera_index, row, column]
+    footprint = float(survey.depth.median() / survey.cameras.focal_px[0, 0])
+    assert (seen - depth).abs().median() < footprint
+    assert ((seen - depth).abs() < 6 * footprint).float().mean() > 0.97
+
+
+def test_it_loads_as_a_scene_with_the_same_photographs_and_poses(folder: Path, survey: Survey) -> None:
+    scene = load_scene(folder)
+    assert scene.names[0] == "river_mouths_0001.png"
+    assert torch.equal(torch.as_tensor(scene.photographs[3]), survey.photographs[3])
+    back = scene.cameras.position_world + scene.origin_world
+    assert torch.allclose(back.float(), survey.cameras.position_world, atol=1e-4)
+    assert torch.allclose(scene.cameras.T_world_camera[..., :3], survey.cameras.T_world_camera[..., :3], atol=1e-5)
+    assert scene.points is not None
+    assert len(scene.points.xyz_world) == len(survey.points.xyz_world)
+    seen = survey.depth.flatten(1)
+    assert (scene.cameras.near_far[:, 0] < seen.quantile(0.01, dim=1)).all()
+    assert (scene.cameras.near_far[:, 1] > seen.quantile(0.99, dim=1)).all()
+
+
+def test_the_truth_lies_beside_it(folder: Path, survey: Survey) -> None:
+    truth = json.loads((folder / "truth" / "truth.json").read_text())
+    depth = np.load(folder / "truth" / "depth" / "river_mouths_0005.npy")
+    assert np.array_equal(depth, survey.depth[4].numpy())
+    picture = cv2.imread(str(folder / "truth" / "orthophoto.png"))
+    surface = np.load(folder / "truth" / "surface.npy")
+    assert picture is not None
+    assert picture.shape[:2] == surface.shape == (truth["map"]["rows"], truth["map"]["columns"])
+    east, north = truth["map"]["first_pixel_centre_east_north_m"]
+    step = truth["map"]["pixel_step_east_north_m"]
+    # Most sparse points are on bare ground: the map's surface, read at their places, is their height.
+    x, y, z = survey.points.xyz_world.numpy().T
+    column, row = np.rint((x - east) / step[0]).astype(int), np.rint((y - north) / step[1]).astype(int)
+    assert np.median(np.abs(surface[row, column] - z)) < 0.3
+    assert truth["gain"]["river_mouths_0001.png"] == [1.0, 1.0, 1.0]
+
+
+def test_photographs_can_be_jpegs(survey: Survey, tmp_path: Path) -> None:
+    write_survey(survey, tmp_path / "jpegs", suffix=".jpg")
+    picture = cv2.imread(str(tmp_path / "jpegs" / "images" / "river_mouths_0002.jpg"))
+    assert picture is not None
+    assert np.abs(picture[..., ::-1].astype(int) - survey.photographs[1].numpy()).mean() < 4
+
+
+def test_a_folder_with_something_in_it_is_left_alone(survey: Survey, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("keep me")
+    with pytest.raises(SceneError, match="not empty"):
+        write_survey(survey, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

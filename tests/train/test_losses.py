@@ -1,0 +1,155 @@
+"""Eq. 5 and the terms beside it, against brute-force twins."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tidefield.config import SWIFT, EncoderConfig
+from tidefield.data.batches import Batch
+from tidefield.evaluation.lpips import prepare_torchvision
+from tidefield.model.network import Network, TileRendering
+from tidefield.train.losses import DEPTH_SCALE, GLIMPSE_WEIGHT, photometric, sparse_depth, structural
+
+SIDE, TILES = 8, 2
+NETWORK = Network(replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False)))
+STRIDE = NETWORK.config.stages[0].stride
+ROWS = SIDE // STRIDE
+
+
+def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Batch]:
+    """Random renderings of random tiles; every eighth pixel has a sparse point."""
+    random = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=random)
+
+    pixels, coarse = SIDE**2, (ROWS + 2) ** 2
+    known = (uniform(TILES, pixels) < 1 / 8).float()
+    batch = Batch(
+        targets=torch.zeros(TILES, dtype=torch.long),
+        corner_px=torch.zeros(TILES, 2),
+        colours=uniform(TILES, pixels, 3),
+        weight=torch.ones(TILES, pixels) if weight is None else weight,
+        inverse_depth=known * (0.2 + 0.01 * uniform(TILES, pixels)),
+        depth_weight=known * uniform(TILES, pixels),
+        neighbours=torch.zeros(TILES, 0, dtype=torch.long),
+        presence=torch.zeros(TILES, 0, 4),
+        which=torch.zeros(TILES, 0, dtype=torch.long),
+        images=(),
+        image_corner_px=(),
+    )
+    rendering = TileRendering(
+        colour=uniform(TILES, pixels, 3),
+        depth=torch.ones(TILES, pixels),
+        opacity=torch.ones(TILES, pixels),
+        shown=torch.ones(TILES, pixels),
+        expected=(0.2 + 0.01 * uniform(TILES, coarse), 0.2 + 0.01 * uniform(TILES, pixels)),
+        glimpses=(uniform(TILES, coarse, 3),),
+    )
+    return rendering, batch
+
+
+def blocks() -> list[tuple[int, int, list[int]]]:
+    """Every coarse ray of a tile: its index, the margin counted in, and the pixels that it stands for."""
+    return [
+        (
+            (row + 1) * (ROWS + 2) + column + 1,
+            row * ROWS + column,
+            [(row * STRIDE + y) * SIDE + column * STRIDE + x for y in range(STRIDE) for x in range(STRIDE)],
+        )
+        for row in range(ROWS)
+        for column in range(ROWS)
+    ]
+
+
+def test_the_loss_is_eq_5_and_the_coarse_rays_are_held_to_the_means_of_their_pixels():
+    rendering, batch = made()
+    loss, error = photometric(rendering, batch, NETWORK, SIDE)
+    fine = sum(
+        float((rendering.colour[t, r] - batch.colours[t, r]).square().sum()) for t in range(2) for r in range(64)
+    )
+    assert error.item() == pytest.approx(fine / (TILES * SIDE**2 * 3), rel=1e-5)
+    coarse = torch.stack(
+        [
+            rendering.glimpses[0][t, ray] - batch.colours[t, pixels].mean(0)
+            for t in range(2)
+            for ray, _, pixels in blocks()
+        ]
+    )
+    assert loss.item() == pytest.approx(error.item() + GLIMPSE_WEIGHT * coarse.square().mean().item(), rel=1e-5)
+
+
+def test_pixels_without_weight_change_nothing():
+    weight = torch.ones(TILES, SIDE**2)
+    weight[:, ::3] = 0
+    rendering, batch = made(weight=weight)
+    elsewhere = torch.where(weight[..., None] > 0, batch.colours, 1 - batch.colours)
+    before, after = (
+        photometric(rendering, replace(batch, colours=c), NETWORK, SIDE) for c in (batch.colours, elsewhere)
+    )
+    assert before[0].item() == pytest.approx(after[0].item(), rel=1e-6)
+    assert before[1].item() == pytest.approx(after[1].item(), rel=1e-6)
+
+
+def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_stages():
+    rendering, batch = made()
+
+    def penalty(found: Tensor, true: Tensor) -> float:
+        miss = abs(float(found / true - 1)) / DEPTH_SCALE
+        return miss**2 / 2 if miss < 1 else miss - 0.5
+
+    terms = []
+    for expected, groups in (
+        (rendering.expected[0], [(ray, pixels) for ray, _, pixels in blocks()]),
+        (rendering.expected[1], [(pixel, [pixel]) for pixel in range(SIDE**2)]),
+    ):
+        total = share = 0.0
+        for t in range(TILES):
+            for ray, pixels in groups:
+                weight = batch.depth_weight[t, pixels]
+                if weight.sum() > 0:
+                    mean = (batch.inverse_depth[t, pixels] * weight).sum() / weight.sum()
+                    total += penalty(expected[t, ray], mean) * float(weight.sum())
+                    share += float(weight.sum())
+        terms.append(total / share)
+    assert sparse_depth(rendering, batch, NETWORK, SIDE).item() == pytest.approx(sum(terms) / 2, rel=1e-4)
+
+
+def test_the_depth_term_is_nothing_without_points_and_at_the_points():
+    rendering, batch = made()
+    none = replace(batch, inverse_depth=torch.zeros(TILES, 64), depth_weight=torch.zeros(TILES, 64))
+    assert sparse_depth(rendering, none, NETWORK, SIDE).item() == 0
+    flat = replace(rendering, expected=tuple(torch.full_like(e, 0.2) for e in rendering.expected))
+    met = replace(batch, inverse_depth=0.2 * (batch.depth_weight > 0))
+    assert sparse_depth(flat, met, NETWORK, SIDE).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_the_structural_term_is_the_ssim_that_evaluation_measures():
+    prepare_torchvision()  # torchmetrics imports it where it is installed
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    rendering, batch = made()
+    pictures = [x.unflatten(1, (SIDE, SIDE)).permute(0, 3, 1, 2) for x in (rendering.colour, batch.colours)]
+    _, similarity = structural_similarity_index_measure(
+        *pictures, sigma=1.5, kernel_size=11, data_range=1.0, return_full_image=True
+    )
+    assert structural(rendering, batch, SIDE).item() == pytest.approx(1 - similarity.mean().item(), rel=1e-5)
+
+
+def test_the_structural_term_is_nothing_for_the_truth_and_leaves_out_what_has_no_weight():
+    rendering, batch = made()
+    assert structural(replace(rendering, colour=batch.colours), batch, SIDE).item() == pytest.approx(0, abs=1e-6)
+    weight = torch.ones(TILES, SIDE**2)
+    weight[1] = 0
+    one = replace(batch, weight=weight)
+    alone = replace(batch, colours=torch.cat([batch.colours[:1], rendering.colour[1:]]))
+    assert structural(rendering, one, SIDE).item() == pytest.approx(
+        2 * structural(rendering, alone, SIDE).item(), rel=1e-4
+    )
+    colour = rendering.colour.clone().requires_grad_()
+    structural(replace(rendering, colour=colour), one, SIDE).backward()
+    assert colour.grad is not None
+    assert colour.grad.isfinite().all()
+    assert (colour.grad[1] == 0).all()

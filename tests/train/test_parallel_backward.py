@@ -1,0 +1,114 @@
+"""Parts of a batch on cores of their own: the same results and gradients as all at once."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import textured_wall as wall
+import torch
+from torch import Tensor, nn
+
+from tidefield.config import SWIFT
+from tidefield.data.batches import draw_batch
+from tidefield.data.depth_prior import DepthPriors
+from tidefield.model.intervals import sample
+from tidefield.model.network import Network
+from tidefield.train.objective import Objective
+from tidefield.train.parallel_backward import side_by_side
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+class Layers(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.second, self.idle = nn.Linear(3, 4), nn.Linear(4, 2), nn.Linear(2, 2)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        hidden = self.first(x).tanh()
+        return hidden, self.second(hidden), x.sum(1)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_values_and_gradients_are_those_of_all_at_once() -> None:
+    torch.manual_seed(0)
+    layers, x = Layers(), torch.randn(5, 3)
+
+    def loss(values: tuple[Tensor, ...]) -> Tensor:
+        return values[0].square().sum() + (values[1] * values[2][:, None]).sum()
+
+    loss(layers(x)).backward()
+    plain = {name: p.grad for name, p in layers.named_parameters()}
+    layers.zero_grad()
+    parts = [partial(layers, part) for part in x.split([2, 2, 1])]
+    found = side_by_side(parts, list(layers.parameters()), CPU)
+    for one, other in zip(found, layers(x), strict=True):
+        torch.testing.assert_close(one, other)
+    loss(found).backward()
+    for name, parameter in layers.named_parameters():
+        torch.testing.assert_close(parameter.grad, plain[name], msg=name)
+    assert layers.idle.weight.grad is None, "what takes no part has no gradient, rather than one of nothing"
+
+
+def test_what_fails_in_a_part_is_told() -> None:
+    def failing() -> tuple[Tensor, ...]:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        side_by_side([failing], [], CPU)
+
+
+def batch_of(count: int, crop_px: int | None = 48):
+    scene = wall.scene(wall.cameras(7, 96, 72, step=0.25), (3,))
+    config = replace(SWIFT.train, tiles=count, tile_px=16, crop_px=crop_px)
+    return draw_batch(scene, DepthPriors(scene), config, 3, torch.Generator().manual_seed(0))
+
+
+def test_parts_of_a_batch_are_its_tiles_with_their_own_crops() -> None:
+    batch = batch_of(3)
+    parts = batch.parts(2)
+    assert [len(part.targets) for part in parts] == [2, 1]
+    for name in ("targets", "corner_px", "colours", "weight", "neighbours", "presence"):
+        torch.testing.assert_close(torch.cat([getattr(part, name) for part in parts]), getattr(batch, name))
+    crops = [part.images[0][part.which] for part in parts]
+    torch.testing.assert_close(torch.cat(crops), batch.images[0][batch.which])
+    corners = [part.image_corner_px[0][part.which] for part in parts]
+    torch.testing.assert_close(torch.cat(corners), batch.image_corner_px[0][batch.which])
+    assert len(batch.parts(1)) == 1
+    assert len(batch.parts(8)) == 3
+
+
+def test_tiles_that_share_whole_photographs_stay_together() -> None:
+    batch = batch_of(3, crop_px=None)
+    assert batch.parts(2) == [batch]
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_network_learns_from_parts_as_from_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without jitter, up to rounding: matrices of other sizes are multiplied in another order."""
+    scene = wall.scene(wall.cameras(7, 96, 72, step=0.25), (3,))
+    torch.manual_seed(0)
+    network = Network(SWIFT.network)
+    monkeypatch.setattr("tidefield.model.network.sample", lambda density, count, _: sample(density, count, None))
+    surfaces = DepthPriors(scene)
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        network.zero_grad()
+        generator = torch.Generator().manual_seed(1)
+        loss, error = Objective(network, SWIFT.train)(scene, surfaces, scene.cameras, 3, generator)
+        loss.backward()
+        gradient = torch.cat([p.grad.flatten() for p in network.parameters() if p.grad is not None])
+        found.append((loss.detach(), error.detach(), gradient))
+    (one, error, gradient), (other, other_error, other_gradient) = found
+    torch.testing.assert_close(one, other, rtol=1e-3, atol=0)
+    torch.testing.assert_close(error, other_error, rtol=1e-3, atol=0)
+    assert (gradient - other_gradient).norm() < 0.02 * gradient.norm()

@@ -1,0 +1,272 @@
+"""Training across scenes: the stream, processes that learn together, and weights as a file."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import textured_wall as wall
+import torch
+import torch.multiprocessing as processes
+from networks import SMALL
+from rich.console import Console
+from safetensors import safe_open
+from torch.nn import functional as F
+
+from tidefield.commands.training import pretrain as pretrain_command
+from tidefield.config import PRESETS, SWIFT
+from tidefield.data.depth_prior import DepthPriors
+from tidefield.errors import RunError
+from tidefield.model.network import Network
+from tidefield.options import Length, Pretrain
+from tidefield.synthetic import Flight
+from tidefield.train import pretrain, stream
+from tidefield.train.loop import Budget, SceneTrainer
+from tidefield.train.pretrain import Pretrainer, Validation
+from tidefield.train.stream import Drawn, Recipe, Stream, recipe
+from tidefield.train.weights import SHIPPED, read_weights, sha256, write_weights
+
+CPU = torch.device("cpu")
+QUIET = Console(quiet=True)
+
+
+class Walls:
+    """Stands in for the stream: a textured wall that others see differently."""
+
+    def __init__(self, rank: int = 0) -> None:
+        scene = wall.scene(wall.cameras(6 + rank))
+        self.drawn = Drawn(scene, DepthPriors(scene), scene.cameras)
+        self.asked: list[int] = []
+
+    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+        self.asked.append(step)
+        return self.drawn
+
+
+def small_recipe(seed: int, number: int) -> Recipe:
+    misposed = (1,) if number == 1 else ()
+    return Recipe("ground_textures", 100 * seed + number, 4, 32, Flight(altitude_m=20.0), misposed)
+
+
+def test_recipes_repeat_and_differ() -> None:
+    assert recipe(3, 5) == recipe(3, 5)
+    every = [recipe(3, number) for number in range(100)]
+    assert len({one.seed for one in every}) == 100
+    assert len({one.category for one in every}) == 5
+    assert {one.flight.exposure_spread > 0 for one in every} == {True, False}
+    assert {one.flight.water_motion > 0 for one in every} == {True, False}
+    assert {len(one.misposed) for one in every} == {0, 1}
+    assert all(index < one.views for one in every for index in one.misposed)
+
+
+def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr(stream, "AT_HAND", 2)
+    monkeypatch.setattr(stream, "STEPS_EACH", 4)
+    generator = torch.Generator().manual_seed(0)
+    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+        names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
+    assert set(names[0]) == {"7-000000", "7-000001"}
+    assert set(names[1]) == {"7-000001", "7-000002"}
+    assert not (tmp_path / "scenes" / "7-000000").exists()
+    assert not (tmp_path / "cache").exists(), "the user's cache would grow without end"
+    made = (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns
+    again = torch.Generator().manual_seed(0)
+    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+        for _ in range(8):
+            scenes.draw(0, again)  # the first is made once more, ...
+        assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
+        assert (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns == made, "... and what is there is not"
+        scenes.draw(16, again)
+        left = {path.name for path in (tmp_path / "scenes").iterdir()}
+        assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
+
+
+def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
+    every = [stream.slot(3, number, 0.5) for number in range(100)]
+    assert every[5] == stream.slot(3, 5, 0.5)
+    assert 30 < sum(own.recipe is None for own in every) < 70
+    assert all(own.recipe is not None for own in [stream.slot(3, number, 0.0) for number in range(20)])
+    for hard in zip(*[(0 < own.points_share < 1, own.shift_px > 0, own.uneven > 0) for own in every], strict=True):
+        assert 10 < sum(hard) < 40
+    assert len({own.points_share for own in every}) > 10
+    assert 4 < sum(own.points_share == 0 for own in every) < 25
+    assert len({own.shift_px for own in every}) > 10
+    assert len({own.uneven for own in every}) > 10
+    assert 30 < sum(own.channels != (0, 1, 2) for own in every) < 60
+    assert len({own.channels for own in every}) == 6
+
+
+def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
+    at = wall.scene(wall.cameras(6))
+    easy, hard = (
+        stream.Slot(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
+        stream.Slot(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
+    )
+    with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
+        whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
+        none = scenes._with_hardships(at, replace(easy, points_share=0.0))
+    assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
+    assert 0.2 < float((few.cameras.principal_px - at.cameras.principal_px).std()) < 1
+    assert torch.equal(few.cameras.principal_px, few.scene.cameras.principal_px)
+    assert torch.equal(whole.cameras.gain, at.cameras.gain)
+    assert torch.equal(few.scene.photographs[1][..., 0], at.photographs[1][..., 2])
+    assert torch.equal(whole.scene.photographs[1], at.photographs[1])
+    assert 0.02 < float((few.cameras.gain / at.cameras.gain).log()[:, 0].std()) < 0.1
+    assert torch.equal(few.cameras.gain, few.scene.cameras.gain)
+    assert at.points is not None
+    assert few.scene.points is not None
+    assert none.scene.points is None
+    assert len(none.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px)
+    assert 0.1 < len(few.scene.points.xyz_world) / len(at.points.xyz_world) < 0.3
+    assert len(few.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px) > 0
+    points = few.scene.points
+    assert len(points.error_px) == len(points.xyz_world) == len(points.point_index.unique())
+    seen_at = at.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
+    assert (seen_at - points.uv_px).norm(dim=-1).max() < 1e-3, "every observation is still of its point"
+
+
+def test_a_turned_scene_has_the_same_views_of_itself() -> None:
+    at = wall.scene(wall.cameras(6))
+    drawn = stream.Drawn(at, DepthPriors(at), at.cameras)
+    turned = stream.turned(drawn, torch.tensor([0.3, -0.8, 0.1, 0.4]))
+    assert turned.scene is at
+    one, other = at.cameras.T_world_camera, turned.cameras.T_world_camera
+    assert (one - other).abs().max() > 0.5
+    torch.testing.assert_close(*(pose[0, :, :3].mT @ (pose - F.pad(pose[0, :, 3:], (3, 0))) for pose in (one, other)))
+
+
+def test_a_photograph_is_told_a_wrong_attitude(tmp_path: Path) -> None:
+    given = small_recipe(0, 1)
+    right = stream.make_survey(given.category, given.seed, given.views, given.width, given.flight)
+    wrong = stream.misposed(right, given)
+    between = right.cameras.T_world_camera[:, :, :3].mT @ wrong.cameras.T_world_camera[:, :, :3]
+    angle = torch.rad2deg(torch.acos(((between.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
+    torch.testing.assert_close(angle, torch.tensor([0.0, stream.MISPOSED_DEG, 0.0, 0.0]), atol=0.05, rtol=0)
+    torch.testing.assert_close(wrong.cameras.T_world_camera[:, :, 3], right.cameras.T_world_camera[:, :, 3])
+
+
+def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
+    seen = []
+    monkeypatch.setattr(
+        learner,
+        "objective",
+        lambda scene, surfaces, cameras, views, generator: seen.append(views) or (torch.zeros(()), torch.zeros(())),
+    )
+    for _ in range(200):
+        learner.loss()
+    assert set(seen) == set(pretrain.VIEWS)
+    assert seen.count(5) > seen.count(12)
+
+
+def learn_together(rank: int, folder: str) -> None:
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
+    os.environ["MASTER_PORT"] = Path(folder, "port").read_text()
+    torch.set_num_threads(1)
+    device = pretrain.join(CPU)
+    assert pretrain.processes() == 2
+    pretrain.CATEGORIES = ("ground_textures",)
+    pretrain.Recipe = lambda *asked: small_recipe(0, 0)
+    made = Path(folder, "validation", "ground_textures")
+    assert rank == 1 or not made.exists()
+    assert list(pretrain.validation_scenes(Path(folder), [], QUIET)) == ["ground_textures"]
+    Path(folder, f"{rank}.seed").write_text(str(pretrain.own_seed(5)))
+    learner = Pretrainer(SMALL, Walls(rank), wall.scene(wall.cameras(4)), 0, device)
+    assert learner.leads == (rank == 0)
+    assert learner.agreed(rank == 1), "one that is asked to stop stops both"
+    for _ in range(3):
+        learner.step(Budget(steps=3))
+    torch.save(learner.network.state_dict(), Path(folder, f"{rank}.pt"))
+    torch.distributed.destroy_process_group()
+
+
+def test_two_processes_learn_the_same_from_different_scenes(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        (tmp_path / "port").write_text(str(free.getsockname()[1]))
+    processes.spawn(learn_together, (str(tmp_path),), nprocs=2)
+    assert [(tmp_path / f"{rank}.seed").read_text() for rank in (0, 1)] == ["5", "1000008"]
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
+    alone = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
+    for _ in range(3):
+        alone.step(Budget(steps=3))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+    assert any(not torch.equal(value, first[name]) for name, value in alone.network.state_dict().items())
+
+
+def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretrain, "VALIDATION_STEPS", 2)
+    scene = wall.scene(wall.cameras(5), (1, 3))
+    learner = Pretrainer(SMALL, Walls(), scene, 0, CPU)
+    validation = Validation({"wall": scene}, tmp_path)
+    for step in range(1, 5):
+        learner.progress.step = step
+        validation(learner, 0.1)
+    again = Validation({"wall": scene}, tmp_path)
+    learner.progress.step = 4
+    again(learner, 0.1)
+    learner.progress.step = 5
+    again(learner, 1.0)
+    points = json.loads((tmp_path / "validation.json").read_text())
+    assert [point["step"] for point in points] == [2, 4, 5]
+    assert all(5 < point["psnr"]["wall"] < 60 for point in points)
+
+
+def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
+    scene = wall.scene(wall.cameras(4))
+    trainer, file = SceneTrainer(SMALL, scene, 1, CPU), tmp_path / "w.safetensors"
+    write_weights(file, trainer.network, SMALL, {"steps": 5})
+    with safe_open(file, framework="pt") as stored:
+        assert json.loads(stored.metadata()["tidefield"])["steps"] == 5
+        assert {stored.get_tensor(name).dtype for name in stored.keys()} == {torch.float16}  # noqa: SIM118
+    begun = SceneTrainer(SMALL, scene, 2, CPU, file)
+    for name, value in trainer.network.state_dict().items():
+        assert torch.equal(begun.network.state_dict()[name], value.half().float()), name
+    fewer = replace(SMALL, network=replace(SMALL.network, views=2))
+    read_weights(file, Network(fewer.network))
+    assert len(sha256(file)) == 64
+
+
+def test_wrong_weights_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "w.safetensors"
+    with pytest.raises(RunError, match="is no file of weights"):
+        read_weights(file, Network(SMALL.network))
+    write_weights(file, Network(SMALL.network), SMALL, {})
+    with pytest.raises(RunError, match=r"another network \(encoder differ\)"):
+        read_weights(file, Network(SWIFT.network))
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(RunError, match="damaged"):
+        read_weights(file, Network(SMALL.network))
+
+
+def test_what_ships_fits_its_preset_and_its_card() -> None:
+    files = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
+    assert set(files) == set(PRESETS)
+    for preset, file in files.items():
+        read_weights(file, Network(PRESETS[preset].network))
+        card = file.with_suffix(".md").read_text(encoding="utf-8")
+        assert card.startswith(f"# Weights of the preset {preset}\n")
+        assert sha256(file) in card
+    assert sum(file.stat().st_size for file in files.values()) < 20e6
+
+
+def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr("tidefield.commands.training.PRESETS", {"swift": SMALL})
+    scene = wall.scene(wall.cameras(5), (1, 3))
+    monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": scene})
+    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
+    with pytest.raises(RunError, match="--resume"):
+        pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
+    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=3), device="cpu", resume=True), QUIET)
+    points = json.loads((tmp_path / "out" / "validation.json").read_text())
+    assert [point["step"] for point in points] == [2, 3]
+    read_weights(tmp_path / "out" / "weights.safetensors", Network(SMALL.network))

@@ -1,0 +1,218 @@
+"""Judge a method on the held-out photographs: numbers, a table and pictures.
+
+Knows a method only as `render(camera) -> Rendering`, so every method is judged alike.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from statistics import fmean
+from typing import Any
+
+import torch
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+from tidefield import __version__
+from tidefield.data.scene import Scene
+from tidefield.data.surface import doubly_seen
+from tidefield.errors import RunError
+from tidefield.evaluation.lpips import Lpips, load_lpips
+from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
+from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
+from tidefield.files import completed_file
+from tidefield.model.rendering import Render, Rendering, to_8_bit
+from tidefield.progress import ProgressBar
+
+NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
+_TITLES = {"psnr": "PSNR dB", "ssim": "SSIM", "lpips_alex": "LPIPS AlexNet", "lpips_vgg": "LPIPS VGG", "flip": "FLIP"}
+_COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_cc": "doubly seen, colour fit"}
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What came out.
+
+    Attributes:
+        path: the evaluation.json.
+        report: its content.
+    """
+
+    path: Path
+    report: dict[str, Any]
+
+    @property
+    def mean(self) -> dict[str, Any]:
+        """Means over the photographs, by metric."""
+        return self.report["mean"]
+
+
+def evaluate(
+    render: Render,
+    scene: Scene,
+    out: Path,
+    *,
+    configuration: Mapping[str, Any],
+    overwrite: bool = False,
+    console: Console | None = None,
+) -> Evaluation:
+    """Render every held-out photograph's camera, compare, and print a table.
+
+    Writes `out/renderings/NAME.png`, `out/pictures/NAME.png` (ground truth | rendering | error | depth) and, last and
+    whole, `out/evaluation.json`.
+
+    Args:
+        render: the method.
+        scene: its test photographs are the truth; its sparse points say which pixels are doubly seen.
+        out: the folder to write to, made if needed.
+        configuration: what made this method, for the record; must be JSON.
+        overwrite: replace an evaluation that is there.
+        console: where to print; standard output if None.
+
+    Raises:
+        RunError: when there is an evaluation already, nothing is held out, a rendering is not finite, or `out` cannot
+            be written.
+    """
+    path, console = out / "evaluation.json", console or Console()
+    if path.exists() and not overwrite:
+        raise RunError(f"{path} is there already: expected a folder without one; choose another, or add --overwrite")
+    if not scene.test:
+        raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
+    files = picture_names([scene.names[i] for i in scene.test])
+    photographs: dict[str, dict[str, Any]] = {}
+    memory: dict[str, int | None] = {}
+    networks: dict[str, Lpips | str] = {}
+    with ProgressBar(console, "Evaluating") as meter:
+        for index, file in zip(scene.test, files, strict=True):
+            rendering, seconds = _rendered(render, scene, index)
+            if not memory:
+                # Here, so that the metrics' own networks do not count as the method's.
+                memory, networks = _peak_memory(), load_lpips()
+            image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
+            seen = doubly_seen(scene, scene.cameras[index])
+            scores = score(image, truth, seen, networks)
+            photographs[scene.names[index]] = {
+                **{name: scores.values[name] for name in NAMES},
+                "reasons": scores.reasons,
+                "seen_share": float(seen.float().mean()),
+                "seconds": seconds,
+            }
+            _save_pictures(out, file, image, truth, rendering)
+            meter(len(photographs), len(scene.test))
+    report = {
+        "per_photograph": photographs,
+        "mean": _mean(list(photographs.values())),
+        **_speed(scene, photographs),
+        **memory,
+        "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
+        "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
+        "version": __version__,
+        "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
+        "configuration": dict(configuration),
+    }
+    with completed_file(path, overwrite=True) as partial:
+        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    console.print(_table(scene, report))
+    for remark in _remarks(report, out):
+        console.print(remark, soft_wrap=True, highlight=False, markup=False)
+    return Evaluation(path, report)
+
+
+def _rendered(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
+    """The view of one photograph's camera, and how many seconds it took."""
+    camera = scene.cameras[index]
+    start = time.perf_counter()
+    with torch.no_grad():
+        rendering = render(camera)
+    if rendering.colour.is_cuda:
+        torch.cuda.synchronize()
+    seconds = time.perf_counter() - start
+    expected, got = (camera.height, camera.width, 3), tuple(rendering.colour.shape)
+    assert got == expected, f"a rendering of {got} for a camera of {expected}"
+    if not (rendering.colour.isfinite().all() and rendering.depth.isfinite().all()):
+        raise RunError(
+            f"the rendering of {scene.names[index]} holds NaN or infinity: expected finite colours and depths; the "
+            "training has probably diverged, so take an earlier checkpoint or train again"
+        )
+    return rendering, seconds
+
+
+def _peak_memory() -> dict[str, int | None]:
+    """The most memory that this process has held so far, and the most that it has held on a GPU."""
+    peak = None
+    if sys.platform != "win32":
+        import resource
+
+        # Kilobytes on Linux, bytes on macOS.
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    cuda = torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else None
+    return {"peak_memory_bytes": peak, "peak_cuda_memory_bytes": cuda}
+
+
+def _speed(scene: Scene, photographs: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    seconds = sum(photograph["seconds"] for photograph in photographs.values())
+    rays = int(scene.cameras.size_px[list(scene.test)].prod(1).sum())
+    return {"rays_per_second": rays / seconds, "seconds_per_frame": seconds / len(photographs)}
+
+
+def _mean(photographs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the photographs that have a value; None, and the reason, where none has."""
+    mean: dict[str, Any] = {}
+    reasons: dict[str, str] = {}
+    for name in NAMES:
+        values = [photograph[name] for photograph in photographs if photograph[name] is not None]
+        mean[name] = fmean(values) if values else None
+        if not values:
+            reasons[name] = photographs[0]["reasons"][name]
+    return {**mean, "reasons": reasons, "seen_share": fmean(photograph["seen_share"] for photograph in photographs)}
+
+
+def picture_names(names: Sequence[str]) -> list[Path]:
+    """File names for pictures of photographs: NAME.png, or NAME.JPG.png where two differ only in their suffix."""
+    stems = [PurePosixPath(name).with_suffix("") for name in names]
+    return [Path(f"{stem if stems.count(stem) == 1 else name}.png") for stem, name in zip(stems, names, strict=True)]
+
+
+def _save_pictures(out: Path, file: Path, image: Image8, truth: Image8, rendering: Rendering) -> None:
+    error = Scale("magma", 0.0, 1.0)
+    panels = [
+        Panel("ground truth", truth),
+        Panel("rendering", image),
+        Panel("error (FLIP)", colours(flip_map(image, truth), error), error),
+        depth_panel("depth", rendering.depth),
+    ]
+    for folder, picture in (("renderings", Image.fromarray(image.numpy())), ("pictures", side_by_side(panels))):
+        path = out / folder / file
+        with completed_file(path, overwrite=True) as partial:
+            picture.save(partial)
+
+
+def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
+    table = Table(title=f"{scene.root.name}, {len(scene.test)} held-out photographs, {report['width']} px")
+    table.add_column("mean")
+    for column in _COLUMNS.values():
+        table.add_column(column, justify="right")
+    for metric in METRICS:
+        values = [report["mean"][metric + suffix] for suffix in _COLUMNS]
+        digits = 2 if metric == "psnr" else 3
+        table.add_row(_TITLES[metric], *("-" if value is None else f"{value:.{digits}f}" for value in values))
+    return table
+
+
+def _remarks(report: Mapping[str, Any], out: Path) -> list[str]:
+    """What the table cannot say: why values are missing, speed, and where the pictures lie."""
+    missing: dict[str, list[str]] = {}
+    for name, reason in report["mean"]["reasons"].items():
+        missing.setdefault(reason, []).append(name)
+    return [
+        *(f"No {', '.join(names)}: {reason}" for reason, names in missing.items()),
+        f"Doubly seen: {report['mean']['seen_share']:.0%} of the pixels.",
+        f"Speed: {report['seconds_per_frame']:.2f} s per frame, {report['rays_per_second']:,.0f} rays/s.",
+        f"Pictures: {out / 'pictures'}",
+    ]

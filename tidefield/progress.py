@@ -1,0 +1,70 @@
+"""How far a long job is: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import logging
+from time import monotonic
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+log = logging.getLogger(__name__)
+
+LINE_SECONDS = 10.0
+
+
+class ProgressBar:
+    """Shows what share of a job is done, and how long the rest will take.
+
+    On a terminal a bar that goes away with the job. In a file or a pipe a line every ten seconds, as a message of this
+    module's logger, which --quiet silences; a job that ends sooner leaves no line.
+
+        with ProgressBar(console, "Rendering") as meter:
+            for done, frame in enumerate(frames, start=1):
+                ...
+                meter(done, len(frames))
+    """
+
+    def __init__(self, console: Console, job: str) -> None:
+        columns = [
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[rest]}"),
+        ]
+        self._job, self._bar_shows = job, console.is_interactive
+        self._bar = Progress(*columns, console=console, disable=not self._bar_shows, transient=True)
+        self._task = self._bar.add_task(job, total=None, rest="")
+        self._first: tuple[float, float] | None = None
+        self._spoken, self._has_spoken = monotonic(), False
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, done: int | float, whole: int | float, note: str | None = None) -> None:
+        """Show that so much of the whole is done.
+
+        Args:
+            note: what to say of it; `done of whole` if None.
+        """
+        now, share = monotonic(), done / whole
+        line = f"{done} of {whole}" if note is None else note
+        if self._first is None:
+            self._first = now, share
+        # From what this process itself has seen: a job that goes on may have begun elsewhere.
+        since, share_then = self._first
+        if share_then < share < 1:
+            line += f"  {_clock((now - since) * (1 - share) / (share - share_then))} left"
+        self._bar.update(self._task, completed=done, total=whole, rest=line)
+        due = now - self._spoken >= LINE_SECONDS or (share >= 1 and self._has_spoken)
+        if due and not self._bar_shows:
+            log.info(f"{self._job}: {line}")
+            self._spoken, self._has_spoken = now, True
+
+
+def _clock(seconds: float) -> str:
+    return f"{round(seconds) // 60}:{round(seconds) % 60:02d}"

@@ -1,0 +1,159 @@
+"""The ground under a survey from its sparse points, and what each photograph covers of it.
+
+The ground is a plane plus a coarse grid of residuals (medians, so that trees and stray points hardly matter).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import distance_transform_edt, map_coordinates, median_filter
+
+from tidefield.survey.report.block import Block
+
+POINTS_A_CELL = 16
+LARGEST_GRID = 256
+BORDER_POINTS = 8  # along each side of a photograph's frame
+FURTHEST = 2.0  # a footprint ends at so many times the distance of the photograph's far points: oblique views see on
+STEPS = 32
+TOLERANCE = 0.004  # of a footprint's size: corners that matter less are left out
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights as a function of x and y.
+
+    Attributes:
+        plane: (a, b, c) of z = a x + b y + c.
+        corner: x and y of the first cell's centre.
+        cell: spacing of the cells.
+        residual: height above the plane, rows along y; its border values go on outside.
+    """
+
+    plane: Float64[np.ndarray, " 3"]
+    corner: Float64[np.ndarray, " 2"]
+    cell: float
+    residual: Float64[np.ndarray, "h w"]
+
+    def above_plane(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
+        """Heights of points above the plane alone."""
+        return points[..., 2] - points[..., :2] @ self.plane[:2] - self.plane[2]
+
+    def relief(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
+        """Heights of the ground above its plane (bilinear)."""
+        index = np.moveaxis((xy - self.corner)[..., ::-1] / self.cell, -1, 0)
+        return map_coordinates(self.residual, index, order=1, mode="nearest")
+
+    def above(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
+        """Heights of points above the ground."""
+        return self.above_plane(points) - self.relief(points[..., :2])
+
+
+def fit_ground(points: Float64[np.ndarray, "P 3"]) -> Ground:
+    """The ground through sparse points (P >= 1); those far outside the others, in x, y or z, are not heeded."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    slack = 0.1 * (high - low) + 1e-9  # the least: points in one plane have no spread at all
+    points = points[((points >= low - slack) & (points <= high + slack)).all(1)]
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    size = high - low
+    cell = max(float(np.sqrt(size.prod() * POINTS_A_CELL / len(points))), float(size.max()) / LARGEST_GRID, 1e-9)
+    columns, rows = (np.floor(size / cell).astype(int) + 1).tolist()
+    index = np.floor((points[:, :2] - low) / cell).astype(int)
+    flat = index[:, 1] * columns + index[:, 0]
+    middle = _medians(flat, points)
+    design = np.c_[middle[:, :2], np.ones(len(middle))]
+    plane = np.linalg.lstsq(design, middle[:, 2], rcond=None)[0]
+    residual = np.full(rows * columns, np.nan)
+    residual[np.unique(flat)] = middle[:, 2] - design @ plane
+    residual = residual.reshape(rows, columns)
+    nearest = np.asarray(distance_transform_edt(np.isnan(residual), return_distances=False, return_indices=True))
+    smooth = median_filter(residual[tuple(nearest)], 3, mode="nearest")
+    return Ground(plane, low + cell / 2, cell, smooth)
+
+
+def _medians(group: np.ndarray, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "G 3"]:
+    """Per group, in order: mean x and y, median z."""
+    order = np.lexsort((points[:, 2], group))
+    _, first, count = np.unique(group[order], return_index=True, return_counts=True)
+    mean = np.add.reduceat(points[order, :2], first) / count[:, None]
+    z = points[order, 2]
+    return np.c_[mean, (z[first + (count - 1) // 2] + z[first + count // 2]) / 2]
+
+
+def footprints(block: Block, ground: Ground) -> tuple[Float64[np.ndarray, "_ 2"], ...]:
+    """Outline on the ground of what every photograph covers: x and y, counter-clockwise; empty if it sees no ground."""
+    reach = _reach(block, ground)
+    borders = [_border_directions(camera) for camera in block.cameras]
+    outlines = []
+    for i in range(len(block)):
+        directions = borders[block.lens[i]] @ block.R_world_camera[i].T
+        hits = _meet(ground, block.position[i], directions, reach[i])
+        outlines.append(_simplified(hits[:, :2]))
+    return tuple(outlines)
+
+
+def _reach(block: Block, ground: Ground) -> Float64[np.ndarray, " N"]:
+    """How far from each camera its footprint may go."""
+    distance = np.linalg.norm(block.points[block.point] - block.position[block.photograph], axis=1)
+    far = 2 * np.maximum(ground.above(block.position), 0)
+    for i, mine in block.observations():
+        far[i] = np.percentile(distance[mine], 98)
+    return FURTHEST * far
+
+
+def _border_directions(camera) -> Float64[np.ndarray, "K 3"]:
+    """Unit directions, in the camera's frame, along the border of its image."""
+    along = np.linspace(0, 1, BORDER_POINTS, endpoint=False)
+    zero, one = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
+    sides = [(along, zero), (one, along), (1 - along, one), (zero, 1 - along)]
+    uv = np.concatenate([np.c_[u, v] for u, v in sides]) * (camera.width, camera.height)
+    xy = camera.cam_from_img(uv)
+    xy = xy[np.isfinite(xy).all(1)]  # a strong distortion need not be invertible at the corners
+    directions = np.c_[xy, np.ones(len(xy))]
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _meet(
+    ground: Ground, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "K 3"], reach: float
+) -> Float64[np.ndarray, "_ 3"]:
+    """Where rays meet the ground first, or where they end; nothing if none of them goes down."""
+    fall = directions[:, :2] @ ground.plane[:2] - directions[:, 2]  # towards the plane, per unit of length
+    if not (fall > 1e-6).any():
+        return np.zeros((0, 3))
+    start = ground.above_plane(origin[None])[0]
+    with np.errstate(divide="ignore"):
+        enter = np.where(fall > 1e-6, (start - ground.residual.max()) / fall, np.inf).clip(0, reach)
+        leave = np.where(fall > 1e-6, (start - ground.residual.min()) / fall, np.inf).clip(0, reach)
+    t = enter[:, None] + (leave - enter)[:, None] * np.linspace(0, 1, STEPS)
+    samples = origin + t[..., None] * directions[:, None]
+    over = ground.above(samples)
+    under = over <= 0
+    k = np.where(under.any(1), under.argmax(1), STEPS - 1).clip(1)
+    rows = np.arange(len(t))
+    before, after = over[rows, k - 1], over[rows, k]
+    share = np.clip(before / np.where(before > after, before - after, 1), 0, 1)
+    share = np.where(under[rows, k], share, 1)
+    hit = t[rows, k - 1] + share * (t[rows, k] - t[rows, k - 1])
+    return origin + hit[:, None] * directions
+
+
+def _simplified(xy: Float64[np.ndarray, "K 2"]) -> Float64[np.ndarray, "k 2"]:
+    """The same outline with fewer corners, counter-clockwise; empty if it encloses nothing."""
+    if len(xy) < 3:
+        return np.zeros((0, 2))
+    middle = xy.mean(0)  # float32 holds a footprint, not a coordinate
+    outline = cv2.approxPolyDP((xy - middle).astype(np.float32)[:, None], TOLERANCE * float(np.ptp(xy, 0).max()), True)
+    outline = outline[:, 0].astype(np.float64) + middle
+    area = signed_area(outline)
+    if len(outline) < 3 or area == 0:
+        return np.zeros((0, 2))
+    return outline if area > 0 else outline[::-1]
+
+
+def signed_area(polygon: Float64[np.ndarray, "K 2"]) -> float:
+    """Area of a polygon: positive if its corners run counter-clockwise."""
+    x, y = (polygon - polygon[:1]).T  # near zero, because far from it the products' difference loses its digits
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
