@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import tyro
 
-from tidefield.cores import spin_briefly
 from tidefield.errors import RunError, TidefieldError
+from tidefield.machine import spin_briefly
 
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
@@ -52,9 +52,10 @@ def speed(
 
     from benchmarks.speed import QUICK, Effort, measure_speed
     from benchmarks.table import speed_tables
-    from tidefield.compare.record import stamp, write_json
     from tidefield.config import PRESETS
     from tidefield.device import choose_device, keep_large_allocations
+    from tidefield.files import write_json
+    from tidefield.machine import describe
 
     keep_large_allocations()
     where, console = choose_device(device), Console()
@@ -65,7 +66,7 @@ def speed(
         report = measure_speed(loaded, configs, where, effort, console.print)
     options = [] if scene is None else ["--scene SCENE", *([] if width is None else [f"--width {width}"])]
     command = " ".join(["python -m benchmarks speed --runs RUNS", *options, f"--device {device}"])
-    report |= {"command": command, **stamp()}
+    report |= {"command": command, **describe()}
     for table in speed_tables(report):
         print(table.markdown(), end="\n\n")
     if runs is not None:

@@ -28,14 +28,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, run_measured, tidefield
 from tidefield.config import PRESETS
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.neighbours import Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import surface_points
+from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
+from tidefield.machine import describe
 from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render, Rendering
 from tidefield.render.trajectory import make_trajectory
@@ -95,7 +97,7 @@ def measure_frames(
         "by_photographs": _by_photographs(view_of, scene, shown),
         "steadiness": _steadiness(view_of, scene),
         "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --device {device}",
-        **stamp(),
+        **describe(),
     }
     write_json(runs / FRAMES_FILE, record)
     return record

@@ -15,7 +15,9 @@ from typing import Any
 
 from PIL import ExifTags, Image
 
-from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, tidefield
+from tidefield.files import read_json, write_json
+from tidefield.machine import describe
 
 WIDTH = 400
 APART_DEG = 0.05
@@ -34,7 +36,7 @@ def measure_many(source: Path, runs: Path, count: int, run: Runner, say: Callabl
         took = run(tidefield("prepare", Path(folder) / "card", Path(folder) / "scene"), {})
         report = read_json(Path(folder) / "scene" / "report.json")
     steps = report["processing_statistics"]["steps_times"]
-    record = {"photographs": count, "steps_times": steps, **asdict(took), **stamp()}
+    record = {"photographs": count, "steps_times": steps, **asdict(took), **describe()}
     write_json(runs / "many.json", record)
     return record
 

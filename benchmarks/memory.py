@@ -14,7 +14,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.record import Runner, run_measured, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, run_measured, tidefield
+from tidefield.files import write_json
+from tidefield.machine import describe
 
 SURVEY_WIDTH = 400
 MEMORY_FILE = "memory.json"
@@ -63,7 +65,7 @@ def measure_memory(
         "command": f"python -m benchmarks memory --runs RUNS --preset {preset} --width {width} "
         f"--photographs {photographs} --device {device}",
         **asdict(took),
-        **stamp(),
+        **describe(),
     }
     write_json(runs / MEMORY_FILE, record)
     return record

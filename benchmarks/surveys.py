@@ -13,12 +13,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, tidefield
 from tidefield.compare.results import Result, read_results
 from tidefield.compare.run import WHOLE
 from tidefield.compare.table import NOTHING, Table, shown
 from tidefield.errors import SurveyError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, read_json, write_json
+from tidefield.machine import describe
 
 AIMS = {"brighton_beach": (18, True), "turin_lot": (32, True), "swindale": (75, False)}
 """Photographs to be placed, and whether the drone says how high it flew."""
@@ -50,7 +51,7 @@ def measure_surveys(
         if read_json(folder / "prepare.json") is None:
             say(f"{survey}: prepare")
             took = run(tidefield("prepare", source, folder / "scene"), {})
-            write_json(folder / "prepare.json", {**asdict(took), **stamp()})
+            write_json(folder / "prepare.json", {**asdict(took), **describe()})
         if pairs != 0 and read_json(folder / "exhaustive" / "exhaustive.json") is None:
             say(f"{survey}: exhaustive")
             some = [] if pairs is None else [str(pairs)]
@@ -68,7 +69,7 @@ def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready:
         out: the file.
     """
     records = {survey: _read(runs / survey) for survey in surveys}
-    many, made = read_json(runs / "many.json"), stamp()["machine"]
+    many, made = read_json(runs / "many.json"), describe()["machine"]
     text = "\n\n".join(
         [
             "# Surveys",

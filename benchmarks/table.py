@@ -11,13 +11,13 @@ from benchmarks.begun import by_length, length_of, length_tables
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_tables, variants, verdicts
-from tidefield.compare.record import read_json, stamp
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.run import METHODS, WHOLE
 from tidefield.compare.table import NOTHING, Table, shown
 from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
 from tidefield.errors import RunError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, read_json
+from tidefield.machine import describe
 
 SPEED_FILE = "speed.json"
 
@@ -123,7 +123,8 @@ def _circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str
             f"Machine: {': '.join([text, ', '.join(names)] if several else [text])}."
             for text, names in machines.items()
         ),
-        f"Measured {measured} with Tidefield {', '.join(versions) or 'of unknown version'}; written {stamp()['date']}.",
+        f"Measured {measured} with Tidefield {', '.join(versions) or 'of unknown version'}; "
+        f"written {describe()['date']}.",
     ]
 
 

@@ -22,7 +22,7 @@ RANK = {
     "commands": 8,
     "cli": 9,
 }
-FOR_ALL = {"config", "cores", "device", "errors", "files", "progress", "options", "parallel", "variants"}
+FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "options", "parallel", "variants"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from tidefield.cores import spin_briefly
 from tidefield.errors import TidefieldError
+from tidefield.machine import spin_briefly
 from tidefield.options import (
     Ablate,
     Baselines,

@@ -3,6 +3,10 @@
 Every message says what was found, what was expected and what to do about it.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 
 class TidefieldError(Exception):
     """Base of every error that a user can mend; commands print it and exit with status 2."""
@@ -22,3 +26,9 @@ class RunError(TidefieldError):
 
 class DeviceError(TidefieldError):
     """The requested device is not on this machine."""
+
+
+def list_names(names: Sequence[str], shown: int = 5) -> str:
+    """The first few of a list of names, and how many more there are, for a message."""
+    rest = len(names) - shown
+    return ", ".join(names[:shown]) + (f" and {rest} more" if rest > 0 else "")

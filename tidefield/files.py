@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from tidefield.errors import RunError
 
@@ -94,3 +96,29 @@ def file_sha256(path: Path) -> str:
     """The SHA-256 of what a file holds, read piece by piece."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Replace a JSON file, whole or not at all.
+
+    Raises:
+        RunError: its folder cannot be written to.
+    """
+    with completed_file(path, overwrite=True) as partial:
+        partial.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file that this program wrote, or None where there is none.
+
+    Raises:
+        RunError: when it is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RunError(
+            f"{path} is not valid JSON ({error}): expected what this program wrote; delete it and repeat"
+        ) from error

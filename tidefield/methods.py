@@ -1,43 +1,110 @@
-"""The methods that there are: floors that need no training, our network, classical NeRF, and nerfstudio's own."""
+"""The one table of methods: what can be trained, rendered, evaluated and compared, under which name.
+
+A new method is a line of `METHODS` and, unless it is another preset, its branch in one of the functions below. The
+table itself imports nothing heavy, so that `--help` can list it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-import torch
+from tidefield.config import PRESETS, AnyConfig, Config, NerfConfig, NerfstudioConfig
 
-from tidefield.baselines import nearest, plane_sweep, sparse_depth
-from tidefield.baselines.nerf import NerfTrainer
-from tidefield.baselines.nerfstudio import driver
-from tidefield.config import Config, NerfConfig, NerfstudioConfig
-from tidefield.data.scene import Scene
-from tidefield.model.network import Network
-from tidefield.model.renderer import Renderer
-from tidefield.model.rendering import Render
-from tidefield.train.checkpoint import Run, TrainingProgress, load_network
-from tidefield.train.loop import SceneTrainer, Trainer
-from tidefield.train.weights import read_weights, sha256
+if TYPE_CHECKING:
+    import torch
 
-UNTRAINED = {"plane-sweep": plane_sweep.make, "sparse-depth": sparse_depth.make, "nearest": nearest.make}
+    from tidefield.data.scene import Scene
+    from tidefield.model.rendering import Render
+    from tidefield.train.checkpoint import Run, TrainingProgress
+    from tidefield.train.loop import Trainer
+
+Kind = Literal["preset", "zero-shot", "nerf", "nerfstudio", "untrained"]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method.
+
+    Attributes:
+        kind: a preset of ours trained on the scene, one with trained weights as they are, classical NeRF, a method of
+            nerfstudio, or a baseline that needs no training.
+        summary: what it is, for `--help` and documents.
+        preset: of ours; None for the others.
+    """
+
+    kind: Kind
+    summary: str
+    preset: str | None = None
+
+
+METHODS = {
+    "tidefield": Method("preset", "the preset swift, trained on the scene from the shipped weights", "swift"),
+    "zero-shot": Method(
+        "zero-shot", "the preset swift with trained weights, without any training on the scene", "swift"
+    ),
+    "paper": Method("preset", "the paper's network, trained on the scene from trained weights", "paper"),
+    "paper-zero-shot": Method("zero-shot", "the paper's network, without any training on the scene", "paper"),
+    "nerf": Method("nerf", "classical NeRF"),
+    "nerfacto": Method("nerfstudio", "nerfstudio's Nerfacto"),
+    "splatfacto": Method("nerfstudio", "nerfstudio's Splatfacto; needs CUDA"),
+    "plane-sweep": Method("untrained", "photographs blended at the depth where they match best"),
+    "sparse-depth": Method("untrained", "photographs blended on the surface through the sparse points"),
+    "nearest": Method("untrained", "the nearest photograph, projected onto that surface"),
+}
+
+
+def names(*kinds: Kind) -> tuple[str, ...]:
+    """Names of the methods of some kinds, in the order of the table; of all kinds if none is given."""
+    return tuple(name for name, method in METHODS.items() if not kinds or method.kind in kinds)
+
+
+def configuration(name: str, preset: str = "swift") -> AnyConfig:
+    """What a run of a trained method stores; `preset` is what "tidefield" stands for."""
+    method = METHODS[name]
+    if method.kind == "nerf":
+        return NerfConfig()
+    if method.kind == "nerfstudio":
+        from tidefield.baselines.nerfstudio.environment import VERSION
+
+        return NerfstudioConfig(name, VERSION)  # type: ignore[arg-type]
+    assert method.kind == "preset", f"{name} is not trained"
+    return PRESETS[preset if name == "tidefield" else name]
+
+
+def untrained(name: str, scene: Scene) -> Render:
+    """A baseline that needs no training."""
+    from tidefield.baselines import nearest, plane_sweep, sparse_depth
+
+    return {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth, "nearest": nearest}[name].make(scene)
 
 
 def make_trainer(
     config: Config | NerfConfig, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
 ) -> Trainer:
-    """What trains a method that lives in this process; our network may begin with trained weights."""
+    """The trainer of a method that trains in this process; a preset of ours may start from trained weights."""
     if isinstance(config, NerfConfig):
+        from tidefield.baselines.nerf import NerfTrainer
+
         return NerfTrainer(config, scene, seed, device)
+    from tidefield.train.loop import SceneTrainer
+
     return SceneTrainer(config, scene, seed, device, weights)
 
 
 def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device) -> tuple[Render, str]:
-    """A preset with trained weights on a scene that it was not trained on, and the weights' SHA-256.
+    """A preset with trained weights on a scene it was not trained on, and the SHA-256 of the weights.
 
     Raises:
-        RunError: the weights are not there, or not the preset's.
+        RunError: the weights are missing, damaged, or another network's.
     """
+    from tidefield.model.network import Network
+    from tidefield.model.renderer import Renderer
+    from tidefield.train.weights import read_weights, sha256
+
     network = Network(config.network).to(device)
     read_weights(weights, network)
     network.eval()
@@ -46,16 +113,20 @@ def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device)
 
 @contextmanager
 def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Iterator[tuple[Render, TrainingProgress]]:
-    """A run as a method, while the block lasts, and how far it was trained.
+    """The method of a run, while the block lasts, and how far it was trained.
 
     Raises:
-        RunError: it has not been trained, or is damaged.
+        RunError: the run has not been trained, or is damaged.
     """
+    from tidefield.train.checkpoint import load_network
+
     if isinstance(run.config, NerfstudioConfig):
+        from tidefield.baselines.nerfstudio import driver
+
         with driver.renderer(folder) as render:
             yield render, driver.progress_of(folder)
         return
-    learner = make_trainer(run.config, scene, run.seed, device)
-    progress = load_network(folder, learner.network)
-    learner.network.eval()
-    yield learner.renderer(), progress
+    trainer = make_trainer(run.config, scene, run.seed, device)
+    progress = load_network(folder, trainer.network)
+    trainer.network.eval()
+    yield trainer.renderer(), progress

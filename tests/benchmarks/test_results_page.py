@@ -10,13 +10,14 @@ import torch
 
 from benchmarks import bars, card, table
 from benchmarks.begun import by_length, length_tables
-from tidefield.compare import record
+from tidefield import machine as this_machine
 from tidefield.compare.results import read_figures
 from tidefield.compare.run import METHODS
 from tidefield.config import PAPER, SWIFT
 from tidefield.errors import RunError
 from tidefield.evaluation.evaluate import NAMES
 from tidefield.evaluation.metrics import SUFFIXES
+from tidefield.files import read_json, write_json
 from tidefield.model.network import Network
 from tidefield.train.weights import sha256, write_weights
 
@@ -40,18 +41,14 @@ def keep_result(
     step = {"command": f"tidefield evaluate RUN {method}", "seconds": 1.0, "peak_memory_bytes": peak}
     process = {
         "settings": {"minutes": minutes, "steps": steps, "width": 400, "device": "cpu", "from_scratch": from_scratch},
-        "evaluate": step | record.stamp(),
+        "evaluate": step | this_machine.describe(),
     }
     if method not in bars.UNTRAINED:
         evaluation["configuration"] = {"trained": {"steps": 1234, "seconds": 600.0}}
         process["train"] = process["evaluate"]
-    kept = [
-        r
-        for r in (record.read_json(file) or {"results": []})["results"]
-        if (r["scene"], r["method"]) != (scene, method)
-    ]
+    kept = [r for r in (read_json(file) or {"results": []})["results"] if (r["scene"], r["method"]) != (scene, method)]
     added = {"scene": scene, "method": method, "evaluation": evaluation, "process": process, "curve": []}
-    record.write_json(file, {"results": [*kept, added]})
+    write_json(file, {"results": [*kept, added]})
 
 
 def keep_all(file: Path, psnr: Mapping[str, float], others: Mapping[str, float] | None = None) -> None:
@@ -62,9 +59,9 @@ def keep_all(file: Path, psnr: Mapping[str, float], others: Mapping[str, float] 
 
 
 def move_to_another_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = record.stamp()
+    here = this_machine.describe()
     other = here | {"machine": here["machine"] | {"processor": "Another"}}
-    monkeypatch.setattr(record, "stamp", lambda: other)
+    monkeypatch.setattr(this_machine, "describe", lambda: other)
 
 
 def judged(file: Path) -> dict[str, bars.Bar]:
@@ -158,12 +155,12 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     keep_result(ablation, "swindale", "tidefield", 27.0)
     keep_result(ablation, "swindale", "no-ray-transformer", 26.0)
     frame = {"preset": "swift", "size_px": [4000, 3000], "photographs": 12, "device": "cpu", "command": "memory"}
-    record.write_json(runs / "memory.json", {**frame, "seconds": 70, "peak_memory_bytes": 6.5e9, **record.stamp()})
+    write_json(runs / "memory.json", {**frame, "seconds": 70, "peak_memory_bytes": 6.5e9, **this_machine.describe()})
     kept = {"first": {"seconds": 25.0}, "further_seconds": 9.5, "by_photographs": {"18": 8.0, "200": 8.4}}
     steady = {"with fading": {"mean_levels": 1.0, "greatest_levels": 2.0, "greatest_of_a_tile_levels": 3.0}}
     steady |= {"without": {"mean_levels": 1.5, "greatest_levels": 4.0, "greatest_of_a_tile_levels": 5.0}}
     views = {"preset": "swift", "size_px": [800, 600], "device": "cpu", "command": "frames", "steadiness": steady}
-    record.write_json(runs / "frames.json", {**views, **kept, **record.stamp()})
+    write_json(runs / "frames.json", {**views, **kept, **this_machine.describe()})
     table.write_page([comparison], [ablation], begun, runs, out)
     text = out.read_text()
     for line in (
@@ -188,7 +185,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
 
 
 def test_of_several_machines_the_page_says_what_each_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here, file, minute = record.stamp(), tmp_path / "comparison.json", tmp_path / "minute.json"
+    here, file, minute = this_machine.describe(), tmp_path / "comparison.json", tmp_path / "minute.json"
     keep_result(file, "swindale", "tidefield", 24.0)
     keep_result(file, "swindale", "nerfacto", 21.0)
     out = tmp_path / "results.md"
@@ -225,7 +222,7 @@ def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
         "real": ["brighton_beach"],
         "validation": points,
     }
-    write_weights(file, Network(SWIFT.network), SWIFT, {**told, **record.stamp()})
+    write_weights(file, Network(SWIFT.network), SWIFT, {**told, **this_machine.describe()})
     with pytest.raises(RunError, match="no zero-shot results"):
         card.write_card(file, [tmp_path / "comparison.json"])
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
@@ -242,7 +239,7 @@ def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
     assert f"SHA-256 `{sha256(file)}`" in text
     assert "in 2.0 hours" in text
     assert card.BY_DIRECTION not in text
-    write_weights(file, Network(SWIFT.network), SWIFT, {**told, "real": ["elsewhere"], **record.stamp()})
+    write_weights(file, Network(SWIFT.network), SWIFT, {**told, "real": ["elsewhere"], **this_machine.describe()})
     with pytest.raises(RunError, match="learned from elsewhere"):
         card.write_card(file, [tmp_path / "comparison.json"])
 
@@ -250,7 +247,7 @@ def test_the_card_tells_what_the_weights_are(tmp_path: Path) -> None:
 def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
     file = tmp_path / "paper.safetensors"
     told = {"steps": 10, "seconds": 60.0, "seed": 0, "processes": 1, "real": [], "validation": []}
-    write_weights(file, Network(PAPER.network), PAPER, {**told, **record.stamp()})
+    write_weights(file, Network(PAPER.network), PAPER, {**told, **this_machine.describe()})
     keep_result(tmp_path / "comparison.json", "swindale", "paper-zero-shot", 20.5)
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
     text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()

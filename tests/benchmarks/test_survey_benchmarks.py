@@ -12,7 +12,8 @@ from PIL.ExifTags import Base
 
 from benchmarks.many import APART_DEG, WIDTH, measure_many
 from benchmarks.surveys import write_page
-from tidefield.compare.record import Took, write_json
+from tidefield.compare.record import Took
+from tidefield.files import write_json
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.survey import Survey
 

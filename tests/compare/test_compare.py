@@ -19,7 +19,6 @@ from tidefield import cli
 from tidefield.compare import published
 from tidefield.compare.figures import most_different, side_by_side, write_curves
 from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
-from tidefield.compare.record import write_json
 from tidefield.compare.results import figures_of, read_figures, read_results
 from tidefield.compare.run import METHODS, Settings, commands, compare
 from tidefield.compare.table import Table
@@ -28,6 +27,7 @@ from tidefield.compare.write import write_comparison
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
+from tidefield.files import write_json
 from tidefield.options import Compare
 
 

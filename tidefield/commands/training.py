@@ -11,12 +11,12 @@ from rich.console import Console
 
 from tidefield.baselines.nerfstudio import driver, environment
 from tidefield.commands.opening import budget_of, load
-from tidefield.compare.record import stamp
 from tidefield.config import PRESETS, AnyConfig, Config, FieldConfig, NerfConfig, NerfstudioConfig, going_on
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.curves import Curve, make_curve
+from tidefield.machine import describe
 from tidefield.methods import make_trainer
 from tidefield.options import Pretrain, Train
 from tidefield.train.checkpoint import RUN_FILE, Run, TrainingProgress, read_run, write_run
@@ -82,7 +82,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
         finished = train_loop(learner, folder, budget, Display(console), validation)
     if learner.leads:
         done, real = learner.progress, [scene.resolve().name for scene in options.real]
-        about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **stamp()}
+        about = {"steps": done.step, "seconds": done.seconds, "seed": options.seed, "real": real, **describe()}
         about["processes"] = across.processes()
         write_weights(folder / WEIGHTS_FILE, learner.network, config, {**about, "validation": validation.points})
     _end(learner.progress, finished, folder, console)

@@ -11,7 +11,7 @@ from tidefield.evaluation.evaluate import evaluate as evaluate_method
 from tidefield.evaluation.lpips import download_lpips_weights
 from tidefield.files import refuse_existing
 from tidefield.geometry.cameras import Cameras
-from tidefield.methods import UNTRAINED
+from tidefield.methods import untrained
 from tidefield.options import Evaluate, Render
 from tidefield.progress import ProgressBar
 from tidefield.render.stills import write_still
@@ -32,7 +32,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         out = source
     if method is not None:
         scene = load(source, options.width, options.allow_missing, console)
-        return evaluate_method(UNTRAINED[method](scene), scene, out, configuration={"method": method}, **settings)
+        return evaluate_method(untrained(method, scene), scene, out, configuration={"method": method}, **settings)
     with opened(options, console) as (scene, view, configuration):
         return evaluate_method(view, scene, out, configuration=configuration, **settings)
 

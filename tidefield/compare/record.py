@@ -6,24 +6,15 @@ started it, so the measuring one must stay small.
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import shlex
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
 
-from tidefield import __version__
-from tidefield.cores import cores
 from tidefield.errors import RunError
-from tidefield.files import completed_file
 
 
 @dataclass(frozen=True)
@@ -65,51 +56,3 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str]) -> Took
         )
     # Kilobytes on Linux, bytes on macOS.
     return Took(time.perf_counter() - start, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
-
-
-def stamp() -> dict[str, Any]:
-    """When, with what and on which machine something is measured."""
-    return {
-        "date": datetime.now(UTC).date().isoformat(),
-        "version": __version__,
-        "machine": {
-            "processor": _processor(),
-            "cores": cores(),
-            "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-            "system": f"{platform.system()} {platform.machine()}",
-            "python": platform.python_version(),
-            "torch": version("torch"),
-        },
-    }
-
-
-def _processor() -> str:
-    if sys.platform == "darwin":
-        command = ["sysctl", "-n", "machdep.cpu.brand_string"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    about = Path("/proc/cpuinfo")
-    lines = about.read_text().splitlines() if about.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Replace a file whole or not at all."""
-    with completed_file(path, overwrite=True) as partial:
-        partial.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> Any:
-    """What is in the file, or None where there is none.
-
-    Raises:
-        RunError: when it is damaged.
-    """
-    if not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RunError(
-            f"{path} is no JSON ({error}): expected what a measurement left; delete it and repeat"
-        ) from error

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.record import read_json
 from tidefield.compare.run import EVALUATION_FILE, PROCESS_FILE, RUNS
 from tidefield.evaluation.curves import CURVE_FILE
+from tidefield.files import read_json
 
 
 @dataclass(frozen=True)

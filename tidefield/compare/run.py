@@ -12,8 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tidefield.compare.record import Runner, read_json, stamp, tidefield, write_json
+from tidefield.compare.record import Runner, tidefield
 from tidefield.errors import RunError
+from tidefield.files import read_json, write_json
+from tidefield.machine import describe
 
 UNTRAINED = ("plane-sweep", "sparse-depth", "nearest")
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
@@ -139,5 +141,5 @@ def _step(
         return
     again = ["--overwrite"] if name == "train" and (folder / RUN_FILE).exists() else []
     took = run(tidefield(*words, *again), {})
-    record[name] = {"command": shlex.join(["tidefield", *shown]), **asdict(took), **stamp()}
+    record[name] = {"command": shlex.join(["tidefield", *shown]), **asdict(took), **describe()}
     write_json(folder / PROCESS_FILE, record)

@@ -9,13 +9,13 @@ from typing import Any
 
 from tidefield.compare.ablation import ablation_tables, verdicts
 from tidefield.compare.figures import side_by_side, write_curves
-from tidefield.compare.record import stamp, write_json
 from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
 from tidefield.compare.table import Table
 from tidefield.compare.tables import all_tables, lpips_weights, missing_metrics
 from tidefield.data.load import load_scene
-from tidefield.files import completed_file
+from tidefield.files import completed_file, write_json
+from tidefield.machine import describe
 
 
 def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
@@ -24,7 +24,7 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     Returns:
         The files.
     """
-    tables, made = all_tables(results), stamp()
+    tables, made = all_tables(results), describe()
     files = [
         _write(out / "tables.md", _page("Comparison", tables, _remarks(results), settings, made)),
         _write(out / "tables.tex", _latex(tables)),
@@ -55,7 +55,7 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     Returns:
         The files.
     """
-    tables, made = ablation_tables(results), stamp()
+    tables, made = ablation_tables(results), describe()
     write_json(out / "ablation.json", {"settings": asdict(settings), **made, "results": figures_of(results)})
     return [
         _write(

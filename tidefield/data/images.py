@@ -27,9 +27,9 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from tidefield.cores import cores
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens, rectify
+from tidefield.machine import cores
 
 Progress = Callable[[int, int], None]
 """Called with how many photographs are ready, and of how many."""

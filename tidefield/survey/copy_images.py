@@ -16,8 +16,8 @@ import pycolmap
 from jaxtyping import Float32
 from PIL import ExifTags, Image
 
-from tidefield.cores import cores
 from tidefield.files import completed_file
+from tidefield.machine import cores
 from tidefield.survey.colour import Evening, evened
 from tidefield.survey.io.pictures import upright
 from tidefield.survey.survey import Photograph

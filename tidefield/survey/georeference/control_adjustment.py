@@ -10,11 +10,11 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut, Residuals
+from tidefield.errors import list_names
 from tidefield.survey.georeference.adjustment import Lens, adjust, carry_over, leave_one_out, reliable, seen_control
 from tidefield.survey.georeference.alignment import metres
 from tidefield.survey.georeference.ground_control import on_one_line
 from tidefield.survey.georeference.marks import Marks, reprojection_px, triangulate_points
-from tidefield.survey.io.names import some
 
 _MARK_TOLERANCE = 0.005
 """Of an image's width. A mark farther than this from where an adjusted model shows its point is wrong, or, where others
@@ -176,12 +176,12 @@ def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstructio
         for number, camera in sorted(model.cameras.items())
     ]
     return (
-        f"Ground control corrected the lens (focal length {some(changes)}, principal point and distortion): the points "
-        "that are left out in turn are met better so.",
+        f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): the "
+        "points that are left out in turn are met better so.",
     )
 
 
 def _unchecked(marks: Marks, check: Residuals) -> tuple[str, ...]:
     rest = sorted(set(marks.point) - set(check.names))
     why = "one photograph shows it, or too few points would be left"
-    return (f"Used, but not checked: {some(rest)}; {why}.",) if rest else ()
+    return (f"Used, but not checked: {list_names(rest)}; {why}.",) if rest else ()

@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float64, Int
 from scipy.optimize import least_squares
 
 from tidefield.data.georeference import LeftOut
-from tidefield.errors import SurveyError
+from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.survey.io.names import some
 from tidefield.survey.survey import Control, Photograph
 
 
@@ -86,9 +85,9 @@ def place_marks(
     )
     if not found:
         raise SurveyError(
-            f"the {len(control.marks)} marks of ground control are in {some([m.photograph for m in control.marks])}, "
-            f"which could not be placed: expected marks in some of {some(sorted(images))}; mark these, or see why the "
-            "others were not placed"
+            f"the {len(control.marks)} marks of ground control are in "
+            f"{list_names([m.photograph for m in control.marks])}, which could not be placed: expected marks in "
+            f"some of {list_names(sorted(images))}; mark these, or see why the others were not placed"
         )
     width = np.array([model.camera(images[mark.photograph].camera_id).width for mark in found], dtype=np.float64)
     zoom = np.array([sizes[mark.photograph] for mark in found]) / width

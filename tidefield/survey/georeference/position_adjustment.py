@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
+from tidefield.errors import list_names
 from tidefield.geometry.similarity import outliers
 from tidefield.survey.georeference.adjustment import (
     adjustment_options,
@@ -24,7 +25,6 @@ from tidefield.survey.georeference.adjustment import (
     thinned,
 )
 from tidefield.survey.georeference.alignment import camera_centres, metres
-from tidefield.survey.io.names import some
 
 DIFFERENTIAL_M = 0.3
 """Positions that state a standard deviation of less are from a differential receiver."""
@@ -104,7 +104,7 @@ def _told(
     if lens == "distortion":
         told.append("The lens' distortion and principal point were corrected by them.")
     if astray:
-        told.append(f"The positions of {some(astray)} are worse than they state, and were not used for that.")
+        told.append(f"The positions of {list_names(astray)} are worse than they state, and were not used for that.")
     return tuple(told)
 
 

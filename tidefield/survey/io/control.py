@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tidefield.errors import SurveyError
+from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import parse_crs
 from tidefield.survey.io.crs import read_crs
 from tidefield.survey.io.gps_files import split_name
-from tidefield.survey.io.names import Names, read_text, some
+from tidefield.survey.io.names import Names, read_text
 from tidefield.survey.io.pictures import upright_size, upright_uv
 from tidefield.survey.io.which_crs import refuse_elsewhere
 from tidefield.survey.survey import Control, Mark, Photograph
@@ -72,7 +72,7 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
         refuse_elsewhere(control, *middle.tolist())
     remarks = []
     if missing:
-        remarks.append(f"{path.name} marks points in photographs that are not there (left out): {some(missing)}.")
+        remarks.append(f"{path.name} marks points in photographs that are not there (left out): {list_names(missing)}.")
     remarks += [f"{path.name}: {reason} and is left out." for reason in outside]
     return control, remarks
 
@@ -121,7 +121,7 @@ def _in_photographs(
             found.append((point, photograph, line))
     if not found:
         raise SurveyError(
-            f"{path} marks points in {len(missing)} photographs ({some(list(missing))}), none of which is there: "
+            f"{path} marks points in {len(missing)} photographs ({list_names(list(missing))}), none of which is there: "
             "expected names of this survey's photographs; correct them, or give the control file of this survey"
         )
     return found, list(missing)

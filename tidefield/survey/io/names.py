@@ -7,17 +7,10 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from tidefield.errors import SurveyError
+from tidefield.errors import SurveyError, list_names
 
-_NAMED_AT_MOST = 5
 _MEGABYTES = 50
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
-
-
-def some(names: Sequence[str]) -> str:
-    """The first few of a list of names, and how many more there are."""
-    rest = len(names) - _NAMED_AT_MOST
-    return ", ".join(names[:_NAMED_AT_MOST]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def folded(name: str) -> str:
@@ -54,7 +47,7 @@ class Names:
         names = next((found[key] for found, key in rules if key in found), [])
         if len(names) > 1:
             raise SurveyError(
-                f"{text} names {len(names)} photographs ({some(names)}): expected one; write its folder, too"
+                f"{text} names {len(names)} photographs ({list_names(names)}): expected one; write its folder, too"
             )
         return names[0] if names else None
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 from PIL import ExifTags
 
-from tidefield.cores import cores
-from tidefield.errors import SurveyError
+from tidefield.errors import SurveyError, list_names
+from tidefield.machine import cores
 from tidefield.survey.io import metadata as tags
 from tidefield.survey.io.control import CONTROL_FILES, read_control
 from tidefield.survey.io.gps_files import GPS_FILES, read_gps_file
 from tidefield.survey.io.lens_prior import lens_prior
-from tidefield.survey.io.names import Names, find_file, folded, some
+from tidefield.survey.io.names import Names, find_file, folded
 from tidefield.survey.io.pictures import opened, refuse_truncated, stored_size, upright_size
 from tidefield.survey.io.positions import drop_astray, drop_impossible
 from tidefield.survey.survey import Photograph, Survey
@@ -58,7 +58,9 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
     _refuse_collisions(names)
     remarks = []
     if undeveloped:
-        remarks.append(f"{len(undeveloped)} camera raw files are not read ({some(undeveloped)}): develop them first.")
+        remarks.append(
+            f"{len(undeveloped)} camera raw files are not read ({list_names(undeveloped)}): develop them first."
+        )
     with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
         # Pillow's, of tags that it cannot read; they name no file, and what is not read is unknown.
         warnings.simplefilter("ignore", UserWarning)
@@ -114,10 +116,10 @@ def _refuse_none(folder: Path, paths: Sequence[Path], undeveloped: Sequence[str]
         return
     if undeveloped:
         raise SurveyError(
-            f"{folder} has {len(undeveloped)} camera raw files ({some(undeveloped)}) and no photographs: expected "
-            "JPEG, PNG or TIFF; develop them first, all with the same settings"
+            f"{folder} has {len(undeveloped)} camera raw files ({list_names(undeveloped)}) and no photographs: "
+            "expected JPEG, PNG or TIFF; develop them first, all with the same settings"
         )
-    found = f"pictures of other kinds ({some(others)})" if others else "no photographs"
+    found = f"pictures of other kinds ({list_names(others)})" if others else "no photographs"
     raise SurveyError(f"{folder} has {found}: expected JPEG, PNG or TIFF files; give their folder, or convert them")
 
 
@@ -129,8 +131,8 @@ def _refuse_collisions(names: Sequence[str]) -> None:
     same = next((several for several in found.values() if len(several) > 1), None)
     if same:
         raise SurveyError(
-            f"{some(same)} differ in their suffix or in upper and lower case only: expected one file per photograph; "
-            "take one of them away or rename it"
+            f"{list_names(same)} differ in their suffix or in upper and lower case only: expected one file per "
+            "photograph; take one of them away or rename it"
         )
 
 
@@ -169,7 +171,7 @@ def _damaged(photographs: Sequence[tuple[Photograph, tuple[str, ...]]]) -> list[
     for block in ("EXIF", "XMP"):
         names = [photograph.name for photograph, damaged in photographs if block in damaged]
         if names:
-            remarks.append(f"The {block} metadata of {some(names)} is damaged and was not read.")
+            remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
     return remarks
 
 
@@ -192,5 +194,5 @@ def _locate(folder: Path, photographs: Sequence[Photograph], gps: Path | None) -
     remarks += astray
     without = [photograph.name for photograph in located if photograph.position is None]
     if without:
-        remarks.append(f"{len(without)} of {len(located)} photographs have no position: {some(without)}.")
+        remarks.append(f"{len(without)} of {len(located)} photographs have no position: {list_names(without)}.")
     return located, remarks

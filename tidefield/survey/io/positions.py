@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from tidefield.survey.io.names import some
+from tidefield.errors import list_names
 from tidefield.survey.survey import Photograph, Position
 
 _EARTH_M = 6_371_000.0
@@ -62,7 +62,7 @@ def drop_astray(photographs: Sequence[Photograph]) -> tuple[list[Photograph], li
     limit_m = max(_FAR_M, _FAR_TIMES_MEDIAN * float(np.median(away_m)))
     far = [index for index, distance in enumerate(away_m) if distance > limit_m]
     if len(far) > max(2, _ASTRAY_AT_MOST * len(located)):
-        names = some([located[index].name for index in far])
+        names = list_names([located[index].name for index in far])
         return list(photographs), [
             f"{len(far)} of the {len(located)} positions lie {away_m[far].min() / 1000:.0f} km and more from the "
             f"others ({names}): these may be two places."
@@ -104,4 +104,4 @@ def _remark(photographs: Sequence[Photograph], what: str) -> str:
     position = photographs[0].position
     assert position is not None
     example = f"latitude {position.latitude_deg:.6g}, longitude {position.longitude_deg:.6g}"
-    return f"The position of {some([p.name for p in photographs])} ({example}) {what}."
+    return f"The position of {list_names([p.name for p in photographs])} ({example}) {what}."

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float64, Int8
 from scipy.spatial import KDTree
 
-from tidefield.cores import cores
 from tidefield.errors import SurveyError
+from tidefield.machine import cores
 from tidefield.survey.io.photographs import FEWEST
 from tidefield.survey.io.pictures import thumbnail
 from tidefield.survey.io.positions import metres_around

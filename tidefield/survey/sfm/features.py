@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from tidefield.cores import cores
 from tidefield.errors import DeviceError
+from tidefield.machine import cores
 from tidefield.survey.io.pictures import upright
 from tidefield.survey.survey import LensPrior, Photograph
 
