@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tidefield.train.weights import about, sha256
+
 from benchmarks.bars import SCENES, UNSEEN
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.run import PAPER_ZERO_SHOT, UNTRAINED, ZERO_SHOT
@@ -23,7 +25,6 @@ from tidefield.train.stream import (
     UNEVEN,
     UNEVEN_SHARE,
 )
-from tidefield.train.weights import about, sha256
 
 OWN = {"swift": ZERO_SHOT, "paper": PAPER_ZERO_SHOT}
 """By preset, what its weights are called in a comparison."""

@@ -1,17 +1,9 @@
 """How all tests run: shapes checked (jaxtyping, enforced by beartype), on one thread, the slow ones on request."""
 
-import os
-from importlib.util import find_spec
-
 import pytest
 import torch
 from jaxtyping import install_import_hook
 
-# Without a GPU kernels run in Triton's interpreter; they are no functions that the hook could wrap.
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"
-if find_spec("triton"):
-    import tidefield.model.fused  # noqa: F401
 install_import_hook("tidefield", "beartype.beartype")
 
 torch.set_num_threads(1)

@@ -32,9 +32,9 @@ def command_lines(program: str) -> list[str]:
 @pytest.mark.parametrize("line", command_lines("tidefield"))
 def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words, called = shlex.split(line), []
-    _, module, function = cli.COMMANDS[words[1]]
-    monkeypatch.setattr(f"tidefield.commands.{module}.{function}", lambda options, console: called.append(options))
-    monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
+    module, _, function = cli.COMMANDS[words[1]]
+    monkeypatch.setattr(module, function, lambda options, console: called.append(options))
+    monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
     monkeypatch.setattr(sys, "argv", words)
     cli.main()
     assert len(called) == 1

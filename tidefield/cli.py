@@ -1,56 +1,56 @@
 """The command line: `tidefield COMMAND`, as `tidefield --help` lists them.
 
-Only what is needed to answer --help is imported here; torch and the rest are imported once a command is known.
+Only what is needed to answer --help is imported here; torch and the rest are imported by the commands' functions.
 """
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from tidefield import __version__
+from tidefield.commands import ablate, baselines, compare, demo, evaluate, import_, prepare, pretrain, render, train
 from tidefield.errors import TidefieldError
 from tidefield.machine import spin_briefly
-from tidefield.options import (
-    Ablate,
-    Baselines,
-    Compare,
-    Demo,
-    Evaluate,
-    Import,
-    Prepare,
-    Pretrain,
-    Render,
-    Train,
-    Verbosity,
-)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-COMMANDS = {
-    "prepare": (Prepare, "surveys", "prepare"),
-    "import": (Import, "surveys", "import_project"),
-    "train": (Train, "training", "train"),
-    "pretrain": (Pretrain, "training", "pretrain"),
-    "evaluate": (Evaluate, "views", "evaluate"),
-    "render": (Render, "views", "render"),
-    "compare": (Compare, "peers", "compare"),
-    "ablate": (Ablate, "peers", "ablate"),
-    "baselines": (Baselines, "peers", "baselines"),
-    "demo": (Demo, "demonstration", "demo"),
+    from tidefield.commands.common import Verbosity
+
+COMMANDS: dict[str, tuple[Any, Any, str]] = {
+    "prepare": (prepare, prepare.Prepare, "prepare"),
+    "import": (import_, import_.Import, "import_project"),
+    "train": (train, train.Train, "train"),
+    "evaluate": (evaluate, evaluate.Evaluate, "evaluate"),
+    "render": (render, render.Render, "render"),
+    "compare": (compare, compare.Compare, "compare"),
+    "ablate": (ablate, ablate.Ablate, "ablate"),
+    "baselines": (baselines, baselines.Baselines, "baselines"),
+    "pretrain": (pretrain, pretrain.Pretrain, "pretrain"),
+    "demo": (demo, demo.Demo, "demo"),
 }
-"""By name: what can be asked, and module and function of `tidefield.commands`, imported only when it is asked for."""
+"""By name: module, options and function."""
+
+DESCRIPTION = """New views of tidal flats from drone photographs.
+
+The usual order of commands:
+  tidefield prepare PHOTOS SCENE    photographs become a scene (or: tidefield import PROJECT SCENE)
+  tidefield train SCENE RUN         learn the scene
+  tidefield evaluate RUN            measure quality on held-out photographs
+  tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+tidefield demo does all of it on a built-in scene."""
 
 
 def main() -> None:
     """Entry point: exit status 0, 2 for a user's mistake, 130 after an interruption."""
     try:
-        _run()
+        _run(sys.argv[1:])
     except TidefieldError as error:
         print(f"tidefield: {error}", file=sys.stderr)
         sys.exit(2)
@@ -63,19 +63,34 @@ def main() -> None:
         sys.exit(141)
 
 
-def _run() -> None:
-    """Understand the command line and do what it says."""
+def _run(words: list[str]) -> None:
+    """Parse the command line and run its command."""
+    if words == ["--version"]:
+        print(f"tidefield {__version__}")
+        return
+    _require_command(words)
     options = tyro.extras.subcommand_cli_from_dict(
-        {name: asked for name, (asked, _, _) in COMMANDS.items()},
+        {name: options for name, (_, options, _) in COMMANDS.items()},
         prog="tidefield",
-        description="New views of tidal flats from drone photographs.",
+        description=DESCRIPTION,
+        args=words,
+        config=(tyro.conf.FlagCreatePairsOff,),
+        sort_subcommands=False,
     )
-    console = _begin(options.verbosity)
-    module, function = next((module, name) for asked, module, name in COMMANDS.values() if asked is type(options))
-    getattr(import_module(f"tidefield.commands.{module}"), function)(options, console)
+    module, function = next((m, f) for m, kind, f in COMMANDS.values() if kind is type(options))
+    getattr(module, function)(options, _set_up(options.verbosity))
 
 
-def _begin(verbosity: Verbosity) -> Console:
+def _require_command(words: list[str]) -> None:
+    """Raises: TidefieldError when the first word is not a command, with the one that is probably meant."""
+    if not words or words[0].startswith("-") or words[0] in COMMANDS:
+        return
+    close = difflib.get_close_matches(words[0], COMMANDS, n=1)
+    advice = f"did you mean `tidefield {close[0]}`?" if close else "`tidefield --help` explains them"
+    raise TidefieldError(f"{words[0]} is not a command: expected one of {', '.join(COMMANDS)}; {advice}")
+
+
+def _set_up(verbosity: Verbosity) -> Console:
     """Set up messages; returns the console that commands print to."""
     spin_briefly()
     from rich.console import Console

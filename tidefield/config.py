@@ -27,30 +27,19 @@ class EncoderConfig:
 
 
 @dataclass(frozen=True)
-class StageConfig:
-    """One pass along the rays; each looks closer where the one before expects the surface."""
+class PassConfig:
+    """One pass along the rays; each searches closer to where the one before found the surface."""
 
     stride: int
     """Pixels between rays: 4 means one ray for 4 x 4 pixels."""
     samples: int
     """M, samples along a ray."""
     feature_stride: int
-    """Pixels between the texels of the feature maps that this stage reads: 4, 2 or 1."""
+    """Pixels between the texels of the feature maps that this pass reads: 4, 2 or 1."""
     feature_channels: int
     """C, channels of these maps."""
     hidden: int
-    """Channels of the aggregated features and of the ray transformer."""
-
-
-@dataclass(frozen=True)
-class FieldConfig:
-    """The per-scene field: a multi-resolution hash grid under scene contraction."""
-
-    levels: int = 12
-    features: int = 2
-    log2_entries: int = 17
-    coarsest: int = 16
-    finest: int = 2048
+    """H, channels of the aggregated features and of the ray transformer."""
 
 
 Part = Literal["direction weights", "ray transformer", "target colour"]
@@ -58,26 +47,23 @@ Part = Literal["direction weights", "ray transformer", "target colour"]
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The network of the paper's Figure 2."""
+    """A network over neighbouring views (the paper's Figure 2)."""
 
+    kind: Literal["paper", "swift"]
+    """`model.paper.PaperNetwork`, the network as printed, or `model.swift.SwiftNetwork`, ours."""
     encoder: EncoderConfig
-    stages: tuple[StageConfig, ...]
+    passes: tuple[PassConfig, ...]
+    """Coarse to fine; the paper has one."""
     views: int
-    """N, neighbouring views at each place; 0 leaves the per-scene field alone, a NeRF."""
-    fold: bool
-    """Apply the aggregation's first layer to the feature maps, once per photograph instead of once per sample."""
+    """N, neighbouring views of each sample."""
     heads: int = 4
     """Attention heads of the ray transformer."""
     harmonics_degree: int = 3
     """J of eq. 8."""
-    doubt: float = 0.05
-    """Share of a finer stage's samples that are spread evenly instead of where the coarser stage saw the surface."""
-    as_printed: bool = False
-    """The paper's boxes and nothing else. Otherwise what we add to them takes part: a look around the sparse points'
-    surface first, density where features agree, sharpened photographs, views by angle before anything is learned."""
-    field: FieldConfig | None = None
+    uniform_fraction: float = 0.05
+    """Share of a finer pass's samples that are spread evenly instead of where the coarser pass found the surface."""
     without: tuple[Part, ...] = ()
-    """Parts of the paper that are left out, to see what they bring: views count alike instead of by direction (eq. 6),
+    """Parts of the paper that are left out, for the ablation: views count alike instead of by direction (eq. 6),
     densities come from each sample alone, colours from the neighbours alone."""
 
 
@@ -92,16 +78,15 @@ class TrainConfig:
     crop_px: int | None
     """Side of the crops of the neighbours that are encoded for a tile; None encodes whole photographs."""
     learning_rate: float
-    field_learning_rate: float = 1e-2
     warm_up: int = 50
     """Steps over which the learning rate rises."""
     unseen_weight: float = 1.0
     """In the loss, of pixels that fewer than two other training photographs see: little can be learned from what
     cannot be known, and its large errors drown the rest."""
     structure_weight: float = 0.0
-    """In the loss, of 1 - SSIM of the tiles: squared errors alone leave what cannot be foretold blurred."""
+    """In the loss, of 1 - SSIM of the tiles: squared errors alone leave unpredictable detail blurred."""
     depth_weight: float = 0.0
-    """In the loss, of the sparse points' depths (where a surface misses them by 1%, this much is added)."""
+    """In the loss, of the sparse points' depths; added where a surface misses a point by 1%."""
     neighbours: Literal["seen", "direction"] = "seen"
     """How neighbours are ranked: by what the target sees, or by viewing direction alone, as the paper does."""
 
@@ -152,24 +137,23 @@ AnyConfig = Config | NerfConfig | NerfstudioConfig
 PAPER = Config(
     preset="paper",
     network=NetworkConfig(
+        kind="paper",
         encoder=EncoderConfig(),
-        stages=(StageConfig(stride=1, samples=64, feature_stride=4, feature_channels=64, hidden=64),),
+        passes=(PassConfig(stride=1, samples=64, feature_stride=4, feature_channels=64, hidden=64),),
         views=8,
-        fold=False,
-        as_printed=True,
     ),
     train=TrainConfig(tile_px=8, tiles=8, crop_px=None, learning_rate=5e-4, neighbours="direction"),
 )
 SWIFT = Config(
     preset="swift",
     network=NetworkConfig(
+        kind="swift",
         encoder=EncoderConfig(widths=(16, 16, 32, 64), blocks=(1, 1, 1), instance_norm=False),
-        stages=(
-            StageConfig(stride=4, samples=24, feature_stride=4, feature_channels=32, hidden=32),
-            StageConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
+        passes=(
+            PassConfig(stride=4, samples=24, feature_stride=4, feature_channels=32, hidden=32),
+            PassConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
         ),
         views=5,
-        fold=True,
     ),
     train=TrainConfig(
         tile_px=32,
@@ -184,8 +168,38 @@ SWIFT = Config(
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 
 
-def going_on(config: Config) -> Config:
-    """The same from trained weights on: the learning rate rises four times as slowly.
+DEFAULT_MINUTES = 10.0
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long to train: minutes or steps."""
+
+    minutes: float | None = None
+    """Minutes of training; 10 if neither this nor --steps is given."""
+    steps: int | None = None
+    """Steps of training, instead of minutes."""
+
+    def checked(self) -> Budget:
+        """This budget, or the default of ten minutes where nothing is given.
+
+        Raises:
+            RunError: both minutes and steps are given.
+        """
+        if self.minutes is not None and self.steps is not None:
+            raise RunError("both --minutes and --steps are given: expected one of them; leave one out")
+        return Budget(minutes=DEFAULT_MINUTES) if self.minutes is None and self.steps is None else self
+
+    def share(self, step: int, seconds: float) -> float:
+        """Share of the budget that is used, 0 to 1."""
+        if self.steps is not None:
+            return min(1.0, step / max(self.steps, 1))
+        assert self.minutes is not None, "a budget is steps or minutes"
+        return min(1.0, seconds / max(60 * self.minutes, 1e-9))
+
+
+def warm_start(config: Config) -> Config:
+    """The configuration for training from trained weights: the learning rate rises four times as slowly.
 
     Adam's steps are too large until its averages mean something, which takes 2 / (1 - beta2) = 200 steps (Ma and
     Yarats, 2021, "On the adequacy of untuned warmup for adaptive optimization"). Random weights do not mind.
@@ -204,10 +218,36 @@ def config_from_json(data: Any) -> AnyConfig:
     Raises:
         RunError: when a field is missing, unknown or of another type.
     """
+    data = _convert_0_1(data)
     method = data.get("method") if isinstance(data, dict) else None
     kinds = typing.get_args(AnyConfig)
     kind = next((k for k in kinds if method in typing.get_args(typing.get_type_hints(k)["method"])), Config)
     return _build(kind, data, "config")
+
+
+def _convert_0_1(data: Any) -> Any:
+    """A configuration that 0.1 wrote, in today's names; anything else as it is.
+
+    Raises:
+        RunError: it is of a network with a per-scene field or without neighbouring views, which 0.2 took out.
+    """
+    network = data.get("network") if isinstance(data, dict) else None
+    if not isinstance(network, dict) or "as_printed" not in network:
+        return data
+    if network.get("field") is not None or not network.get("views"):
+        raise RunError(
+            "this run has a per-scene field (--field, no-neighbours), which Tidefield 0.2 took out: expected a run "
+            "without one; train it again, or use Tidefield 0.1"
+        )
+    kept = {name: value for name, value in network.items() if name in ("encoder", "views", "heads", "harmonics_degree")}
+    kept |= {
+        "kind": "paper" if network["as_printed"] else "swift",
+        "passes": network.get("stages"),
+        "uniform_fraction": network.get("doubt"),
+        "without": network.get("without"),
+    }
+    train = {name: value for name, value in data.get("train", {}).items() if name != "field_learning_rate"}
+    return {**data, "network": kept, "train": train}
 
 
 def _build(kind: Any, data: Any, where: str) -> Any:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import math
-import os
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from importlib.util import find_spec
 from threading import Lock
 from time import perf_counter
 
@@ -57,9 +55,7 @@ def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
 
 @cache
 def _cpu_gains_by_bfloat16() -> bool:
-    """Whether convolutions in bfloat16 take less time here: tried, since some that know it take twice as long."""
-    if not torch.cpu._is_avx512_bf16_supported():
-        return False
+    """Whether convolutions in bfloat16 take less time here: tried, since some CPUs with bfloat16 take twice as long."""
     images, weight = torch.ones(1, 64, 64, 64).contiguous(memory_format=torch.channels_last), torch.ones(64, 64, 3, 3)
     least = {torch.float32: math.inf, torch.bfloat16: math.inf}
     # The first try prepares the kernels; in turns, so that what else the machine does meets both.
@@ -72,14 +68,6 @@ def _cpu_gains_by_bfloat16() -> bool:
                 if number:
                     least[dtype] = min(least[dtype], perf_counter() - began)
     return least[torch.bfloat16] < least[torch.float32]
-
-
-def fuses(values: torch.Tensor) -> bool:
-    """Whether fused kernels work on these values: on CUDA, with Triton, and where TIDEFIELD_FUSED=1 asks for it.
-
-    They are not the default, because nobody has measured yet what they gain.
-    """
-    return values.is_cuda and os.environ.get("TIDEFIELD_FUSED") == "1" and find_spec("triton") is not None
 
 
 def keep_large_allocations() -> None:

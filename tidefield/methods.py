@@ -101,14 +101,14 @@ def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device)
     Raises:
         RunError: the weights are missing, damaged, or another network's.
     """
-    from tidefield.model.network import Network
+    from tidefield.model.network import make_network
     from tidefield.model.renderer import Renderer
-    from tidefield.train.weights import read_weights, sha256
+    from tidefield.train.checkpoint import read_weights, weights_sha256
 
-    network = Network(config.network).to(device)
+    network = make_network(config.network).to(device)
     read_weights(weights, network)
     network.eval()
-    return Renderer(network, scene, config, device), sha256(weights)
+    return Renderer(network, scene, config, device), weights_sha256(weights)
 
 
 @contextmanager

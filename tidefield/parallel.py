@@ -1,18 +1,23 @@
-"""Many independent pieces of tensor work on the cores of one machine."""
+"""Independent pieces of tensor work on the cores of one machine, forward and backward."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 T = TypeVar("T")
+Part = Callable[[], tuple[Tensor, ...]]
 
 
 def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> list[T]:
-    """Results of tasks in their order, worked on side by side where the device is a CPU.
+    """Results of tasks in their order, computed in parallel where the device is a CPU.
 
     Each task gets one core for all of its operations. Sharing every small operation among the cores instead costs
     a hand-over per operation, several times the work itself on a busy machine; and this way the results cannot
@@ -27,3 +32,55 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
             return list(pool.map(lambda task: task(), tasks))
     finally:
         torch.set_num_threads(cores)
+
+
+def differentiable_parts(
+    parts: Sequence[Part], parameters: Sequence[Tensor], device: torch.device
+) -> tuple[Float[Tensor, "T *_"], ...]:
+    """What the parts return, concatenated along the first dimension; differentiable in the parameters.
+
+    Args:
+        parts: each returns as many tensors, of its own share of the first dimension.
+        parameters: all that the parts use and that are trained.
+        device: where they are.
+    """
+    return _DifferentiableParts.apply(parts, device, *parameters)  # type: ignore[no-any-return]
+
+
+class _DifferentiableParts(torch.autograd.Function):
+    """`backward` alone would walk through all parts on the one thread that calls it."""
+
+    @staticmethod
+    def forward(ctx: Any, parts: Sequence[Part], device: torch.device, *parameters: Tensor) -> tuple[Tensor, ...]:
+        ctx.outputs = in_parallel([partial(_with_grad, part) for part in parts], device)
+        ctx.parameters, ctx.device = parameters, device
+        return tuple(torch.cat([part.detach() for part in values]) for values in zip(*ctx.outputs, strict=True))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        sizes = [len(values[0]) for values in ctx.outputs]
+        shares = zip(*(gradient.split(sizes) for gradient in gradients), strict=True)
+        tasks = [partial(_gradients, *each, ctx.parameters) for each in zip(ctx.outputs, shares, strict=True)]
+        found = in_parallel(tasks, ctx.device)
+        ctx.outputs = None
+        return None, None, *(_sum(values) for values in zip(*found, strict=True))
+
+
+def _with_grad(part: Part) -> tuple[Tensor, ...]:
+    with torch.enable_grad():
+        return part()
+
+
+def _gradients(
+    outputs: tuple[Tensor, ...], gradients: tuple[Tensor, ...], parameters: tuple[Tensor, ...]
+) -> tuple[Tensor | None, ...]:
+    pairs = [(value, gradient) for value, gradient in zip(outputs, gradients, strict=True) if value.requires_grad]
+    values, own = zip(*pairs, strict=True)
+    return torch.autograd.grad(values, parameters, own, allow_unused=True)
+
+
+def _sum(values: Sequence[Tensor | None]) -> Tensor | None:
+    """Always in the same order, so that a training can be repeated."""
+    known = [value for value in values if value is not None]
+    return torch.stack(known).sum(0) if known else None

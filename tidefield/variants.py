@@ -1,6 +1,6 @@
-"""Variants of a preset, each with one thing changed: what the ablation compares.
+"""Variants of a preset, each with one part changed or left out, for the ablation.
 
-Plain values and no heavy imports, like the configurations that they are made of.
+Plain values and no heavy imports, like the configurations.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from tidefield.config import Config, FieldConfig, Part
+from tidefield.config import AnyConfig, Config, NerfConfig, Part
 from tidefield.errors import RunError
 
 VIEWS = (2, 3, 4, 5, 6, 8, 10, 12)
 DEGREES = (0, 1, 2, 3, 4)
 SAMPLES = {"half": 0.5, "double": 2.0}
-"""Shares of the preset's samples along the ray, in all its stages."""
+"""Shares of the preset's samples along the ray, in all passes."""
 
 
-def vary(config: Config, name: str) -> Config:
+def vary(config: Config, name: str) -> AnyConfig:
     """The variant of that name.
 
     Raises:
@@ -39,18 +39,17 @@ def _without(config: Config, part: Part) -> Config:
 
 
 def _samples(config: Config, share: float) -> Config:
-    stages = (replace(stage, samples=max(2, round(share * stage.samples))) for stage in config.network.stages)
-    return _network(config, stages=tuple(stages))
+    passes = (replace(one, samples=max(2, round(share * one.samples))) for one in config.network.passes)
+    return _network(config, passes=tuple(passes))
 
 
-VARIANTS: dict[str, Callable[[Config], Config]] = {
-    "no-neighbours": partial(_network, views=0, field=FieldConfig()),
+VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
+    "no-neighbours": lambda _: NerfConfig(),
     "no-direction-weights": partial(_without, part="direction weights"),
     "no-ray-transformer": partial(_without, part="ray transformer"),
     "no-target-colour": partial(_without, part="target colour"),
-    "field": partial(_network, field=FieldConfig()),
     **{f"degree-{degree}": partial(_network, harmonics_degree=degree) for degree in DEGREES},
     **{f"views-{views}": partial(_network, views=views) for views in VIEWS},
     **{f"samples-{name}": partial(_samples, share=share) for name, share in SAMPLES.items()},
 }
-"""Without neighbours the per-scene field is all that there is; the paper's eq. 6 are the direction weights."""
+"""Without neighbouring views what is left is classical NeRF. The direction weights are the paper's eq. 6."""

@@ -8,10 +8,9 @@ import textured_wall as wall
 import torch
 
 from tidefield.baselines.nerf import Mlp, Nerf, NerfTrainer, Rays, draw_pixels, encode
-from tidefield.config import NerfConfig
+from tidefield.config import Budget, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.train.loop import Budget
 
 CPU = torch.device("cpu")
 SMALL = NerfConfig(coarse=8, fine=8, depth=4, width=32, position_octaves=6, rays=128, learning_rate=5e-3)

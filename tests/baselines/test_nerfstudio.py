@@ -14,11 +14,11 @@ from rich.console import Console
 
 from tidefield.baselines.nerfstudio import driver, environment
 from tidefield.baselines.nerfstudio.export import export
+from tidefield.config import Budget
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import make_curve
-from tidefield.train.loop import Budget
 
 CPU = torch.device("cpu")
 FAKE = """

@@ -14,6 +14,7 @@ import pytest
 import textured_wall as wall
 import torch
 from scenes_on_disk import PINHOLE, survey, write_colmap
+from tidefield.train.weights import write_weights
 from torch import nn
 
 from benchmarks import frames, memory, speed, stages, table
@@ -30,7 +31,6 @@ from tidefield.model.network import Network
 from tidefield.model.rendering import Rendering
 from tidefield.model.views import Views
 from tidefield.train.loop import SceneTrainer
-from tidefield.train.weights import write_weights
 
 CPU = torch.device("cpu")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tidefield.train.weights import sha256, write_weights
 
 from benchmarks import bars, card, table
 from benchmarks.begun import by_length, length_tables
@@ -19,7 +20,6 @@ from tidefield.evaluation.evaluate import NAMES
 from tidefield.evaluation.metrics import SUFFIXES
 from tidefield.files import read_json, write_json
 from tidefield.model.network import Network
-from tidefield.train.weights import sha256, write_weights
 
 
 def keep_result(

@@ -18,7 +18,7 @@ from PIL import Image
 
 from tidefield import cli, synthetic
 from tidefield import progress as meter
-from tidefield.commands import demonstration
+from tidefield.commands import demo
 from tidefield.synthetic import make_survey, write_survey
 
 
@@ -84,11 +84,11 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
 
 
 def test_resume_goes_on_from_the_last_step(scene: Path, run: Path) -> None:
-    from tidefield.model.network import Network
+    from tidefield.model.network import make_network
     from tidefield.train.checkpoint import load_network, read_run
 
     call("train", scene, run, "--steps", 5, "--resume", "-q")
-    assert load_network(run, Network(read_run(run).config.network)).step == 5
+    assert load_network(run, make_network(read_run(run).config.network)).step == 5
 
 
 def test_a_run_is_not_overwritten_unasked(scene: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,7 +110,7 @@ def test_an_imported_scene_is_told_of_and_can_be_used(
 ) -> None:
     call("import", scene, tmp_path / "own", "--link")
     assert re.search(
-        r"own: 9 photographs, 2 of them held out; 1 camera; [\d,]+ sparse points, seen [\d,]+ times",
+        r"own: 9 photographs, 2 of them held out; 1 camera; [\d,]+ sparse points, observed [\d,]+ times",
         capsys.readouterr().out,
     )
     assert (tmp_path / "own" / "transforms.json").is_file()
@@ -148,10 +148,10 @@ def test_the_demonstration_makes_all_that_it_names(
         return make_survey(category, seed, views, width=width // 10, supersample=1)
 
     monkeypatch.setattr(synthetic, "make_survey", smaller)
-    monkeypatch.setattr(demonstration, "FRAMES", 4)
+    monkeypatch.setattr(demo, "FRAMES", 4)
     out = tmp_path / "demo"
     call("demo", out, "--minutes", 0.01, "--device", "cpu")
-    named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("What was made:")[1].strip().splitlines()]
+    named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("Written:")[1].strip().splitlines()]
     names = ["scene", "run/evaluation.json", "side-by-side.png", "run/pictures", "fly-through.mp4"]
     assert named == [out / name for name in names]
     assert all(path.exists() for path in named)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from comparisons import Children, evaluation, quiet
 from scenes_on_disk import PINHOLE, survey, write_colmap
+from tidefield.options import Ablate
 
 from tidefield.compare.ablation import ablation_tables, variants, verdicts
 from tidefield.compare.results import Result, Results, read_results
@@ -16,7 +17,6 @@ from tidefield.config import PAPER, SWIFT, EncoderConfig, config_from_json, conf
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.model.network import Network
-from tidefield.options import Ablate
 from tidefield.variants import VARIANTS, vary
 
 SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, preset="paper")

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_wall as wall
+import tidefield.commands.peers
 from comparisons import SETTINGS, Children, quiet
 from PIL import Image
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
+from tidefield.options import Compare
 
-import tidefield.commands.peers
 from tidefield import cli
 from tidefield.compare import published
 from tidefield.compare.figures import most_different, side_by_side, write_curves
@@ -28,7 +29,6 @@ from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
 from tidefield.files import write_json
-from tidefield.options import Compare
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ import torch
 from networks import SMALL
 from rich.console import Console
 
+from tidefield.config import Budget
 from tidefield.evaluation.curves import SHARES, SMALLER, make_curve
 from tidefield.model.rendering import Rendering
-from tidefield.train.display import Display
-from tidefield.train.loop import Budget, SceneTrainer, train
+from tidefield.train.loop import SceneTrainer, train
 
 
 def test_small_views_are_judged_by_their_mean_error():
@@ -35,7 +35,7 @@ def test_small_views_are_judged_by_their_mean_error():
 def test_a_training_leaves_a_point_for_each_share_of_its_budget(tmp_path: Path):
     scene = wall.scene(wall.cameras(6), (1, 3))
     trainer, budget, curve = SceneTrainer(SMALL, scene, 0, torch.device("cpu")), Budget(steps=32), make_curve(scene)
-    train(trainer, tmp_path, budget, Display(Console(quiet=True)), curve.watch(tmp_path, 0.0))
+    train(trainer, tmp_path, budget, Console(quiet=True), curve.watch(tmp_path, 0.0))
     points = json.loads((tmp_path / "curve.json").read_text())
     assert len(points) == len(SHARES)
     assert [seconds for seconds, _ in points] == sorted(seconds for seconds, _ in points)

@@ -7,6 +7,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.model.aggregate import Aggregate, direction_weights, weighted_moments
+from tidefield.model.swift import ComparingAggregate, degrees_of_freedom, mean_colours
+from tidefield.model.views import Gathered
 
 T, N, P, C, H = 2, 4, 20, 5, 6
 
@@ -111,31 +113,31 @@ def box(folded: bool = False) -> Aggregate:
     return randomise(Aggregate(H if folded else C, H, folded).double())
 
 
-def inputs(channels: int = C) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return draw(T, N, P, channels), torch.sigmoid(draw(T, N, P, 3, seed=3)), cosines(), some_valid()
+def inputs(channels: int = C) -> tuple[Tensor, Tensor, Tensor]:
+    return draw(T, N, P, channels), cosines(), some_valid()
 
 
 def test_a_view_counts_as_much_as_it_is_there():
-    features, colours, cosine, valid = inputs()
-    presence = torch.ones(T, N, P).double()
+    features, cosine, valid = inputs()
+    blend_weight = torch.ones(T, N, P).double()
     own = box()
-    same = own(features, colours, cosine, valid, presence)
-    for name, value in vars(own(features, colours, cosine, valid)).items():
+    same = own(features, cosine, valid, blend_weight)
+    for name, value in vars(own(features, cosine, valid)).items():
         torch.testing.assert_close(getattr(same, name), value)
-    presence[:, 1] = 0
+    blend_weight[:, 1] = 0
     without = valid.clone()
     without[:, 1] = False
-    weight = direction_weights(cosine, valid, own.log_sharpness.exp(), presence)
+    weight = direction_weights(cosine, valid, own.log_sharpness.exp(), blend_weight)
     assert not weight[:, 1].any()
     torch.testing.assert_close(weight.sum(1), without.any(1).double())
-    assert not own(features, colours, cosine, valid, presence).view_weight[:, 1].any()
+    assert not own(features, cosine, valid, blend_weight).view_weight[:, 1].any()
 
 
 def test_the_box_is_figure_2_sample_by_sample():
     """[F_i, mu, v] through one layer after the other, for one sample and view at a time."""
     own = box()
-    features, colours, cosine, valid = inputs()
-    evidence = own(features, colours, cosine, valid)
+    features, cosine, valid = inputs()
+    evidence = own(features, cosine, valid)
     weight = direction_weights(cosine, valid, own.log_sharpness.exp())
     assert isinstance(own.own, torch.nn.Linear)
     first = torch.cat([own.own.weight, own.shared.weight], 1)
@@ -149,7 +151,7 @@ def test_the_box_is_figure_2_sample_by_sample():
             hidden = F.relu(first @ triple + own.own.bias + own.shared.bias)
             hidden = F.relu(own.second(hidden))
             torch.testing.assert_close(evidence.per_view[t, i, p], hidden)
-            trust = torch.sigmoid(own.trust(hidden))[0]
+            trust = torch.sigmoid(own.view_weight(hidden))[0]
             torch.testing.assert_close(evidence.view_weight[t, i, p], trust)
             pooled.append((trust, hidden))
         total = sum(trust for trust, _ in pooled)
@@ -162,55 +164,67 @@ def test_the_box_is_figure_2_sample_by_sample():
 @pytest.mark.parametrize("folded", [False, True])
 def test_what_invalid_views_hold_changes_nothing(folded: bool):
     own = box(folded)
-    features, colours, cosine, valid = inputs(H if folded else C)
-    before = own(features, colours, cosine, valid)
+    features, cosine, valid = inputs(H if folded else C)
+    before = own(features, cosine, valid)
     hidden = ~valid
-    changed = [t.masked_fill(hidden.reshape(hidden.shape + (1,) * (t.dim() - 3)), 0.77) for t in (features, colours)]
-    after = own(*changed, cosine.masked_fill(hidden, -1.0), valid)
-    for name in ("density", "view_weight", "mean_colour", "disagreement", "count", "valid"):
+    after = own(features.masked_fill(hidden[..., None], 0.77), cosine.masked_fill(hidden, -1.0), valid)
+    for name in ("density", "view_weight", "direction_weight", "variance", "valid"):
         torch.testing.assert_close(getattr(before, name), getattr(after, name))
 
 
 def test_the_order_of_the_views_does_not_matter():
     own, order = box(), torch.tensor([2, 0, 3, 1])
     before, after = own(*inputs()), own(*(t[:, order] for t in inputs()))
-    for name in ("density", "mean_colour", "disagreement", "count", "valid"):
+    for name in ("density", "variance", "valid"):
         torch.testing.assert_close(getattr(before, name), getattr(after, name))
     torch.testing.assert_close(before.per_view[:, order], after.per_view)
     torch.testing.assert_close(before.view_weight[:, order], after.view_weight)
 
 
+def comparing() -> ComparingAggregate:
+    return randomise(ComparingAggregate(C, H, folded=False, uniform_weights=False).double())
+
+
+def gathered(valid: Tensor) -> Gathered:
+    """What the views show at the samples; of it, the tests need the colours."""
+    colours = torch.sigmoid(draw(T, N, P, 3, seed=3))
+    return Gathered(colours, draw(T, N, P, C), draw(T, N, P, 3), cosines(), valid, torch.ones(T, N, P).double())
+
+
 def test_where_no_view_sees_the_colour_is_grey_and_nothing_is_known():
-    evidence = box()(*inputs())
-    valid = some_valid()
+    evidence, valid = comparing()(*inputs()), some_valid()
     assert torch.equal(evidence.valid, valid.any(1))
-    assert (evidence.mean_colour[:, 2] == 0.5).all()
+    assert (mean_colours(evidence, gathered(valid))[:, 2] == 0.5).all()
     assert (evidence.view_weight[~valid] == 0).all()
     assert (evidence.view_weight[valid] > 0).all()
     assert evidence.density.isfinite().all()
+    assert (degrees_of_freedom(evidence)[:, 1:3] == 0).all(), "one view or none says nothing"
 
 
 def test_views_that_agree_have_no_disagreement_and_others_have():
-    features, colours, cosine, valid = inputs()
+    features, cosine, valid = inputs()
+    own = comparing()
     same = features[:, :1].expand_as(features)
-    assert box()(same, colours, cosine, valid).disagreement.abs().max() < 1e-12
-    assert (box()(features, colours, cosine, valid).disagreement[:, 0] > 0).all()
+    assert own.disagreement(own(same, cosine, valid)).abs().max() < 1e-12
+    assert (own.disagreement(own(features, cosine, valid))[:, 0] > 0).all()
 
 
 def test_gradients_of_the_box_are_finite_where_nothing_sees():
-    own = box()
+    own = comparing()
     evidence = own(*inputs())
-    (evidence.density.sum() + evidence.mean_colour.sum() + evidence.disagreement.sum()).backward()
+    colours = mean_colours(evidence, gathered(some_valid()))
+    (evidence.density.sum() + colours.sum() + own.disagreement(evidence).sum()).backward()
     for name, parameter in own.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
 
 
-def test_views_that_count_alike_are_averaged_whatever_their_directions():
-    own = randomise(Aggregate(C, H, folded=False, alike=True).double())
-    features, colours, cosine, valid = inputs()
-    evidence = own(features, colours, cosine, valid)
-    torch.testing.assert_close(evidence.count, valid.sum(1).double())
+def test_uniform_weights_average_the_views_whatever_their_directions():
+    own = randomise(Aggregate(C, H, uniform_weights=True).double())
+    features, cosine, valid = inputs()
+    evidence = own(features, cosine, valid)
+    torch.testing.assert_close(degrees_of_freedom(evidence), (valid.sum(1).double() - 1).clamp(min=0))
+    seen, mean = gathered(valid), mean_colours(evidence, gathered(valid))
     for t, p in [(0, 0), (1, 4), (1, 5)]:
-        expected = colours[t, valid[t, :, p], p].mean(0) + 0.5 * (not valid[t, :, p].any())
-        torch.testing.assert_close(evidence.mean_colour[t, p], expected)
+        expected = seen.colours[t, valid[t, :, p], p].mean(0) + 0.5 * (not valid[t, :, p].any())
+        torch.testing.assert_close(mean[t, p], expected)

@@ -6,9 +6,9 @@ import torch
 
 from tidefield.config import SWIFT
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
-from tidefield.model import cache as shelf
+from tidefield.model import cache as feature_cache
 from tidefield.model.cache import CacheFull, FeatureCache
-from tidefield.model.network import Network
+from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
 
 CPU = torch.device("cpu")
@@ -17,14 +17,14 @@ TARGET = 3
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shelf, "BLOCK_PX", 64)
-    monkeypatch.setattr(shelf, "OVERLAP_PX", 32)
+    monkeypatch.setattr(feature_cache, "BLOCK_PX", 64)
+    monkeypatch.setattr(feature_cache, "OVERLAP_PX", 32)
 
 
 @pytest.fixture(scope="module")
 def network() -> Network:
     torch.manual_seed(0)
-    return Network(SWIFT.network).eval()
+    return make_network(SWIFT.network).eval()
 
 
 def scene():
@@ -43,9 +43,7 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
-    found = views.read(
-        1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5), detail=True
-    )
+    found = views.read(1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5))
     assert found.valid.all()
     assert len(views.which.unique()) == 4
     column, row = around.reshape(-1, 2).long().unbind(-1)
@@ -55,12 +53,11 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_what_was_forgotten_is_encoded_again_alike(network: Network):
+def test_evicted_blocks_are_encoded_again_alike(network: Network):
     at = scene()
     roomy, cramped = (Renderer(network, at, SWIFT, CPU) for _ in range(2))
-    cramped.shelf = FeatureCache(network, at, CPU, budget_bytes=1)
-    assert roomy.shelf is not None
-    assert cramped.shelf.slots == SWIFT.network.views + EXTRA_VIEWS < roomy.shelf.slots
+    cramped.cache = FeatureCache(network, at, CPU, budget_bytes=1)
+    assert cramped.cache.slots == SWIFT.network.views + EXTRA_VIEWS < roomy.cache.slots
     one, other = (renderer(at.cameras[TARGET]) for renderer in (roomy, cramped))
     torch.testing.assert_close(one.colour, other.colour, atol=1e-4, rtol=0)
 

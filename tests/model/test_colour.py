@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.model.aggregate import Evidence
-from tidefield.model.colour import ColourBlend
+from tidefield.model.colour import AngularColourBlend, ColourBlend
 from tidefield.model.views import Gathered
 
 T, N, P, H = 2, 3, 6, 8
@@ -30,14 +31,33 @@ def scene() -> tuple[Evidence, Gathered, Tensor]:
     direction = unit(generator, T, P)
     theirs = F.normalize(direction[:, None] + 0.3 * unit(generator, T, N, P), dim=-1)
     cosine = (theirs * direction[:, None]).sum(-1)
-    agreement = draw(T, P), valid.sum(1).double()
-    evidence = Evidence(draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, draw(T, P, 3), *agreement, valid.any(1))
+    weight = valid / valid.sum(1, keepdim=True).clamp(min=1)
+    evidence = Evidence(
+        draw(T, P, H), draw(T, N, P, H), draw(T, N, P) * valid, weight.double(), draw(T, P, 4), valid.any(1)
+    )
     there = torch.ones(T, N, P).double()
     return evidence, Gathered(draw(T, N, P, 3), draw(T, N, P, 4), theirs, cosine, valid, there), direction
 
 
-def blend(degree: int = 3) -> ColourBlend:
-    return randomise(ColourBlend(H, degree).double())
+MEAN = torch.rand(T, P, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+BLENDS = [ColourBlend, AngularColourBlend]
+
+
+def colour_of(
+    own: ColourBlend, evidence: Evidence, gathered: Gathered, direction: Tensor, mean: Tensor = MEAN
+) -> Tensor:
+    """The colours of either kind of blend."""
+    further = (mean,) if isinstance(own, AngularColourBlend) else ()
+    return own(evidence, gathered, direction, *further)
+
+
+def target_of(own: ColourBlend, evidence: Evidence, direction: Tensor, mean: Tensor = MEAN) -> Tensor:
+    """The target candidate's colour."""
+    return own.target_colour(evidence, direction, mean if isinstance(own, AngularColourBlend) else 0.5)[1]
+
+
+def blend(degree: int = 3, kind: type[ColourBlend] = AngularColourBlend) -> ColourBlend:
+    return randomise(kind(H, degree).double())
 
 
 def shares(own: ColourBlend, evidence: Evidence, gathered: Gathered, direction: Tensor) -> Tensor:
@@ -46,22 +66,22 @@ def shares(own: ColourBlend, evidence: Evidence, gathered: Gathered, direction: 
     The target candidate is the same either way, so the difference to all black is that view's alone.
     """
     black = replace(gathered, colours=torch.zeros_like(gathered.colours))
-    nothing = own(evidence, black, direction)
+    nothing = colour_of(own, evidence, black, direction)
     result = []
     for i in range(gathered.valid.shape[1]):
         painted = black.colours.clone()
         painted[:, i] = 1
-        result.append((own(evidence, replace(black, colours=painted), direction) - nothing)[..., 0])
+        result.append((colour_of(own, evidence, replace(black, colours=painted), direction) - nothing)[..., 0])
     return torch.stack(result, 1)
 
 
 def test_the_colour_is_the_weighted_sum_of_the_candidates():
     own, (evidence, gathered, direction) = blend(), scene()
-    target = own(evidence, None, direction)
+    target = target_of(own, evidence, direction)
     share = shares(own, evidence, gathered, direction)
     rest = 1 - share.sum(1)
     expected = (share[..., None] * gathered.colours).sum(1) + rest[..., None] * target
-    torch.testing.assert_close(own(evidence, gathered, direction), expected)
+    torch.testing.assert_close(colour_of(own, evidence, gathered, direction), expected)
 
 
 def test_the_colour_is_a_convex_combination_and_every_candidate_takes_part():
@@ -69,9 +89,9 @@ def test_the_colour_is_a_convex_combination_and_every_candidate_takes_part():
     share = shares(own, evidence, gathered, direction)
     assert (share[gathered.valid] > 0).all()
     assert (share.sum(1) < 1).all(), "the target candidate has no share"
-    candidates = torch.cat([gathered.colours, own(evidence, None, direction)[:, None]], 1)
+    candidates = torch.cat([gathered.colours, target_of(own, evidence, direction)[:, None]], 1)
     visible = torch.cat([gathered.valid, torch.ones(T, 1, P, dtype=torch.bool)], 1)[..., None]
-    colour = own(evidence, gathered, direction)
+    colour = colour_of(own, evidence, gathered, direction)
     assert (colour <= candidates.masked_fill(~visible, -torch.inf).amax(1) + 1e-12).all()
     assert (colour >= candidates.masked_fill(~visible, torch.inf).amin(1) - 1e-12).all()
 
@@ -100,27 +120,54 @@ def test_two_views_in_the_same_place_that_say_the_same_have_the_same_share():
 
 def test_invalid_views_have_no_share():
     own, (evidence, gathered, direction) = blend(), scene()
-    before = own(evidence, gathered, direction)
+    before = colour_of(own, evidence, gathered, direction)
     other = gathered.colours.masked_fill(~gathered.valid[..., None], 1e3)
-    torch.testing.assert_close(own(evidence, replace(gathered, colours=other), direction), before)
+    torch.testing.assert_close(colour_of(own, evidence, replace(gathered, colours=other), direction), before)
 
 
 def test_a_sample_that_no_view_sees_takes_the_targets_colour():
     own, (evidence, gathered, direction) = blend(), scene()
     unseen = ~gathered.valid.any(1)
     assert unseen.any()
-    target = own(evidence, None, direction)
-    torch.testing.assert_close(own(evidence, gathered, direction)[unseen], target[unseen])
+    target = target_of(own, evidence, direction)
+    torch.testing.assert_close(colour_of(own, evidence, gathered, direction)[unseen], target[unseen])
 
 
-def test_without_neighbours_the_colour_is_the_expansion_around_the_mean():
+def test_the_target_is_an_expansion_around_grey_or_around_the_neighbours_mean():
     evidence, _, direction = scene()
     turned = direction.flip(-1)
-    constant, varied = blend(0), blend(3)
-    torch.testing.assert_close(constant(evidence, None, direction), constant(evidence, None, turned))
-    assert (varied(evidence, None, direction) - varied(evidence, None, turned)).abs().min() > 1e-6
-    lighter = replace(evidence, mean_colour=evidence.mean_colour + 0.25)
-    torch.testing.assert_close(varied(lighter, None, direction), varied(evidence, None, direction) + 0.25)
+    constant, varied, printed = blend(0), blend(3), blend(3, ColourBlend)
+    torch.testing.assert_close(target_of(constant, evidence, direction), target_of(constant, evidence, turned))
+    assert (target_of(varied, evidence, direction) - target_of(varied, evidence, turned)).abs().min() > 1e-6
+    lighter = target_of(varied, evidence, direction, MEAN + 0.25)
+    torch.testing.assert_close(lighter, target_of(varied, evidence, direction) + 0.25)
+    for parameter in printed.target.parameters():
+        torch.nn.init.zeros_(parameter)
+    torch.testing.assert_close(target_of(printed, evidence, direction), torch.full((T, P, 3), 0.5).double())
+
+
+def test_the_printed_blend_is_eq_7_of_the_inputs_that_the_paper_names():
+    """[F_N,i, d - d_i, d.d_i, w_n,i] through two layers, for one sample and view at a time."""
+    own, (evidence, gathered, direction) = blend(3, ColourBlend), scene()
+    colour = own(evidence, gathered, direction)
+    target, logit = target_of(own, evidence, direction), own.target(evidence.density)[..., 0]
+    for t, p in [(0, 0), (0, 1), (1, 0), (1, 2), (1, 4)]:
+        total, mixed = torch.exp(logit[t, p]), torch.exp(logit[t, p]) * target[t, p]
+        for i in range(N):
+            if gathered.valid[t, i, p]:
+                offset = 5 * (direction[t, p] - gathered.directions[t, i, p])
+                numbers = torch.stack([*offset, -20 * (1 - gathered.cosine[t, i, p]), evidence.view_weight[t, i, p]])
+                hidden = F.relu(own.view(evidence.per_view[t, i, p]) + own.direction.weight @ numbers)
+                share = torch.exp(own.logit(hidden)[0])
+                total, mixed = total + share, mixed + share * gathered.colours[t, i, p]
+        torch.testing.assert_close(colour[t, p], mixed / total)
+
+
+def test_the_target_starts_with_a_share_of_two_per_cent():
+    own, (evidence, gathered, direction) = AngularColourBlend(H, 3).double(), scene()
+    seen = gathered.valid.any(1)
+    rest = 1 - shares(own, evidence, gathered, direction).sum(1)[seen]
+    torch.testing.assert_close(rest, torch.full_like(rest, 1 / (1 + math.exp(4))))
 
 
 def test_the_order_of_the_views_does_not_matter():
@@ -128,7 +175,9 @@ def test_the_order_of_the_views_does_not_matter():
     order = torch.tensor([2, 0, 1])
     permuted = replace(evidence, per_view=evidence.per_view[:, order], view_weight=evidence.view_weight[:, order])
     views = Gathered(**{k: v[:, order] for k, v in vars(gathered).items()})
-    torch.testing.assert_close(own(permuted, views, direction), own(evidence, gathered, direction))
+    torch.testing.assert_close(
+        colour_of(own, permuted, views, direction), colour_of(own, evidence, gathered, direction)
+    )
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -138,7 +187,7 @@ def test_gradients_are_right_whether_or_not_a_view_sees_the_sample(seen: bool):
 
     def colour(density: Tensor, per_view: Tensor, trust: Tensor, colours: Tensor) -> Tensor:
         changed = replace(evidence, density=density, per_view=per_view, view_weight=trust)
-        return own(changed, replace(gathered, colours=colours), direction)
+        return colour_of(own, changed, replace(gathered, colours=colours), direction)
 
     inputs = (evidence.density, evidence.per_view, evidence.view_weight, gathered.colours)
     assert torch.autograd.gradcheck(colour, tuple(t.requires_grad_() for t in inputs))
@@ -148,13 +197,13 @@ def test_views_straight_behind_the_target_stay_finite():
     own, (evidence, gathered, direction) = blend(), scene()
     same = direction[:, None].expand_as(gathered.directions)
     straight = replace(gathered, directions=same, cosine=torch.full_like(gathered.cosine, 1 + 1e-7))
-    assert own(evidence, straight, direction).isfinite().all()
+    assert colour_of(own, evidence, straight, direction).isfinite().all()
 
 
-def test_alone_the_neighbours_share_everything_that_one_of_them_sees():
-    own, (evidence, gathered, direction) = randomise(ColourBlend(H, 3, alone=True).double()), scene()
+def test_neighbours_only_the_neighbours_share_everything_that_one_of_them_sees():
+    own, (evidence, gathered, direction) = randomise(AngularColourBlend(H, 3, neighbours_only=True).double()), scene()
     share, seen = shares(own, evidence, gathered, direction).sum(1), gathered.valid.any(1)
     torch.testing.assert_close(share[seen], torch.ones_like(share[seen]))
     assert (share[~seen] == 0).all()
-    own(evidence, gathered, direction).sum().backward()
+    colour_of(own, evidence, gathered, direction).sum().backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in own.parameters())

@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.model.compositing import composite, surface_logits, surface_shares, weights
+from tidefield.model.compositing import composite, weights
+from tidefield.model.swift import surface_logits, surface_shares
 
 
 def random_ray(rays: int = 20, samples: int = 9, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ import pytest
 import torch
 from random_weights import randomise
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from tidefield.config import PAPER, PRESETS, SWIFT, EncoderConfig
 from tidefield.model.encoder import Encoder
@@ -14,7 +15,7 @@ ALL = ((4, 5), (2, 4), (1, 3))
 
 def paper() -> Encoder:
     """Without memory: shapes only."""
-    stage = PAPER.network.stages[0]
+    stage = PAPER.network.passes[0]
     with torch.device("meta"):
         return Encoder(PAPER.network.encoder, ((stage.feature_stride, stage.feature_channels),))
 
@@ -133,3 +134,12 @@ def test_finer_outputs_hold_finer_detail():
             for m, (s, _) in zip(encoder(stripes), ALL, strict=True)
         ]
     assert all(coarse < 0.1 * fine for coarse, fine in pairwise(rough[1:]))
+
+
+def test_the_basic_block_is_resnets_layer_by_layer():
+    """conv, norm, ReLU, conv, norm, plus the shortcut, then ReLU (He et al., 2016, Figure 2)."""
+    block = Encoder(EncoderConfig((4, 4, 6, 8), (1, 1, 1), True), ((4, 5),)).stages[0][0]
+    x = torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(0))
+    hidden = F.relu(block.first[1](block.first[0](x)))
+    expected = F.relu(block.second[1](block.second[0](hidden)) + block.shortcut(x))
+    torch.testing.assert_close(block(x), expected)

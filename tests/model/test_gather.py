@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.baselines.photograph import read_photograph
-from tidefield.model.fill import fill_unseen
-from tidefield.model.gather import doubled, gather, joined, maps_from_images, weighted_rows
+from tidefield.model.rendering import fill_unseen
+from tidefield.model.views import concatenate, gather, maps_from_images, upsample_twice, weighted_rows
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -98,7 +98,7 @@ def test_maps_of_several_sizes_are_read_as_one_set(stride: int):
     groups = [images(2, 7, 9, seed=1), images(1, 4, 3, seed=2), images(1, 1, 5, seed=3)]
     corner = corners(4)
     parts = [maps_from_images(g, c, stride) for g, c in zip(groups, corner.split([2, 1, 1]), strict=True)]
-    maps = joined(parts)
+    maps = concatenate(parts)
     every = [image for g in groups for image in g]
     which = torch.tensor([[3, 0], [1, 2], [2, 2]])
     uv = torch.stack([spots(every[k][None], corner[k][None], stride)[0] for k in which.reshape(-1)])
@@ -157,7 +157,7 @@ def test_doubling_keeps_the_pixels_and_is_exact_on_quadratics_between_them():
     def picture(u: Tensor, v: Tensor) -> Tensor:
         return torch.stack([0.3 * u * u - u * v, 2 * v * v - u + 1, u * v])
 
-    twice = doubled(picture(u, v)[None])
+    twice = upsample_twice(picture(u, v)[None])
     assert twice.shape == (1, 3, 24, 28)
     torch.testing.assert_close(twice[0, :, ::2, ::2], picture(u, v))
     y, x = torch.meshgrid(0.5 + torch.arange(24.0).double() / 2, 0.5 + torch.arange(28.0).double() / 2, indexing="ij")
@@ -166,7 +166,7 @@ def test_doubling_keeps_the_pixels_and_is_exact_on_quadratics_between_them():
 
 def test_a_doubled_picture_is_read_at_its_pixels_and_up_to_its_border():
     picture = torch.rand(1, 3, 6, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    maps = maps_from_images(doubled(picture), torch.tensor([[10.0, 20.0]]), 0.5)
+    maps = maps_from_images(upsample_twice(picture), torch.tensor([[10.0, 20.0]]), 0.5)
     corner = torch.tensor([10.0, 20.0]).double()
     uv = corner + torch.tensor([[0.5, 0.5], [7.5, 5.5], [3.5, 2.5], [0, 0], [8, 6]]).double()
     values, inside = gather(maps, torch.tensor([[0]]), uv[None, None])

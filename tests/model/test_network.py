@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import textured_wall as wall
 import torch
-from networks import CPU, FIELD, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
+from networks import CPU, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
 from torch import Tensor, nn
 
 from tidefield.config import PAPER, SWIFT, Config
@@ -13,10 +13,11 @@ from tidefield.data.neighbours import Neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.model.cache import FeatureCache
-from tidefield.model.intervals import Intervals
-from tidefield.model.network import Network, TileRendering, Tiles
+from tidefield.model.network import Network, TileRendering
 from tidefield.model.renderer import Renderer
-from tidefield.model.stage import place_samples
+from tidefield.model.sampling import Intervals, Tiles, place_samples
+
+PASSES = {"swift": "passes", "paper": "aggregate"}
 
 
 def finite_forward_and_backward(own: Network, result: TileRendering) -> set[str]:
@@ -36,15 +37,14 @@ def test_every_kind_of_network_is_finite_forward_and_backward(name: str, opaque:
     result = own(tiles, views, start, opaque, torch.Generator().manual_seed(0))
     assert result.colour.shape == (2, 256, 3)
     assert result.depth.shape == result.opacity.shape == (2, 256)
-    assert len(result.expected) == len(result.glimpses) + 1 == len(own.stages)
+    assert len(result.inverse_depths) == len(result.coarse_colours) + 1 == len(own.grids)
     assert (result.opacity <= 1 + 1e-5).all()
     assert ((result.depth > 3 - 1e-3) & (result.depth < 10 + 1e-2)).all()
-    boxes = ({"encoder"} if own.config.views else set()) | ({"field"} if own.field else set())
-    assert finite_forward_and_backward(own, result) >= boxes | {"stages", "colour"}
+    assert finite_forward_and_backward(own, result) >= {"encoder", "colour", PASSES[name]}
 
 
-@pytest.mark.parametrize("name", ["swift", "paper", "swift and field"])
-def test_rays_that_no_view_sees_are_finite_and_only_a_field_can_stop_them(name: str):
+@pytest.mark.parametrize("name", NETWORKS)
+def test_rays_that_no_view_sees_are_finite_and_empty(name: str):
     own, at = network(NETWORKS[name], stir=0.02), scene()
     pose = at.cameras.T_world_camera.clone()
     pose[TARGET, 0, 3] += 100
@@ -52,11 +52,8 @@ def test_rays_that_no_view_sees_are_finite_and_only_a_field_can_stop_them(name: 
     tiles, views, start = looking(own, at)
     result = own(tiles, views, start, True)
     finite_forward_and_backward(own, result)
-    if own.field:
-        torch.testing.assert_close(result.opacity, torch.ones(2, 256))
-    else:
-        assert not result.opacity.any()
-        assert not result.colour.any()
+    assert not result.opacity.any()
+    assert not result.colour.any()
 
 
 @pytest.mark.parametrize("name", ["swift", "paper"])
@@ -113,7 +110,7 @@ def test_what_one_view_alone_sees_is_not_smeared_over_the_depths_it_might_have()
     own = network(SWIFT.network).eval()
     with torch.inference_mode():
         tiles, _, start = looking(own, at, 16, ((40, 28),))
-        wide = replace(start, near=start.expected * 1.5, far=start.expected / 1.5)
+        wide = replace(start, inv_near=start.inv_expected * 1.5, inv_far=start.inv_expected / 1.5)
         views = FeatureCache(own, at, CPU).views(
             Neighbours(torch.tensor([[0]]), torch.ones(1, 1, 4)), torch.zeros(1, 3)
         )
@@ -130,12 +127,12 @@ def test_a_surface_that_no_view_sees_is_not_sought_where_they_see():
     own = network(SWIFT.network).eval()
     with torch.inference_mode():
         tiles, views, start = looking(own, at, 16, ((40, 16),))
-        deep = replace(start, near=start.expected * 1.2, far=start.expected / 3)
+        deep = replace(start, inv_near=start.inv_expected * 1.2, inv_far=start.inv_expected / 3)
         found = own(tiles, views, deep, True)
-        farther = own(tiles, views, replace(deep, expected=deep.far * 1.2), True)
-    assert found.shown.max() < 0.1
+        farther = own(tiles, views, replace(deep, inv_expected=deep.inv_far * 1.2), True)
+    assert found.visibility.max() < 0.1
     assert (found.depth - wall.DEPTH).abs().max() < 0.1
-    assert farther.shown.reshape(16, 16)[:, :6].min() > 0.9, "there they see"
+    assert farther.visibility.reshape(16, 16)[:, :6].min() > 0.9, "there they see"
 
 
 def test_what_no_neighbour_sees_is_continued_from_beside_it():
@@ -157,10 +154,10 @@ def test_what_no_neighbour_sees_is_continued_from_beside_it():
     beside = view.colour[:, edge - 6 : edge - 1].mean((0, 1))
     assert (view.colour[:, edge + 3 :].mean((0, 1)) - beside).abs().max() < 0.15
     assert (view.depth[:, edge + 3 :] - wall.DEPTH).abs().max() < 0.2
-    assert not Renderer(network(PAPER.network).eval(), at, PAPER, CPU).fills
+    assert not Renderer(network(PAPER.network).eval(), at, PAPER, CPU).fills_unseen
 
 
-@pytest.mark.parametrize("name", ["swift", "field alone"])
+@pytest.mark.parametrize("name", ["swift"])
 def test_tiles_do_not_show(name: str):
     """Four small tiles are the large tile that they cover: margins are rendered, not guessed."""
     own, at = network(NETWORKS[name], stir=0.02).eval(), scene()
@@ -169,23 +166,6 @@ def test_tiles_do_not_show(name: str):
         parts = own(*looking(own, at, 8, ((16, 8), (24, 8), (16, 16), (24, 16))), True).colour.reshape(4, 8, 8, 3)
     upper, lower = torch.cat([parts[0], parts[1]], 1), torch.cat([parts[2], parts[3]], 1)
     torch.testing.assert_close(torch.cat([upper, lower]), whole, atol=1e-4, rtol=0)
-
-
-def test_a_field_alone_says_the_same_of_a_place_whatever_the_interval_it_is_met_in():
-    """Density per unit of length: twice as many samples through an even fog stop the same light."""
-    config = replace(SMALL_PAPER, views=0, field=FIELD)
-    fine = replace(config, stages=(replace(config.stages[0], samples=48),))
-    few, many = network(config), network(fine)
-    many.load_state_dict(few.state_dict())
-    for own in (few, many):
-        nn.init.zeros_(own.stages[0].density.weight)  # type: ignore[arg-type]
-        nn.init.constant_(own.stages[0].density.bias, -2.0)  # type: ignore[arg-type]
-    at = scene()
-    with torch.inference_mode():
-        one, other = few(*looking(few, at), False).opacity, many(*looking(many, at), False).opacity
-    assert 0.05 < one.mean() < 0.999
-    # The first sample lies in the middle of its part: the light before it is not counted.
-    torch.testing.assert_close(one, other, atol=0.05, rtol=0)
 
 
 def test_without_a_generator_rendering_repeats_and_with_one_it_varies_with_the_seed():
@@ -211,12 +191,12 @@ def test_samples_lie_on_their_pixels_rays_at_their_depths_and_their_lengths_add_
     camera = scene().cameras[[0]]
     uv = torch.tensor([[[3.5, 40.0], [60.0, 7.5]]])
     intervals = Intervals(torch.tensor([[1 / 3, 1 / 4]]), torch.tensor([[1 / 9, 1 / 5]]), torch.full((1, 2), torch.nan))
-    place = torch.tensor([0.0, 0.3, 0.8]).expand(1, 2, 3)
-    samples = place_samples(camera, uv, intervals, place)
+    s = torch.tensor([0.0, 0.3, 0.8]).expand(1, 2, 3)
+    samples = place_samples(camera, uv, intervals, s)
     pixels, z = camera.project(samples.points_world[0])
     torch.testing.assert_close(pixels[0], uv[0].repeat_interleave(3, 0), atol=1e-3, rtol=0)
     torch.testing.assert_close(z[0], 1 / samples.inverse_depth.flatten())
-    torch.testing.assert_close(samples.inverse_depth, intervals.inverse_depth(place))
+    torch.testing.assert_close(samples.inverse_depth, intervals.inverse_depth(s))
     offset = samples.points_world[0] - camera.position_world
     torch.testing.assert_close(samples.directions[0], offset / offset.norm(dim=-1, keepdim=True))
     reach = offset.norm(dim=-1).reshape(2, 3)
@@ -247,7 +227,7 @@ def test_the_learned_sharpening_keeps_even_areas():
 
 
 def test_the_papers_network_has_nothing_that_the_paper_does_not_have():
-    ours = ("descriptors", "sharpen", "guide", "match", "metric", "angle")
+    ours = ("descriptors", "sharpen", "prior", "agreement", "metric", "angle")
     assert not [n for n, _ in network(SMALL_PAPER).named_parameters() if any(part in n for part in ours)]
     found = [n for n, _ in network(SWIFT.network).named_parameters()]
     assert all(any(part in n for n in found) for part in ours)
@@ -257,4 +237,43 @@ def test_densities_come_from_each_sample_alone_without_the_ray_transformer():
     own = network(replace(SMALL_PAPER, without=("ray transformer",)), stir=0.05)
     assert not [name for name, _ in own.named_parameters() if "transformer" in name]
     result = own(*looking(own, scene()), opaque=True)
-    assert finite_forward_and_backward(own, result) >= {"encoder", "stages", "colour"}
+    assert finite_forward_and_backward(own, result) >= {"encoder", "aggregate", "density", "colour"}
+
+
+def test_a_view_is_rendered_at_the_gain_of_its_camera():
+    at = scene()
+    own = Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU)
+    camera = at.cameras[TARGET]
+    darker = replace(camera, gain=camera.gain * torch.tensor([[0.5, 0.75, 1.0]]))
+    torch.testing.assert_close(
+        own(darker).colour, own(camera).colour * torch.tensor([0.5, 0.75, 1.0]), atol=1e-5, rtol=0
+    )
+
+
+def test_the_papers_density_is_per_mean_interval_of_the_ray():
+    """An untrained head of a constant density: softplus(b) in every mean interval, whatever the lengths."""
+    own, at = network(SMALL_PAPER), scene()
+    nn.init.zeros_(own.density.weight)  # type: ignore[arg-type]
+    nn.init.constant_(own.density.bias, -1.0)  # type: ignore[arg-type]
+    tiles, views, start = looking(own, at)
+    with torch.inference_mode():
+        opacity = own(tiles, views, start, False).opacity
+    # All samples are seen; from the first sample, half an interval behind the near end, to the far end.
+    uv = tiles.rays_px(1)
+    s = (torch.arange(12) + 0.5) / 12
+    delta = place_samples(tiles.cameras, uv, start, s.expand(2, 256, -1)).delta
+    thickness = torch.nn.functional.softplus(torch.tensor(-1.0)) * delta.sum(-1) / delta.mean(-1)
+    torch.testing.assert_close(opacity, 1 - torch.exp(-thickness), atol=1e-4, rtol=0)
+
+
+def test_coarse_colours_are_the_neighbours_mean_colours_under_the_coarse_weights():
+    own, at = network(SWIFT.network).eval(), scene()
+    with torch.inference_mode():
+        result = own(*looking(own, at), True)
+        tiles = looking(own, at)[0]
+    truth = at.photographs[TARGET].float() / 255
+    uv = tiles.rays_px(*own.grids[0])[0].long()
+    inside = (uv >= 2).all(-1) & (uv < torch.tensor([62, 46])).all(-1)
+    means = torch.stack([truth[v - 2 : v + 2, u - 2 : u + 2].mean((0, 1)) for u, v in uv[inside].tolist()])
+    error = (result.coarse_colours[0][0][inside] - means).mean().abs()
+    assert error < 0.02, "mean colours are not those of the wall"

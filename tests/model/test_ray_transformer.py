@@ -5,7 +5,7 @@ import torch
 from random_weights import randomise
 from torch import Tensor
 
-from tidefield.model.ray_transformer import RayTransformer, attend, attend_to_few, positional_encoding
+from tidefield.model.ray_transformer import RayTransformer, attend, attend_short, positional_encoding
 
 R, M, H = 5, 8, 12
 
@@ -100,7 +100,7 @@ def test_few_samples_attend_to_each_other_as_many_do():
     keys = torch.rand(40, 6, generator=random) < 0.6
     keys |= ~keys.any(-1, keepdim=True)
     whole, few = qkv.clone().requires_grad_(), qkv.clone().requires_grad_()
-    expected, found = attend(whole, keys), attend_to_few(few, keys)
+    expected, found = attend(whole, keys), attend_short(few, keys)
     torch.testing.assert_close(found, expected)
     for result in (expected, found):
         result.square().sum().backward()

@@ -6,15 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from tidefield.config import SWIFT, EncoderConfig
 from tidefield.data.batches import Batch
 from tidefield.evaluation.lpips import prepare_torchvision
-from tidefield.model.network import Network, TileRendering
-from tidefield.train.losses import DEPTH_SCALE, GLIMPSE_WEIGHT, photometric, sparse_depth, structural
+from tidefield.model.network import RayGrid, TileRendering
+from tidefield.train.losses import COARSE_WEIGHT, DEPTH_SCALE, photometric, sparse_depth, structural
 
 SIDE, TILES = 8, 2
-NETWORK = Network(replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False)))
-STRIDE = NETWORK.config.stages[0].stride
+STRIDE = 4
+GRIDS = (RayGrid(STRIDE, 1), RayGrid(1, 0))
 ROWS = SIDE // STRIDE
 
 
@@ -44,9 +43,9 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         colour=uniform(TILES, pixels, 3),
         depth=torch.ones(TILES, pixels),
         opacity=torch.ones(TILES, pixels),
-        shown=torch.ones(TILES, pixels),
-        expected=(0.2 + 0.01 * uniform(TILES, coarse), 0.2 + 0.01 * uniform(TILES, pixels)),
-        glimpses=(uniform(TILES, coarse, 3),),
+        visibility=torch.ones(TILES, pixels),
+        inverse_depths=(0.2 + 0.01 * uniform(TILES, coarse), 0.2 + 0.01 * uniform(TILES, pixels)),
+        coarse_colours=(uniform(TILES, coarse, 3),),
     )
     return rendering, batch
 
@@ -66,19 +65,19 @@ def blocks() -> list[tuple[int, int, list[int]]]:
 
 def test_the_loss_is_eq_5_and_the_coarse_rays_are_held_to_the_means_of_their_pixels():
     rendering, batch = made()
-    loss, error = photometric(rendering, batch, NETWORK, SIDE)
+    loss, error = photometric(rendering, batch, GRIDS, SIDE)
     fine = sum(
         float((rendering.colour[t, r] - batch.colours[t, r]).square().sum()) for t in range(2) for r in range(64)
     )
     assert error.item() == pytest.approx(fine / (TILES * SIDE**2 * 3), rel=1e-5)
     coarse = torch.stack(
         [
-            rendering.glimpses[0][t, ray] - batch.colours[t, pixels].mean(0)
+            rendering.coarse_colours[0][t, ray] - batch.colours[t, pixels].mean(0)
             for t in range(2)
             for ray, _, pixels in blocks()
         ]
     )
-    assert loss.item() == pytest.approx(error.item() + GLIMPSE_WEIGHT * coarse.square().mean().item(), rel=1e-5)
+    assert loss.item() == pytest.approx(error.item() + COARSE_WEIGHT * coarse.square().mean().item(), rel=1e-5)
 
 
 def test_pixels_without_weight_change_nothing():
@@ -86,14 +85,12 @@ def test_pixels_without_weight_change_nothing():
     weight[:, ::3] = 0
     rendering, batch = made(weight=weight)
     elsewhere = torch.where(weight[..., None] > 0, batch.colours, 1 - batch.colours)
-    before, after = (
-        photometric(rendering, replace(batch, colours=c), NETWORK, SIDE) for c in (batch.colours, elsewhere)
-    )
+    before, after = (photometric(rendering, replace(batch, colours=c), GRIDS, SIDE) for c in (batch.colours, elsewhere))
     assert before[0].item() == pytest.approx(after[0].item(), rel=1e-6)
     assert before[1].item() == pytest.approx(after[1].item(), rel=1e-6)
 
 
-def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_stages():
+def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_passes():
     rendering, batch = made()
 
     def penalty(found: Tensor, true: Tensor) -> float:
@@ -102,8 +99,8 @@ def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_stages()
 
     terms = []
     for expected, groups in (
-        (rendering.expected[0], [(ray, pixels) for ray, _, pixels in blocks()]),
-        (rendering.expected[1], [(pixel, [pixel]) for pixel in range(SIDE**2)]),
+        (rendering.inverse_depths[0], [(ray, pixels) for ray, _, pixels in blocks()]),
+        (rendering.inverse_depths[1], [(pixel, [pixel]) for pixel in range(SIDE**2)]),
     ):
         total = share = 0.0
         for t in range(TILES):
@@ -114,16 +111,16 @@ def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_stages()
                     total += penalty(expected[t, ray], mean) * float(weight.sum())
                     share += float(weight.sum())
         terms.append(total / share)
-    assert sparse_depth(rendering, batch, NETWORK, SIDE).item() == pytest.approx(sum(terms) / 2, rel=1e-4)
+    assert sparse_depth(rendering, batch, GRIDS, SIDE).item() == pytest.approx(sum(terms) / 2, rel=1e-4)
 
 
 def test_the_depth_term_is_nothing_without_points_and_at_the_points():
     rendering, batch = made()
     none = replace(batch, inverse_depth=torch.zeros(TILES, 64), depth_weight=torch.zeros(TILES, 64))
-    assert sparse_depth(rendering, none, NETWORK, SIDE).item() == 0
-    flat = replace(rendering, expected=tuple(torch.full_like(e, 0.2) for e in rendering.expected))
+    assert sparse_depth(rendering, none, GRIDS, SIDE).item() == 0
+    flat = replace(rendering, inverse_depths=tuple(torch.full_like(e, 0.2) for e in rendering.inverse_depths))
     met = replace(batch, inverse_depth=0.2 * (batch.depth_weight > 0))
-    assert sparse_depth(flat, met, NETWORK, SIDE).item() == pytest.approx(0, abs=1e-6)
+    assert sparse_depth(flat, met, GRIDS, SIDE).item() == pytest.approx(0, abs=1e-6)
 
 
 def test_the_structural_term_is_the_ssim_that_evaluation_measures():

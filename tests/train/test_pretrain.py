@@ -17,18 +17,18 @@ from rich.console import Console
 from safetensors import safe_open
 from torch.nn import functional as F
 
-from tidefield.commands.training import pretrain as pretrain_command
-from tidefield.config import PRESETS, SWIFT
+from tidefield.commands.pretrain import Pretrain
+from tidefield.commands.pretrain import pretrain as pretrain_command
+from tidefield.config import PRESETS, SWIFT, Budget
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.errors import RunError
-from tidefield.model.network import Network
-from tidefield.options import Length, Pretrain
+from tidefield.model.network import make_network
 from tidefield.synthetic import Flight
 from tidefield.train import pretrain, stream
-from tidefield.train.loop import Budget, SceneTrainer
+from tidefield.train.checkpoint import SHIPPED, read_weights, weights_sha256, write_weights
+from tidefield.train.loop import SceneTrainer
 from tidefield.train.pretrain import Pretrainer, Validation
 from tidefield.train.stream import Drawn, Recipe, Stream, recipe
-from tidefield.train.weights import SHIPPED, read_weights, sha256, write_weights
 
 CPU = torch.device("cpu")
 QUIET = Console(quiet=True)
@@ -63,10 +63,10 @@ def test_recipes_repeat_and_differ() -> None:
     assert all(index < one.views for one in every for index in one.misposed)
 
 
-def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(stream, "recipe", small_recipe)
-    monkeypatch.setattr(stream, "AT_HAND", 2)
+    monkeypatch.setattr(stream, "POOL_SIZE", 2)
     monkeypatch.setattr(stream, "STEPS_EACH", 4)
     generator = torch.Generator().manual_seed(0)
     with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
@@ -87,30 +87,32 @@ def test_the_stream_keeps_a_few_scenes_at_hand(tmp_path: Path, monkeypatch: pyte
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
 
 
-def test_scenes_are_procedural_and_real_with_hardships_of_their_own() -> None:
-    every = [stream.slot(3, number, 0.5) for number in range(100)]
-    assert every[5] == stream.slot(3, 5, 0.5)
+def test_scenes_are_procedural_and_real_augmented_of_their_own() -> None:
+    every = [stream.describe_draw(3, number, 0.5) for number in range(100)]
+    assert every[5] == stream.describe_draw(3, 5, 0.5)
     assert 30 < sum(own.recipe is None for own in every) < 70
-    assert all(own.recipe is not None for own in [stream.slot(3, number, 0.0) for number in range(20)])
-    for hard in zip(*[(0 < own.points_share < 1, own.shift_px > 0, own.uneven > 0) for own in every], strict=True):
+    assert all(own.recipe is not None for own in [stream.describe_draw(3, number, 0.0) for number in range(20)])
+    for hard in zip(
+        *[(0 < own.points_share < 1, own.shift_px > 0, own.exposure_error > 0) for own in every], strict=True
+    ):
         assert 10 < sum(hard) < 40
     assert len({own.points_share for own in every}) > 10
     assert 4 < sum(own.points_share == 0 for own in every) < 25
     assert len({own.shift_px for own in every}) > 10
-    assert len({own.uneven for own in every}) > 10
+    assert len({own.exposure_error for own in every}) > 10
     assert 30 < sum(own.channels != (0, 1, 2) for own in every) < 60
     assert len({own.channels for own in every}) == 6
 
 
-def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
+def test_augmentation_is_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
     at = wall.scene(wall.cameras(6))
     easy, hard = (
-        stream.Slot(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
-        stream.Slot(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
+        stream.Draw(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
+        stream.Draw(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
     )
     with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
-        whole, few = scenes._with_hardships(at, easy), scenes._with_hardships(at, hard)
-        none = scenes._with_hardships(at, replace(easy, points_share=0.0))
+        whole, few = scenes._augmented(at, easy), scenes._augmented(at, hard)
+        none = scenes._augmented(at, replace(easy, points_share=0.0))
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
     assert 0.2 < float((few.cameras.principal_px - at.cameras.principal_px).std()) < 1
     assert torch.equal(few.cameras.principal_px, few.scene.cameras.principal_px)
@@ -122,9 +124,9 @@ def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp
     assert at.points is not None
     assert few.scene.points is not None
     assert none.scene.points is None
-    assert len(none.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px)
+    assert len(none.priors.observed(0).uv_px) == len(whole.priors.observed(0).uv_px)
     assert 0.1 < len(few.scene.points.xyz_world) / len(at.points.xyz_world) < 0.3
-    assert len(few.surfaces.observed(0).uv_px) == len(whole.surfaces.observed(0).uv_px) > 0
+    assert len(few.priors.observed(0).uv_px) == len(whole.priors.observed(0).uv_px) > 0
     points = few.scene.points
     assert len(points.error_px) == len(points.xyz_world) == len(points.point_index.unique())
     seen_at = at.cameras.project(points.xyz_world)[0][points.camera_index, points.point_index]
@@ -134,7 +136,7 @@ def test_hardships_are_few_points_and_photographs_and_exposures_that_are_off(tmp
 def test_a_turned_scene_has_the_same_views_of_itself() -> None:
     at = wall.scene(wall.cameras(6))
     drawn = stream.Drawn(at, DepthPriors(at), at.cameras)
-    turned = stream.turned(drawn, torch.tensor([0.3, -0.8, 0.1, 0.4]))
+    turned = stream.rotate(drawn, torch.tensor([0.3, -0.8, 0.1, 0.4]))
     assert turned.scene is at
     one, other = at.cameras.T_world_camera, turned.cameras.T_world_camera
     assert (one - other).abs().max() > 0.5
@@ -156,8 +158,8 @@ def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     monkeypatch.setattr(
         learner,
-        "objective",
-        lambda scene, surfaces, cameras, views, generator: seen.append(views) or (torch.zeros(()), torch.zeros(())),
+        "batch_loss",
+        lambda scene, priors, cameras, views, generator: seen.append(views) or (torch.zeros(()), torch.zeros(())),
     )
     for _ in range(200):
         learner.loss()
@@ -170,16 +172,16 @@ def learn_together(rank: int, folder: str) -> None:
     os.environ["MASTER_PORT"] = Path(folder, "port").read_text()
     torch.set_num_threads(1)
     device = pretrain.join(CPU)
-    assert pretrain.processes() == 2
+    assert pretrain.world_size() == 2
     pretrain.CATEGORIES = ("ground_textures",)
     pretrain.Recipe = lambda *asked: small_recipe(0, 0)
     made = Path(folder, "validation", "ground_textures")
     assert rank == 1 or not made.exists()
     assert list(pretrain.validation_scenes(Path(folder), [], QUIET)) == ["ground_textures"]
-    Path(folder, f"{rank}.seed").write_text(str(pretrain.own_seed(5)))
+    Path(folder, f"{rank}.seed").write_text(str(pretrain.process_seed(5)))
     learner = Pretrainer(SMALL, Walls(rank), wall.scene(wall.cameras(4)), 0, device)
-    assert learner.leads == (rank == 0)
-    assert learner.agreed(rank == 1), "one that is asked to stop stops both"
+    assert learner.is_main_process == (rank == 0)
+    assert learner.should_stop(rank == 1), "one that is asked to stop stops both"
     for _ in range(3):
         learner.step(Budget(steps=3))
     torch.save(learner.network.state_dict(), Path(folder, f"{rank}.pt"))
@@ -230,43 +232,43 @@ def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
     for name, value in trainer.network.state_dict().items():
         assert torch.equal(begun.network.state_dict()[name], value.half().float()), name
     fewer = replace(SMALL, network=replace(SMALL.network, views=2))
-    read_weights(file, Network(fewer.network))
-    assert len(sha256(file)) == 64
+    read_weights(file, make_network(fewer.network))
+    assert len(weights_sha256(file)) == 64
 
 
-def test_wrong_weights_are_told(tmp_path: Path) -> None:
+def test_wrong_weights_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "w.safetensors"
-    with pytest.raises(RunError, match="is no file of weights"):
-        read_weights(file, Network(SMALL.network))
-    write_weights(file, Network(SMALL.network), SMALL, {})
+    with pytest.raises(RunError, match="is not a weights file"):
+        read_weights(file, make_network(SMALL.network))
+    write_weights(file, make_network(SMALL.network), SMALL, {})
     with pytest.raises(RunError, match=r"another network \(encoder differ\)"):
-        read_weights(file, Network(SWIFT.network))
+        read_weights(file, make_network(SWIFT.network))
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(RunError, match="damaged"):
-        read_weights(file, Network(SMALL.network))
+        read_weights(file, make_network(SMALL.network))
 
 
 def test_what_ships_fits_its_preset_and_its_card() -> None:
     files = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
     assert set(files) == set(PRESETS)
     for preset, file in files.items():
-        read_weights(file, Network(PRESETS[preset].network))
+        read_weights(file, make_network(PRESETS[preset].network))
         card = file.with_suffix(".md").read_text(encoding="utf-8")
         assert card.startswith(f"# Weights of the preset {preset}\n")
-        assert sha256(file) in card
+        assert weights_sha256(file) in card
     assert sum(file.stat().st_size for file in files.values()) < 20e6
 
 
 def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(stream, "recipe", small_recipe)
-    monkeypatch.setattr("tidefield.commands.training.PRESETS", {"swift": SMALL})
+    monkeypatch.setitem(PRESETS, "swift", SMALL)
     scene = wall.scene(wall.cameras(5), (1, 3))
     monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": scene})
-    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
+    pretrain_command(Pretrain(tmp_path / "out", budget=Budget(steps=2), device="cpu"), QUIET)
     with pytest.raises(RunError, match="--resume"):
-        pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=2), device="cpu"), QUIET)
-    pretrain_command(Pretrain(tmp_path / "out", length=Length(steps=3), device="cpu", resume=True), QUIET)
+        pretrain_command(Pretrain(tmp_path / "out", budget=Budget(steps=2), device="cpu"), QUIET)
+    pretrain_command(Pretrain(tmp_path / "out", budget=Budget(steps=3), device="cpu", resume=True), QUIET)
     points = json.loads((tmp_path / "out" / "validation.json").read_text())
     assert [point["step"] for point in points] == [2, 3]
-    read_weights(tmp_path / "out" / "weights.safetensors", Network(SMALL.network))
+    read_weights(tmp_path / "out" / "weights.safetensors", make_network(SMALL.network))

@@ -22,8 +22,8 @@ from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.compositing import composite, weights
-from tidefield.model.intervals import sample
 from tidefield.model.rendering import Render, Rendering
+from tidefield.model.sampling import sample
 from tidefield.train.loop import Trainer
 
 RAYS_AT_ONCE = 1024
@@ -161,8 +161,7 @@ class NerfTrainer(Trainer):
             torch.manual_seed(seed)
             network = Nerf(config)
         network.cover(scene.cameras[list(scene.train)])
-        groups = [{"params": list(network.parameters()), "peak": config.learning_rate}]
-        super().__init__(network.to(device), groups, scene, seed, device, betas=(0.9, 0.999), eps=1e-8)
+        super().__init__(network.to(device), config.learning_rate, scene, seed, device, {})
         self.config, self.nerf = config, network
 
     @property

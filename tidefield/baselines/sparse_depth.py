@@ -15,8 +15,7 @@ from tidefield.baselines.photograph import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.fill import fill_unseen
-from tidefield.model.rendering import Render, Rendering
+from tidefield.model.rendering import Render, Rendering, fill_unseen
 
 VIEWS = 4
 SOFTNESS_RAD = 0.02  # angle at which a photograph's weight has halved: below it differences in angle hardly matter

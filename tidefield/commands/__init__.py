@@ -1,1 +1,4 @@
-"""What the commands do, once their arguments are known."""
+"""One module per command: its options, which make its part of the command line, and its function.
+
+The options are imported to answer --help, so heavy imports stand inside the functions.
+"""

@@ -96,6 +96,11 @@ def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> float:
     return min(10 * math.log10(255**2 / mean_square), PSNR_LIMIT_DB) if mean_square > 0 else PSNR_LIMIT_DB
 
 
+def psnr_from_mse(mean_square: float) -> float:
+    """Decibels of a mean squared error of values in [0, 1] (eq. 12), at most `PSNR_LIMIT_DB`."""
+    return min(-10 * math.log10(mean_square), PSNR_LIMIT_DB) if mean_square > 0 else PSNR_LIMIT_DB
+
+
 def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
     """Eq. 13 around each pixel, mean over the channels."""
     first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))

@@ -1,6 +1,6 @@
-"""The training photographs' features, encoded block by block when first needed, and kept while there is room.
+"""Features of the training photographs, encoded block by block when first needed; least recently used blocks go first.
 
-Alphabet: T tiles, N views, S slots.
+Alphabet: T tiles, N views.
 """
 
 from __future__ import annotations
@@ -16,20 +16,19 @@ from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import project
-from tidefield.model.gather import FeatureMaps
 from tidefield.model.network import Network
-from tidefield.model.views import Encoded, Views
+from tidefield.model.views import Encoded, FeatureMaps, Views
 
 BLOCK_PX = 1024
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
 OVERLAP_PX = 384
-"""What neighbouring blocks share at least, so that what a tile shows lies in one of them."""
+"""Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
 BUDGET_BYTES = 1_500_000_000
-"""Of features kept; what was not used for longest goes first."""
+"""Memory for features."""
 
 
 class CacheFull(Exception):
-    """More blocks were asked for at once than the shelf holds."""
+    """More blocks were asked for at once than the cache holds."""
 
 
 class FeatureCache:
@@ -39,7 +38,7 @@ class FeatureCache:
         network: whose encoder is used, on `device`.
         scene: the photographs.
         device: where features are computed and kept.
-        budget_bytes: of memory for features; a few blocks are kept even if they need more.
+        budget_bytes: memory for features; a few blocks are kept even if they need more.
     """
 
     def __init__(self, network: Network, scene: Scene, device: torch.device, budget_bytes: int = BUDGET_BYTES) -> None:
@@ -54,30 +53,30 @@ class FeatureCache:
         texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
         self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views + EXTRA_VIEWS)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
-        self._encoded = Encoded(features, self._empty(like.photographs))
-        self._held: OrderedDict[tuple[int, int, int], int] = OrderedDict()
+        self._encoded = Encoded(features, self._empty(like.photographs), like.with_colours)
+        self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
 
     def views(self, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
-        """The neighbours of tiles, encoded around what each tile shows.
+        """Encode the neighbours of tiles around what each tile shows.
 
         Args:
-            neighbours: photographs, and how far each of them is there.
+            neighbours: photographs and their blend weights.
             middle_world: the surface in the middle of each tile.
 
         Raises:
-            CacheFull: when these tiles need more blocks than there are slots.
+            CacheFull: these tiles need more blocks than the cache holds.
         """
         keys = self._blocks(neighbours.index, middle_world)
-        wanted = dict.fromkeys(keys)
-        if len(wanted) > self.slots:
+        distinct = dict.fromkeys(keys)
+        if len(distinct) > self.slots:
             raise CacheFull
-        for key in wanted:
-            if key in self._held:
-                self._held.move_to_end(key)
-        for key in wanted:
-            if key not in self._held:
+        for key in distinct:
+            if key in self._slots:
+                self._slots.move_to_end(key)
+        for key in distinct:
+            if key not in self._slots:
                 self._encode(key)
-        which = torch.tensor([self._held[key] for key in keys], device=self.device).reshape(neighbours.index.shape)
+        which = torch.tensor([self._slots[key] for key in keys], device=self.device).reshape(neighbours.index.shape)
         cameras = self.cameras[neighbours.index.reshape(-1).to(self.device)]
         return Views(cameras, which, neighbours.presence.to(self.device), self._encoded)
 
@@ -94,7 +93,7 @@ class FeatureCache:
 
     def _encode(self, key: tuple[int, int, int]) -> None:
         photograph, column, row = key
-        slot = self._held.popitem(last=False)[1] if len(self._held) == self.slots else len(self._held)
+        slot = self._slots.popitem(last=False)[1] if len(self._slots) == self.slots else len(self._slots)
         size = self.scene.cameras.size_px[photograph]
         last = (_block_counts(size) - 1).clamp(min=1)
         corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([column, row]) / last).floor().long()
@@ -107,7 +106,7 @@ class FeatureCache:
             first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(block.rows)] = block.rows.to(maps.rows.dtype)
             maps.size[slot], maps.origin_px[slot] = block.size[0], block.origin_px[0]
-        self._held[key] = slot
+        self._slots[key] = slot
 
     def _texels(self, stride: int | float) -> int:
         return math.prod(math.ceil(side / stride) for side in self._side)

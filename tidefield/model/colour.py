@@ -1,19 +1,83 @@
-"""Colour of a sample: a softmax blend of the neighbours' colours and of the target's own (paper, eqs. 7 and 8)."""
+"""Colour of a sample: spherical harmonics (paper, eqs. 8-10) blended with the neighbours' colours (eq. 7).
+
+Alphabet: T tiles, N views, P samples of a tile, H hidden channels, j degree, m order, (x, y, z) a unit direction with
+z = cos(theta); Y_j^m has the index j^2 + j + m.
+"""
 
 from __future__ import annotations
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tidefield.model.aggregate import Evidence, weighted_sum
-from tidefield.model.harmonics import basis, expand
 from tidefield.model.views import Gathered
+
+HIGHEST_DEGREE = 4
+
+
+def basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K"]:
+    """Y_j^m of unit directions for all j <= degree: K = (degree + 1)^2 values, eqs. 9 and 10.
+
+    sqrt(2) K cos(m phi) P_j^m for m > 0, sqrt(2) K sin(|m| phi) P_j^|m| for m < 0, K P_j^0 for m = 0, where P carries
+    the Condon-Shortley sign. sin(theta)^m cos(m phi) and sin(theta)^m sin(m phi) are the real and imaginary parts of
+    (x + i y)^m, so no angle is ever computed and the poles are no special case.
+
+    Args:
+        directions: unit vectors; the values are polynomials in them, so gradients are finite everywhere.
+        degree: J of the paper, 0 to 4; 3 is its usual value.
+    """
+    assert 0 <= degree <= HIGHEST_DEGREE, f"degree {degree} is not in 0..{HIGHEST_DEGREE}"
+    x, y, z = directions.unbind(-1)
+    cos_m, sin_m = [torch.ones_like(x)], [torch.zeros_like(x)]
+    for _ in range(degree):
+        cos_m.append(x * cos_m[-1] - y * sin_m[-1])
+        sin_m.append(x * sin_m[-1] + y * cos_m[len(sin_m) - 1])
+    legendre = _legendre_over_sin(z, degree)
+    columns = []
+    for j in range(degree + 1):
+        for m in range(-j, j + 1):
+            order = abs(m)
+            scale = math.sqrt((2 * j + 1) * math.factorial(j - order) / (4 * math.pi * math.factorial(j + order)))
+            azimuth = cos_m[order] if m >= 0 else sin_m[order]
+            columns.append((scale * (math.sqrt(2) if m else 1.0)) * azimuth * legendre[j, order])
+    return torch.stack(columns, dim=-1)
+
+
+def _legendre_over_sin(z: Tensor, degree: int) -> dict[tuple[int, int], Tensor]:
+    """P_j^m(z) / sin(theta)^m by the usual three-term recurrence in j, with the sign (-1)^m."""
+    table = {(0, 0): torch.ones_like(z)}
+    for m in range(degree + 1):
+        if m:
+            table[m, m] = -(2 * m - 1) * table[m - 1, m - 1]
+        if m < degree:
+            table[m + 1, m] = (2 * m + 1) * z * table[m, m]
+        for j in range(m + 2, degree + 1):
+            table[j, m] = ((2 * j - 1) * z * table[j - 1, m] - (j + m - 1) * table[j - 2, m]) / (j - m)
+    return table
+
+
+def expand(coefficients: Float[Tensor, "*B 3 K"], basis_values: Float[Tensor, "*B K"]) -> Float[Tensor, "*B 3"]:
+    """Colour of eq. 8: sum_jm c_j^m Y_j^m, per channel."""
+    return (coefficients * basis_values[..., None, :]).sum(-1)
+
+
+def blend(
+    logits: Float[Tensor, "T N P"],
+    target_logit: Float[Tensor, "T P"],
+    colours: Float[Tensor, "T N P 3"],
+    target: Float[Tensor, "T P 3"],
+) -> Float[Tensor, "T P 3"]:
+    """Eq. 7: c = sum_i C_i exp(w_ci) / sum_j exp(w_cj) over the neighbours' colours and the target's own."""
+    share = torch.softmax(torch.cat([logits, target_logit[:, None]], dim=1), dim=1)
+    return weighted_sum(colours, share[:, :-1]) + share[:, -1, :, None] * target
 
 
 class ColourBlend(nn.Module):
-    """c = sum_i C_i exp(w_ci) / sum_j exp(w_cj) over the neighbours and the target candidate.
+    """Eqs. 7 and 8 as printed.
 
     The neighbours' logits come from [F_N,i, d - d_i, d.d_i, w_n,i], the target's from F_sigma. The target's colour is
     expanded in spherical harmonics of d around middle grey; its coefficients are predicted per sample and channel.
@@ -21,64 +85,90 @@ class ColourBlend(nn.Module):
     Args:
         hidden: H.
         degree: J.
-        alone: the neighbours' colours alone; the target's share is nothing where a neighbour sees the sample.
-        as_printed: nothing else. Otherwise the angle also enters on a logarithmic scale, blending begins by inverse
-            angle, as in unstructured lumigraph rendering (Buehler et al., 2001), and the target begins with a small
-            share and is a difference to the neighbours' mean colour.
+        neighbours_only: the target has no share where a neighbour sees the sample; for the ablation.
+        inputs: numbers that enter each neighbour's logit next to F_N,i: d - d_i (3), d.d_i and w_n,i.
     """
 
-    def __init__(self, hidden: int, degree: int, as_printed: bool = False, alone: bool = False) -> None:
+    def __init__(self, hidden: int, degree: int, neighbours_only: bool = False, inputs: int = 5) -> None:
         super().__init__()
-        self.degree, self.alone = degree, alone
+        self.degree, self.neighbours_only = degree, neighbours_only
         self.view = nn.Linear(hidden, hidden)
-        # d - d_i (3 numbers), d.d_i, w_n,i and, if not as printed, the logarithm of the angle.
-        self.direction = nn.Linear(5 if as_printed else 6, hidden, bias=False)
+        self.direction = nn.Linear(inputs, hidden, bias=False)
         self.logit = nn.Linear(hidden, 1)
-        self.angle = None if as_printed else nn.Parameter(torch.tensor(1.0))
         self.target = nn.Linear(hidden, 1 + 3 * (degree + 1) ** 2)
         nn.init.zeros_(self.logit.weight)
         nn.init.zeros_(self.target.weight)
         nn.init.zeros_(self.target.bias)
-        if not as_printed:
-            with torch.no_grad():
-                self.target.bias[0] = -4.0
 
     def forward(
-        self, evidence: Evidence, gathered: Gathered | None, direction: Float[Tensor, "T P 3"]
+        self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
     ) -> Float[Tensor, "T P 3"]:
         """Colours of P samples per tile; `direction` is d, unit, towards the samples."""
-        head = self.target(evidence.density)
-        coefficients = head[..., 1:].unflatten(-1, (3, -1))
-        middle = 0.5 if self.angle is None else evidence.mean_colour
-        target = middle + expand(coefficients, basis(direction, self.degree))
-        if gathered is None:
-            return target
-        logits = self._view_logits(evidence, gathered, direction)
-        own, seen = head[..., 0], gathered.valid.any(1)
-        if self.alone:
-            own = own.masked_fill(seen, -torch.inf)
-        elif self.angle is not None:
-            # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
-            own = own + torch.where(seen, logits.masked_fill(~gathered.valid, -1e4).logsumexp(1), 0.0)
-        share = torch.softmax(torch.cat([logits, own[:, None]], dim=1), dim=1)
-        return weighted_sum(gathered.colours, share[:, :-1]) + share[:, -1, :, None] * target
+        target_logit, target = self.target_colour(evidence, direction, 0.5)
+        logits = self.view_logits(evidence, gathered, self.view_inputs(evidence, gathered, direction))
+        logits = logits.masked_fill(~gathered.valid, -torch.inf)
+        return blend(logits, self.restrict(target_logit, gathered.valid), gathered.colours, target)
 
-    def _view_logits(
+    def target_colour(
+        self, evidence: Evidence, direction: Float[Tensor, "T P 3"], origin: Float[Tensor, "T P 3"] | float
+    ) -> tuple[Float[Tensor, "T P"], Float[Tensor, "T P 3"]]:
+        """The target candidate: its logit, and its colour, expanded in spherical harmonics around `origin`."""
+        head = self.target(evidence.density)
+        return head[..., 0], origin + expand(head[..., 1:].unflatten(-1, (3, -1)), basis(direction, self.degree))
+
+    def view_inputs(
         self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
+    ) -> list[Float[Tensor, "T N P"]]:
+        """d - d_i, d.d_i and w_n,i, scaled so that view directions 10 degrees apart, usual in surveys, are of order 1:
+        |d - d_i| is 0.17 there, and 1 - d.d_i is 0.015."""
+        offset = (direction[:, None] - gathered.directions) * 5
+        return [*offset.unbind(-1), (1 - gathered.cosine) * -20, evidence.view_weight]
+
+    def view_logits(
+        self, evidence: Evidence, gathered: Gathered, inputs: list[Float[Tensor, "T N P"]]
     ) -> Float[Tensor, "T N P"]:
-        apart = 1 - gathered.cosine
-        # 1e-4 is the angle, 0.8 degrees, below which a closer view is no better than its resampling.
-        closeness = -torch.log(apart.clamp(min=0) + 1e-4)
-        # In a survey the angles are small: scaled so that 10 degrees are of order one.
-        turned = (direction[:, None] - gathered.directions) * 5
-        near = [*turned.unbind(-1), apart * -20, evidence.view_weight]
-        if self.angle is not None:
-            near.append(closeness / 4)
+        """w_ci of eq. 7, from F_N,i and further numbers of each view."""
         hidden = self.view(evidence.per_view)
-        # Each of the numbers for all samples, one after the other: a linear layer would first lay them side by side.
+        # Each number for all samples, one after the other: a linear layer would first interleave them.
         across = self.direction.weight.T.expand(hidden.shape[0] * hidden.shape[1], -1, -1)
-        hidden = torch.baddbmm(hidden.flatten(0, 1), torch.stack(near, dim=2).flatten(0, 1).transpose(1, 2), across)
-        logits = self.logit(F.relu(hidden, inplace=True))[..., 0].unflatten(0, gathered.cosine.shape[:2])
-        if self.angle is not None:
-            logits = logits + self.angle * closeness + gathered.presence.log()
-        return logits.masked_fill(~gathered.valid, -torch.inf)
+        hidden = torch.baddbmm(hidden.flatten(0, 1), torch.stack(inputs, dim=2).flatten(0, 1).transpose(1, 2), across)
+        return self.logit(F.relu(hidden, inplace=True))[..., 0].unflatten(0, gathered.cosine.shape[:2])
+
+    def restrict(self, target_logit: Float[Tensor, "T P"], valid: Bool[Tensor, "T N P"]) -> Float[Tensor, "T P"]:
+        """The target's logit, minus infinity where only neighbours may take part."""
+        return target_logit.masked_fill(valid.any(1), -torch.inf) if self.neighbours_only else target_logit
+
+
+class AngularColourBlend(ColourBlend):
+    """Eqs. 7 and 8 with a prior on angles, for `swift`.
+
+    Blending starts by inverse angle, as in unstructured lumigraph rendering (Buehler et al., 2001), with the angle on a
+    logarithmic scale as a further input. The target's colour is a difference to the neighbours' mean colour, and its
+    share starts small and does not depend on how many neighbours there are.
+    """
+
+    def __init__(self, hidden: int, degree: int, neighbours_only: bool = False) -> None:
+        super().__init__(hidden, degree, neighbours_only, inputs=6)
+        self.angle = nn.Parameter(torch.tensor(1.0))
+        with torch.no_grad():
+            self.target.bias[0] = -4.0  # a share of 1.8%
+
+    def forward(  # type: ignore[override]
+        self,
+        evidence: Evidence,
+        gathered: Gathered,
+        direction: Float[Tensor, "T P 3"],
+        mean_colour: Float[Tensor, "T P 3"],
+    ) -> Float[Tensor, "T P 3"]:
+        """Colours of P samples per tile; `mean_colour` is the neighbours' under the direction weights."""
+        target_logit, target = self.target_colour(evidence, direction, mean_colour)
+        # 1e-4 is the angle, 0.8 degrees, below which a closer view is no better than its resampling.
+        closeness = -torch.log((1 - gathered.cosine).clamp(min=0) + 1e-4)
+        logits = self.view_logits(evidence, gathered, [*self.view_inputs(evidence, gathered, direction), closeness / 4])
+        logits = logits + self.angle * closeness + gathered.blend_weight.log()
+        logits = logits.masked_fill(~gathered.valid, -torch.inf)
+        if not self.neighbours_only:
+            # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
+            total = logits.masked_fill(~gathered.valid, -1e4).logsumexp(1)
+            target_logit = target_logit + torch.where(gathered.valid.any(1), total, 0.0)
+        return blend(logits, self.restrict(target_logit, gathered.valid), gathered.colours, target)

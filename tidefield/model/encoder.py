@@ -20,7 +20,7 @@ class Encoder(nn.Module):
 
     Args:
         config: widths, blocks and norms.
-        outputs: (stride, channels) of each output; strides 4, 2 and 1 can be had.
+        outputs: (stride, channels) of each output; strides 4, 2 and 1 are possible.
     """
 
     def __init__(self, config: EncoderConfig, outputs: tuple[tuple[int, int], ...]) -> None:
@@ -43,7 +43,7 @@ class Encoder(nn.Module):
         """One map per configured output; an H x W image gives ceil(H / stride) x ceil(W / stride).
 
         Args:
-            images: colours in [0, 1], exposures evened out.
+            images: colours in [0, 1], at the common exposure.
         """
         # Channels last is what CPUs and GPUs convolve fastest.
         x = (images - 0.5).contiguous(memory_format=torch.channels_last)

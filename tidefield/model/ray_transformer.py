@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 FREQUENCIES = 4
 """Octaves of the positional encoding, from half a period over the ray's range."""
-FEW = 8
+SHORT_RAY = 8
 """Samples of a ray up to which all pairs are written out: PyTorch's attention is made for long sequences, and takes
 several times as long for thousands of short ones."""
 
@@ -22,8 +22,8 @@ several times as long for thousands of short ones."""
 def positional_encoding(position: Float[Tensor, "*B"]) -> Float[Tensor, "*B 8"]:
     """sin and cos of pi 2^k position.
 
-    A function of the sample's place between near (0) and far (1), not of its index, so M may change between training
-    and rendering (method.md, section 6).
+    A function of the sample's normalised distance between near (0) and far (1), not of its index, so M may change
+    between training and rendering (docs/method.md, section 6).
     """
     octaves = position[..., None] * (math.pi * 2.0 ** torch.arange(FREQUENCIES, device=position.device))
     return torch.cat([octaves.sin(), octaves.cos()], dim=-1)
@@ -32,14 +32,14 @@ def positional_encoding(position: Float[Tensor, "*B"]) -> Float[Tensor, "*B 8"]:
 class RayTransformer(nn.Module):
     """Positional encoding and multi-head self-attention over the samples, then a feed-forward layer (pre-norm).
 
-    Samples that nothing is known of are masked as keys: whatever their features hold, the other samples' outputs stay
+    Samples that no view sees are masked as keys: whatever their features hold, the outputs of the other samples stay
     the same.
     """
 
     def __init__(self, hidden: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.place = nn.Linear(2 * FREQUENCIES, hidden)
+        self.position = nn.Linear(2 * FREQUENCIES, hidden)
         self.before_attention = nn.LayerNorm(hidden)
         self.query_key_value = nn.Linear(hidden, 3 * hidden)
         self.after_attention = nn.Linear(hidden, hidden)
@@ -53,11 +53,11 @@ class RayTransformer(nn.Module):
         position: Float[Tensor, "R M"],
         valid: Bool[Tensor, "R M"],
     ) -> Float[Tensor, "R M H"]:
-        x = features + self.place(positional_encoding(position))
+        x = features + self.position(positional_encoding(position))
         qkv = self.query_key_value(self.before_attention(x)).unflatten(-1, (3, self.heads, -1))
         # A ray without any valid sample attends to all: an empty softmax is NaN, and its densities are 0 anyway.
         keys = valid | ~valid.any(-1, keepdim=True)
-        attended = attend_to_few(qkv, keys) if features.shape[1] <= FEW else attend(qkv, keys)
+        attended = attend_short(qkv, keys) if features.shape[1] <= SHORT_RAY else attend(qkv, keys)
         x = x + self.after_attention(attended.flatten(2))
         return x + self.feed_forward(x)
 
@@ -68,8 +68,8 @@ def attend(qkv: Float[Tensor, "R M 3 A D"], keys: Bool[Tensor, "R M"]) -> Float[
     return F.scaled_dot_product_attention(query, key, value, attn_mask=keys[:, None, None, :]).transpose(1, 2)
 
 
-def attend_to_few(qkv: Float[Tensor, "R M 3 A D"], keys: Bool[Tensor, "R M"]) -> Float[Tensor, "R M A D"]:
-    """The same, for rays of a few samples."""
+def attend_short(qkv: Float[Tensor, "R M 3 A D"], keys: Bool[Tensor, "R M"]) -> Float[Tensor, "R M A D"]:
+    """`attend`, for rays of a few samples."""
     # The rays come last, so that every operation runs along many of them.
     query, key, value = qkv.permute(2, 3, 1, 4, 0).contiguous()
     score = (query[:, :, None] * key[:, None]).sum(3) / math.sqrt(query.shape[2])

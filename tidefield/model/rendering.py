@@ -1,4 +1,4 @@
-"""The one seam of the program: `render(camera) -> Rendering`."""
+"""The interface of every method: `render(camera) -> Rendering`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.geometry.cameras import Cameras
 
@@ -17,9 +18,9 @@ class Rendering:
     """What a camera sees.
 
     Attributes:
-        colour: in [0, 1], display-referred like the photographs, at the camera's own gain.
+        colour: in [0, 1], display-referred like the photographs, at the camera's gain.
         depth: expected z-depth (along the camera's +z), world units.
-        opacity: share of the light that the scene stopped, in [0, 1].
+        opacity: share of the light that the scene stops, in [0, 1].
     """
 
     colour: Float[Tensor, "H W 3"]
@@ -28,9 +29,30 @@ class Rendering:
 
 
 def to_8_bit(colour: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-    """Colours in [0, 1], clipped and rounded to 0..255."""
+    """Clip colours to [0, 1] and round them to 0..255."""
     return (colour.detach().float().clamp(0, 1) * 255).round().to(torch.uint8)
 
 
+def fill_unseen(colour: Float[Tensor, "H W 3"], seen: Bool[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """Continue colours smoothly into pixels that no photograph sees; middle grey if none is seen at all.
+
+    Seen pixels are averaged over larger and larger blocks until every block has one, then interpolated back
+    (pull-push: Gortler et al., The Lumigraph, 1996).
+    """
+    if seen.all():
+        return colour
+    if not seen.any():
+        return torch.full_like(colour, 0.5)
+    weight = seen.to(colour)[None, None]
+    blocks = {"kernel_size": 2, "ceil_mode": True, "count_include_pad": False}
+    coarse_weight = F.avg_pool2d(weight, **blocks)
+    coarse = F.avg_pool2d(colour.permute(2, 0, 1)[None] * weight, **blocks)
+    # The floor keeps blocks without a seen pixel finite; they are filled from the next coarser ones.
+    coarse = (coarse / coarse_weight.clamp(min=1e-6))[0].permute(1, 2, 0)
+    coarse = fill_unseen(coarse, coarse_weight[0, 0] > 0)
+    filled = F.interpolate(coarse.permute(2, 0, 1)[None], size=seen.shape, mode="bilinear", align_corners=False)
+    return torch.where(seen[..., None], colour, filled[0].permute(1, 2, 0))
+
+
 Render = Callable[[Cameras], Rendering]
-"""A method that makes views: takes one camera (a `Cameras` of length 1), returns the view of its full size."""
+"""A method: takes one camera (a `Cameras` of length 1) and returns its view in full size."""

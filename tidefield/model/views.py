@@ -1,24 +1,28 @@
-"""The neighbouring views of a batch of tiles, read at samples: projection and gathering (method.md, section 3).
+"""Neighbouring views of a batch of tiles, read at samples: projection and interpolation (docs/method.md, section 3).
 
-Alphabet: T tiles, N views, K maps, P samples of a tile, C channels.
+The texels of a map lie in memory as rows of channels, so a read is a weighted sum of a few rows: `embedding_bag`, which
+is several times faster than `grid_sample` for more than a few channels, on CPUs and GPUs alike.
+
+Alphabet: T tiles, N views, K maps, Q texels of all maps together, P samples of a tile, C channels.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.data.neighbours import from_border
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.gather import FeatureMaps, gather, joined
 
 FEATHER = 0.02
 """Share of its width over which a view fades towards the border of its frame."""
-LEAST_PRESENCE = 1e-4
-"""Of a view that has faded out: its logarithm enters the blending, and where it alone sees, it must do."""
+LEAST_BLEND_WEIGHT = 1e-4
+"""Of a view that has faded out: the logarithm enters the blending, and the view must serve where it alone sees."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Gathered:
         directions: d_i, unit, from each view's camera to the sample.
         cosine: d.d_i with the target's direction.
         valid: whether the sample is in front of the camera and inside the encoded part of the photograph.
-        presence: how far each view is there (`data.neighbours`), above 0.
+        blend_weight: above 0, to 1; lets views fade in and out (`data.neighbours`).
     """
 
     colours: Float[Tensor, "T N P 3"]
@@ -39,27 +43,28 @@ class Gathered:
     directions: Float[Tensor, "T N P 3"]
     cosine: Float[Tensor, "T N P"]
     valid: Bool[Tensor, "T N P"]
-    presence: Float[Tensor, "T N P"]
+    blend_weight: Float[Tensor, "T N P"]
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """Photographs as the network reads them.
+    """Photographs as a network reads them.
 
     Attributes:
-        features: by stride; from stride 2 on the first three channels are the photographs' mean colours, at the common
-            exposure.
-        photographs: the colours themselves, at stride 1 or 1/2.
+        features: maps by stride.
+        photographs: the colours, at stride 1 or 1/2.
+        with_colours: strides whose maps begin with three channels of mean colours, at the common exposure.
     """
 
     features: dict[int, FeatureMaps]
     photographs: FeatureMaps
+    with_colours: frozenset[int] = frozenset()
 
     @staticmethod
-    def joined(parts: list[Encoded]) -> Encoded:
-        """Groups of photographs of one size each as one set."""
-        features = {stride: joined([part.features[stride] for part in parts]) for stride in parts[0].features}
-        return Encoded(features, joined([part.photographs for part in parts]))
+    def concatenate(parts: list[Encoded]) -> Encoded:
+        """Join groups of photographs of one size each into one set."""
+        features = {stride: concatenate([part.features[stride] for part in parts]) for stride in parts[0].features}
+        return Encoded(features, concatenate([part.photographs for part in parts]), parts[0].with_colours)
 
 
 @dataclass(frozen=True)
@@ -69,34 +74,35 @@ class Views:
     Attributes:
         cameras: of the T N views, tile by tile.
         which: the map of each view.
-        presence: how far each view is there at its tile's corners (`data.neighbours`).
+        blend_weight: of each view at its tile's corners (`data.neighbours`).
         encoded: all maps.
     """
 
     cameras: Cameras
     which: Int[Tensor, "T N"]
-    presence: Float[Tensor, "T N 4"]
+    blend_weight: Float[Tensor, "T N 4"]
     encoded: Encoded
 
     def __getitem__(self, tiles: Int[Tensor, " t"]) -> Views:
         rows = torch.arange(self.which.numel(), device=self.which.device).reshape(self.which.shape)[tiles].reshape(-1)
-        return Views(self.cameras[rows], self.which[tiles], self.presence[tiles], self.encoded)
+        return Views(self.cameras[rows], self.which[tiles], self.blend_weight[tiles], self.encoded)
 
     def read(
         self,
         stride: int,
         points_world: Float[Tensor, "T P 3"],
         directions: Float[Tensor, "T P 3"],
-        within: Float[Tensor, "T R 2"],
-        detail: bool,
+        ray_in_tile: Float[Tensor, "T R 2"],
+        mean_colours: bool = False,
     ) -> Gathered:
-        """Project samples into every view and read the maps of one stride there.
+        """Project samples into every view and read features and colours there.
 
         Args:
-            points_world: of the samples of R rays, all rays' samples one after the other.
-            directions: d, unit, from the target's camera to the samples.
-            within: where the rays pass their tile, 0 to 1 from its left and from its top.
-            detail: read the photographs themselves, not their means over the stride.
+            stride: of the feature maps to read.
+            points_world: of the samples of R rays, the samples of all rays one after the other.
+            directions: d, unit, from the target camera to the samples.
+            ray_in_tile: where the rays pass their tile, 0 to 1 from its left and from its top.
+            mean_colours: take the mean colours of the feature maps instead of the photographs' own, in one read.
         """
         tiles, count = self.which.shape
         # One product for all views of a tile, with all x in memory, then all y, then all z.
@@ -104,31 +110,159 @@ class Views:
         products = torch.baddbmm(matrix[..., 3:], matrix[..., :3], points_world.transpose(1, 2))
         homogeneous = products.unflatten(1, (count, 3)).transpose(2, 3)
         z = homogeneous[..., 2:]
-        front = z > 1e-6
+        front = z > 1e-6  # points on the camera's plane have no pixel
         uv = homogeneous[..., :2] / torch.where(front, z, 1.0)
         size = self.cameras.size_px.reshape(tiles, count, 1, 2)
         inside = front[..., 0] & (uv >= 0).all(-1) & (uv <= size).all(-1)
         values, on_map = gather(self.encoded.features[stride], self.which, uv)
-        colours, features = values.split([3, values.shape[-1] - 3], dim=-1) if stride > 1 else (values, values)
-        if detail or stride == 1:
+        features = values[..., 3:] if stride in self.encoded.with_colours else values
+        if mean_colours:
+            assert stride in self.encoded.with_colours, f"maps of stride {stride} hold no colours"
+            colours = values[..., :3]
+        else:
             colours, on_map = gather(self.encoded.photographs, self.which, uv)
         offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
-        theirs = offset * offset.square().sum(-1, keepdim=True).clamp(min=1e-18).rsqrt()
+        # The floor keeps the direction of a point in the camera's centre finite.
+        view_directions = offset * offset.square().sum(-1, keepdim=True).clamp(min=1e-18).rsqrt()
         return Gathered(
             colours=colours,
             features=features,
-            directions=theirs,
-            cosine=(theirs * directions[:, None]).sum(-1),
+            directions=view_directions,
+            cosine=(view_directions * directions[:, None]).sum(-1),
             valid=inside & on_map,
-            presence=self._presence(within, points_world.shape[1], from_border(uv, size, FEATHER)),
+            blend_weight=self._blend_weight(ray_in_tile, points_world.shape[1], from_border(uv, size, FEATHER)),
         )
 
-    def _presence(
-        self, within: Float[Tensor, "T R 2"], samples: int, inside: Float[Tensor, "T N P"]
+    def _blend_weight(
+        self, ray_in_tile: Float[Tensor, "T R 2"], samples: int, border: Float[Tensor, "T N P"]
     ) -> Float[Tensor, "T N P"]:
-        """How far each view is there at every sample: as far as at its ray, and as the sample is inside its frame."""
-        right, below = (x[:, None] for x in within.unbind(-1))
-        rows = self.presence.unflatten(-1, (2, 2)).unbind(2)
+        """Each view's weight at every sample: interpolated between the tile's corners, times the fade at the border."""
+        right, below = (x[:, None] for x in ray_in_tile.unbind(-1))
+        rows = self.blend_weight.unflatten(-1, (2, 2)).unbind(2)
         upper, lower = (torch.lerp(row[..., :1], row[..., 1:], right) for row in rows)
-        rays = torch.lerp(upper, lower, below).repeat_interleave(samples // within.shape[1], dim=-1)
-        return (rays * inside).clamp(min=LEAST_PRESENCE)
+        rays = torch.lerp(upper, lower, below).repeat_interleave(samples // ray_in_tile.shape[1], dim=-1)
+        return (rays * border).clamp(min=LEAST_BLEND_WEIGHT)
+
+
+@dataclass(frozen=True)
+class FeatureMaps:
+    """K maps of features, of any sizes, one after the other.
+
+    Attributes:
+        rows: the texels of all maps, each map row by row; single or half precision.
+        first: index in `rows` of each map's first texel.
+        size: (width, height) of each map, texels.
+        origin_px: pixel of the photograph at which each map's first texel is centred.
+        stride: pixels between texels; 1/2 where there are twice as many.
+    """
+
+    rows: Float[Tensor, "Q C"]
+    first: Int[Tensor, " K"]
+    size: Int[Tensor, "K 2"]
+    origin_px: Float[Tensor, "K 2"]
+    stride: int | float
+
+
+def maps_from_images(
+    images: Float[Tensor, "K C h w"], corner_px: Float[Tensor, "K 2"], stride: int | float
+) -> FeatureMaps:
+    """Maps from images of one size.
+
+    A convolution of odd size with stride s and padding of half its size centres its output (0, 0) at input pixel
+    (0, 0), whose centre is half a pixel from the corner: hence the 0.5, whatever the stride.
+    """
+    count, channels, height, width = images.shape
+    device = images.device
+    return FeatureMaps(
+        rows=images.permute(0, 2, 3, 1).reshape(-1, channels),
+        first=torch.arange(count, device=device) * (height * width),
+        size=torch.tensor([width, height], device=device).expand(count, 2),
+        origin_px=corner_px + 0.5,
+        stride=stride,
+    )
+
+
+def concatenate(maps: list[FeatureMaps]) -> FeatureMaps:
+    """Join maps of several sizes into one set."""
+    offsets = torch.tensor([0, *(len(m.rows) for m in maps[:-1])], device=maps[0].rows.device).cumsum(0)
+    return FeatureMaps(
+        rows=torch.cat([m.rows for m in maps]),
+        first=torch.cat([m.first + o for m, o in zip(maps, offsets, strict=True)]),
+        size=torch.cat([m.size for m in maps]),
+        origin_px=torch.cat([m.origin_px for m in maps]),
+        stride=maps[0].stride,
+    )
+
+
+def upsample_twice(images: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C H W"]:
+    """Images with a texel every half pixel: every second one is a pixel of the image, the others lie between.
+
+    By cubic convolution (Keys, Cubic convolution interpolation for digital image processing, 1981, eq. 15 with a =
+    -1/2, halfway). What is read bilinearly from the result hardly differs from what 4 x 4 texels of the images would
+    give, at a quarter of the reads.
+    """
+    for dim in (2, 3):
+        ends = [images.narrow(dim, at, 1) for at in (0, -1)]
+        padded = torch.cat([ends[0], images, ends[1], ends[1]], dim)
+        size = images.shape[dim]
+        outer = padded.narrow(dim, 0, size) + padded.narrow(dim, 3, size)
+        inner = images + padded.narrow(dim, 2, size)
+        between = (9 * inner - outer) / 16
+        images = torch.stack([images, between], dim + 1).flatten(dim, dim + 1)
+    return images
+
+
+def gather(
+    maps: FeatureMaps, which: Int[Tensor, "T N"], uv_px: Float[Tensor, "T N P 2"]
+) -> tuple[Float[Tensor, "T N P C"], Bool[Tensor, "T N P"]]:
+    """Interpolate maps bilinearly: values of map `which[t, n]` at pixels, and whether the pixel lies on the map.
+
+    Beyond the outermost texels' centres the border is continued; "on the map" reaches half a stride beyond them, and
+    half a pixel at least.
+    """
+    size = maps.size[which][:, :, None]
+    position = (uv_px - maps.origin_px[which][:, :, None]) / maps.stride
+    reach = max(0.5, 0.5 / maps.stride)
+    inside = ((position >= -reach) & (position <= size - reach)).all(-1)
+    # NaN or huge positions of invalid points must still index something.
+    position = torch.where(inside[..., None], position, torch.zeros_like(position))
+    corner = position.floor()
+    right, below = (position - corner).unbind(-1)
+    left, above = 1 - right, 1 - below
+    low = corner.int()
+    last = (size - 1).int()
+    high = torch.minimum(low + 1, last)
+    low = torch.minimum(low.clamp(min=0), last)
+    first, width = maps.first[which][:, :, None].int(), size[..., 0].int()
+    upper, lower = first + low[..., 1] * width, first + high[..., 1] * width
+    columns = low[..., 0], high[..., 0]
+    indices = torch.stack([row + column for row in (upper, lower) for column in columns], dim=-1)
+    shares = torch.stack([row * column for row in (above, below) for column in (left, right)], dim=-1)
+    values = weighted_rows(maps.rows, indices.reshape(-1, 4), shares.reshape(-1, 4).to(maps.rows.dtype))
+    values = values.float() if values.dtype == torch.float16 else values
+    return values.reshape(*uv_px.shape[:-1], -1), inside
+
+
+def weighted_rows(
+    rows: Float[Tensor, "Q C"], index: Int[Tensor, "S B"], share: Float[Tensor, "S B"]
+) -> Float[Tensor, "S C"]:
+    """sum_b share[s, b] rows[index[s, b]]; differentiable in `rows` only, as sample positions are not learned."""
+    return _WeightedRows.apply(rows, index, share)  # type: ignore[no-any-return]
+
+
+class _WeightedRows(torch.autograd.Function):
+    """`embedding_bag` would do alone, but its own backward is several times slower than one `scatter_add`."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, index: Tensor, share: Tensor) -> Tensor:
+        ctx.save_for_backward(index, share)
+        ctx.shape = rows.shape
+        return F.embedding_bag(index, rows, per_sample_weights=share, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None]:
+        index, share = ctx.saved_tensors
+        (grad,) = grads
+        spread = (grad[:, None] * share[..., None]).reshape(-1, grad.shape[-1])
+        result = torch.zeros(ctx.shape, dtype=grad.dtype, device=grad.device)
+        return result.scatter_add_(0, index.reshape(-1, 1).long().expand_as(spread), spread), None, None

@@ -1,13 +1,16 @@
-"""Runs on disk: what was trained, on what, and how far.
+"""Runs and trained weights on disk.
 
-RUN/run.json says what the run is; RUN/checkpoint.safetensors holds the weights, the optimiser, the random state and, in
-its header, how far training got. Each is replaced whole or not at all.
+RUN/run.json describes a run; RUN/checkpoint.safetensors holds the weights, the optimiser, the random state and, in its
+header, the progress. A weights file (`tidefield pretrain`) holds the weights alone, in half precision, and a
+description. Each file is replaced whole or not at all.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+import re
+from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +20,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tidefield import __version__
-from tidefield.config import AnyConfig, config_from_json, config_to_json
+from tidefield.config import AnyConfig, Config, config_from_json, config_to_json
 from tidefield.errors import RunError
-from tidefield.files import completed_file
+from tidefield.files import completed_file, file_sha256, write_json
+from tidefield.model.network import Network
 
-RUN_FILE, CHECKPOINT_FILE = "run.json", "checkpoint.safetensors"
-_LARGEST_RUN_FILE = 1 << 24
+RUN_FILE, CHECKPOINT_FILE, WEIGHTS_FILE = "run.json", "checkpoint.safetensors", "weights.safetensors"
+SHIPPED = Path(__file__).parents[1] / "weights"
+_LARGEST_RUN_FILE, _LARGEST_WEIGHTS_FILE = 1 << 24, 1 << 30
 
 
 @dataclass(frozen=True)
@@ -34,8 +39,8 @@ class Run:
         width: of its photographs, pixels; None for their own.
         seed: of weights and batches.
         config: network and training.
-        weights: SHA-256 of the trained weights that it began with; None from scratch.
-        version: of the program that began it.
+        weights: SHA-256 of the trained weights it started from; None from scratch.
+        version: of the program that started it.
     """
 
     scene: Path
@@ -48,7 +53,7 @@ class Run:
 
 @dataclass
 class TrainingProgress:
-    """How far a run has trained."""
+    """How far a run has been trained."""
 
     step: int = 0
     seconds: float = 0.0
@@ -56,6 +61,7 @@ class TrainingProgress:
 
 
 def write_run(folder: Path, run: Run) -> None:
+    """Write RUN/run.json."""
     data = {
         "scene": str(run.scene),
         "width": run.width,
@@ -64,12 +70,15 @@ def write_run(folder: Path, run: Run) -> None:
         "config": config_to_json(run.config),
         "weights": run.weights,
     }
-    with completed_file(folder / RUN_FILE, overwrite=True) as partial:
-        partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / RUN_FILE, data)
 
 
 def read_run(folder: Path) -> Run:
-    """Raises: RunError when the folder holds no run or one of another kind."""
+    """Read RUN/run.json.
+
+    Raises:
+        RunError: the folder holds no run, or one that does not fit this version.
+    """
     path = folder / RUN_FILE
     if not path.is_file():
         raise RunError(
@@ -109,7 +118,7 @@ def save_checkpoint(
             # The library hides the system's error number in its text.
             raise RunError(
                 f"{folder / CHECKPOINT_FILE} cannot be written ({error}): expected a folder of yours with free space; "
-                "make room and go on with --resume; the checkpoint before it is untouched"
+                "make room and continue with --resume; the checkpoint before it is untouched"
             ) from error
 
 
@@ -117,19 +126,19 @@ def load_network(folder: Path, network: nn.Module) -> TrainingProgress:
     """Read the weights of a run's checkpoint into its network.
 
     Raises:
-        RunError: there is none, it is damaged, or it belongs to another network.
+        RunError: there is no checkpoint, it is damaged, or it belongs to another network.
     """
-    tensors, progress = _read(folder)
-    _load_weights(folder, network, tensors)
+    tensors, progress = _read_checkpoint(folder)
+    _load_state(folder, network, tensors)
     return progress
 
 
 def load_training(
     folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, generator: torch.Generator
 ) -> TrainingProgress:
-    """Read all of a run's checkpoint, so that training goes on as if it had not stopped."""
-    tensors, progress = _read(folder)
-    _load_weights(folder, network, tensors)
+    """Read all of a run's checkpoint, so that training continues as if it had not stopped."""
+    tensors, progress = _read_checkpoint(folder)
+    _load_state(folder, network, tensors)
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimizer."):
@@ -140,17 +149,14 @@ def load_training(
     return progress
 
 
-def _read(folder: Path) -> tuple[dict[str, Tensor], TrainingProgress]:
+def _read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], TrainingProgress]:
     path = folder / CHECKPOINT_FILE
     if not path.is_file():
         raise RunError(f"{folder} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
     try:
-        with safe_open(path, framework="pt") as file:
-            header: Any = json.loads((file.metadata() or {})["tidefield"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return tensors, TrainingProgress(
-            int(header["step"]), float(header["seconds"]), [float(x) for x in header["losses"]]
-        )
+        header, tensors = _read_tensors(path)
+        losses = [float(x) for x in header["losses"]]
+        return tensors, TrainingProgress(int(header["step"]), float(header["seconds"]), losses)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise RunError(
             f"{path} is damaged or of another program ({error}): expected a checkpoint that `tidefield train` wrote; "
@@ -158,7 +164,14 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], TrainingProgress]:
         ) from error
 
 
-def _load_weights(folder: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
+def _read_tensors(path: Path) -> tuple[Any, dict[str, Tensor]]:
+    """The description in a file's header, and its tensors, in today's names."""
+    with safe_open(path, framework="pt") as file:
+        header = json.loads((file.metadata() or {})["tidefield"])
+        return header, convert_names_0_1({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+
+
+def _load_state(folder: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     weights = {name.removeprefix("network."): v for name, v in tensors.items() if name.startswith("network.")}
     try:
         network.load_state_dict(weights)
@@ -167,3 +180,140 @@ def _load_weights(folder: Path, network: nn.Module, tensors: dict[str, Tensor]) 
             f"{folder / CHECKPOINT_FILE} does not fit {folder / RUN_FILE}: expected two files of one run; restore the "
             "right one"
         ) from error
+
+
+_NAMES_0_1 = (
+    (r"\btrust\.", "view_weight."),
+    (r"\bmetric$", "log_metric"),
+    (r"\btransformer\.place\.", "transformer.position."),
+    (r"\bguide\.", "prior_features."),
+    (r"\bmatch$", "agreement"),
+    (r"\bguide_height$", "prior_height"),
+    (r"\bguide_steepness$", "prior_steepness"),
+    (r"\blone_steepness$", "single_view_steepness"),
+)
+"""Parameters' names of version 0.1 as patterns, and today's."""
+
+
+def convert_names_0_1(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of a file, with the parameter names of version 0.1 replaced by today's.
+
+    The order of the parameters, by which a checkpoint numbers the optimiser's state, is the same in both.
+    """
+    if not any(re.search(r"\bstages\.\d+\.aggregate\.", name) for name in tensors):
+        return tensors
+    # The paper's network has one pass, whose boxes are now the network's own.
+    swift = any(name.endswith("sharpen") for name in tensors)
+    converted = {}
+    for name, value in tensors.items():
+        # Not the encoder's stages, which keep their name.
+        name = re.sub(r"^(network\.)?stages\.(\d+)\.", r"\1passes.\2." if swift else r"\1", name)
+        for pattern, today in _NAMES_0_1:
+            name = re.sub(pattern, today, name)
+        converted[name] = value
+    return converted
+
+
+def shipped_weights(preset: str) -> Path | None:
+    """The weights of a preset that are installed, if there are any.
+
+    `swift`'s are part of the package; `paper`'s, 54 times as large, are a package of their own.
+    """
+    places = [SHIPPED]
+    package = find_spec("tidefield_paper_weights")
+    if package is not None and package.origin is not None:
+        places.append(Path(package.origin).parent)
+    return next((file for place in places if (file := place / f"{preset}.safetensors").is_file()), None)
+
+
+def given_or_shipped(given: Path | None, preset: str) -> Path:
+    """The named weights, or else those of the preset that are installed.
+
+    Raises:
+        RunError: there are neither.
+    """
+    found = given or shipped_weights(preset)
+    if found is None:
+        raise RunError(
+            f"no weights of {preset} are installed: expected --weights FILE, or the package tidefield-paper-weights "
+            "(weights/paper in the repository); install it, name a file, or use --preset swift"
+        )
+    return found
+
+
+def write_weights(path: Path, network: Network, config: Config, description: dict[str, Any]) -> None:
+    """Write a network's weights in half precision, over older ones.
+
+    Args:
+        path: the file.
+        network: whose weights.
+        config: of the network.
+        description: what else to keep with them, for JSON.
+    """
+    state = network.state_dict()
+    tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in state.items()}
+    header = {"config": config_to_json(config), "version": __version__, **description}
+    with completed_file(path, overwrite=True) as partial:
+        save_file(tensors, partial, metadata={"tidefield": json.dumps(header)})
+
+
+def weights_sha256(path: Path) -> str:
+    """SHA-256 of a weights file, for records.
+
+    Raises:
+        RunError: there is no such file.
+    """
+    _require_weights(path)
+    return file_sha256(path)
+
+
+def describe_weights(path: Path) -> dict[str, Any]:
+    """The description in a weights file.
+
+    Raises:
+        RunError: there is no such file, or it is damaged.
+    """
+    return _read_weights(path)[0]
+
+
+def read_weights(path: Path, network: Network) -> None:
+    """Read a weights file into a network.
+
+    Raises:
+        RunError: there is no such file, it is damaged, or it belongs to another network.
+    """
+    header, tensors = _read_weights(path)
+    config = config_from_json(header["config"])
+    assert isinstance(config, Config), "other methods have no weights files"
+    own, theirs = _comparable(asdict(network.config)), _comparable(asdict(config.network))
+    if theirs != own:
+        different = ", ".join(sorted(name for name in own if theirs.get(name) != own[name]))
+        raise RunError(f"{path} belongs to another network ({different} differ): expected weights of this one")
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if name in tensors:
+                value.copy_(tensors[name])
+
+
+def _require_weights(path: Path) -> None:
+    if not path.is_file() or path.stat().st_size > _LARGEST_WEIGHTS_FILE:
+        raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
+
+
+def _read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    _require_weights(path)
+    try:
+        header, tensors = _read_tensors(path)
+        header["config"]["network"].keys()
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise RunError(
+            f"{path} is damaged or of another program ({error}): expected what `tidefield pretrain` wrote; name another"
+        ) from error
+    return header, tensors
+
+
+def _comparable(network: dict[str, Any]) -> dict[str, Any]:
+    """What the weights depend on: the numbers of views and of samples along a ray are free."""
+    kept = {name: value for name, value in network.items() if name not in ("views", "passes")}
+    passes = [{name: value for name, value in one.items() if name != "samples"} for one in network["passes"]]
+    return {**kept, "passes": passes}

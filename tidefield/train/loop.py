@@ -1,4 +1,4 @@
-"""Training on one scene."""
+"""Training: the loop, and the trainer of one scene."""
 
 from __future__ import annotations
 
@@ -9,27 +9,26 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import torch
+from rich.console import Console
 from tensorboardX import SummaryWriter
 from torch import nn
 
-from tidefield.config import Config, TrainConfig
+from tidefield.config import Budget, Config
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.scene import Scene
+from tidefield.evaluation.metrics import psnr_from_mse
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.network import Network
+from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.checkpoint import TrainingProgress, load_training, save_checkpoint
-from tidefield.train.display import Display
-from tidefield.train.losses import psnr
-from tidefield.train.objective import Objective
-from tidefield.train.weights import read_weights
+from tidefield.progress import ProgressBar
+from tidefield.train.checkpoint import TrainingProgress, load_training, read_weights, save_checkpoint
+from tidefield.train.losses import BatchLoss
 
 log = logging.getLogger(__name__)
 
@@ -37,61 +36,46 @@ SAVE_SECONDS = 60.0
 PICTURE_SECONDS = 300.0
 FINAL_RATE = 0.02
 """Learning rate at the end, as a share of its peak; it falls along half a cosine."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """When training ends: after so many steps or so many minutes of training, whichever is given."""
-
-    steps: int | None = None
-    minutes: float | None = None
-
-    def share(self, progress: TrainingProgress) -> float:
-        """How much of the budget is used, 0 to 1."""
-        if self.steps is not None:
-            return min(1.0, progress.step / max(self.steps, 1))
-        assert self.minutes is not None, "a budget is steps or minutes"
-        return min(1.0, progress.seconds / max(60 * self.minutes, 1e-9))
-
+ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
+"""Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
 
 Callback = Callable[["Trainer", float], None]
-"""Is told of the learner and of the share of the budget that is used."""
+"""Called with the trainer and the share of the budget that is used."""
 
 
 class Trainer(ABC):
-    """A network, its optimiser and its place in the sequence of random batches: what the loop trains.
+    """A network, its optimiser and its position in the sequence of random batches.
 
     The same seed, scene and budget in steps give the same weights bit for bit on a CPU, however often training is
     stopped and resumed.
 
     Args:
         network: on `device`.
-        groups: of parameters, as torch's optimisers take them, each with its "peak" learning rate.
+        learning_rate: its peak.
         scene: to learn from.
         seed: of the batches.
         device: where to compute.
-        betas, eps: Adam's.
+        adam: further options of the optimiser.
     """
 
     def __init__(
         self,
         network: nn.Module,
-        groups: list[dict[str, Any]],
+        learning_rate: float,
         scene: Scene,
         seed: int,
         device: torch.device,
-        betas: tuple[float, float],
-        eps: float,
+        adam: dict[str, Any],
     ) -> None:
-        self.network, self.scene, self.device = network, scene, device
+        self.network, self.learning_rate, self.scene, self.device = network, learning_rate, scene, device
         self.generator = torch.Generator().manual_seed(seed)
-        self.optimizer = torch.optim.Adam([group for group in groups if group["params"]], betas=betas, eps=eps)
+        self.optimizer = torch.optim.Adam(network.parameters(), **adam)
         self.progress = TrainingProgress()
         self.cameras = scene.cameras.to(device)
 
     @property
-    def leads(self) -> bool:
-        """Whether it writes what has been learned: one of several processes that train together."""
+    def is_main_process(self) -> bool:
+        """Whether this process writes what is learned: one of several that train together does."""
         return True
 
     @property
@@ -109,19 +93,19 @@ class Trainer(ABC):
 
     @abstractmethod
     def renderer(self) -> Render:
-        """What has been learned so far as a method; the network is in evaluation mode."""
+        """The trained method so far; the network is in evaluation mode."""
 
     def views(self, cameras: Sequence[Cameras]) -> list[Rendering]:
-        """What has been learned so far, seen by some cameras."""
+        """Render some cameras with what has been learned so far."""
         self.network.eval()
         render = self.renderer()
         renderings = [render(camera) for camera in cameras]
         self.network.train()
         return renderings
 
-    def agreed(self, stop: bool) -> bool:
+    def should_stop(self, asked: bool) -> bool:
         """Whether to stop: where several processes train together, when one of them is asked to."""
-        return stop
+        return asked
 
     def resume(self, folder: Path) -> None:
         self.progress = load_training(folder, self.network, self.optimizer, self.generator)
@@ -132,9 +116,9 @@ class Trainer(ABC):
     def step(self, budget: Budget) -> float:
         """One step of gradient descent; returns the mean squared error of its colours."""
         start = time.perf_counter()
-        rate = self.rate(budget.share(self.progress))
+        rate = self.rate(budget.share(self.progress.step, self.progress.seconds))
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * group["peak"]
+            group["lr"] = rate * self.learning_rate
         loss, error = self.loss()
         self.optimizer.zero_grad()
         loss.backward()
@@ -148,7 +132,15 @@ class Trainer(ABC):
 
 
 class SceneTrainer(Trainer):
-    """Trains the paper's network on tiles of photographs and their neighbours."""
+    """Trains a network over neighbouring views on tiles of one scene's photographs.
+
+    Args:
+        config: network and training.
+        scene: to learn from.
+        seed: of weights and batches.
+        device: where to compute.
+        weights: a weights file to start from; random weights if None.
+    """
 
     network: Network
 
@@ -157,16 +149,13 @@ class SceneTrainer(Trainer):
     ) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            network = Network(config.network).to(device)
+            network = make_network(config.network).to(device)
         if weights is not None:
             read_weights(weights, network)
-        if network.field is not None:
-            network.field.cover(*scene_ball(scene))
-        # A small epsilon: the field's gradients are tiny, and Adam's default would stop them.
-        super().__init__(network, groups_of(network, config.train), scene, seed, device, (0.9, 0.99), 1e-12)
+        super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
         self.config = config
-        self.surfaces = DepthPriors(scene)
-        self.objective = Objective(network, config.train)
+        self.priors = DepthPriors(scene)
+        self.batch_loss = BatchLoss(network, config.train)
 
     @property
     def rays_per_step(self) -> int:
@@ -176,17 +165,10 @@ class SceneTrainer(Trainer):
         return cosine_rate(self.progress.step, share, self.config.train.warm_up)
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.objective(self.scene, self.surfaces, self.cameras, self.config.network.views, self.generator)
+        return self.batch_loss(self.scene, self.priors, self.cameras, self.config.network.views, self.generator)
 
     def renderer(self) -> Render:
         return Renderer(self.network, self.scene, self.config, self.device)
-
-
-def groups_of(network: Network, config: TrainConfig) -> list[dict[str, Any]]:
-    """The network's parameters as the optimiser takes them: the per-scene field has a rate of its own."""
-    field = [p for name, p in network.named_parameters() if name.startswith("field.")]
-    rest = [p for name, p in network.named_parameters() if not name.startswith("field.")]
-    return [{"params": rest, "peak": config.learning_rate}, {"params": field, "peak": config.field_learning_rate}]
 
 
 def cosine_rate(step: int, share: float, warm_up: int) -> float:
@@ -195,54 +177,66 @@ def cosine_rate(step: int, share: float, warm_up: int) -> float:
     return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
 
-def train(trainer: Trainer, folder: Path, budget: Budget, display: Display, watch: Callback | None = None) -> bool:
-    """Train until the budget is used; save every minute and at the end, and on Ctrl-C or a polite kill.
+def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, callback: Callback | None = None) -> bool:
+    """Train until the budget is used; save every minute, at the end, and on Ctrl-C or SIGTERM.
 
     Args:
         trainer: what to train.
         folder: the run's.
         budget: steps or minutes.
-        display: where progress is shown.
-        watch: called after every step; the clock stands still meanwhile.
+        console: where progress is shown.
+        callback: called after every step; its time does not count.
 
     Returns:
-        Whether the budget was used up; False after an interruption, from which `resume` goes on.
+        Whether the budget was used up; False after an interruption, from which `resume` continues.
     """
     progress = trainer.progress
-    writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=trainer.leads)
+
+    def used() -> float:
+        return budget.share(progress.step, progress.seconds)
+
+    writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=trainer.is_main_process)
     saved = pictured = time.monotonic()
-    with writer, display, _interruption() as interrupted:
-        while budget.share(progress) < 1 and not trainer.agreed(interrupted()):
+    with writer, ProgressBar(console, "Training") as bar, _stop_requests() as stop_requested:
+        while used() < 1 and not trainer.should_stop(stop_requested()):
             error = trainer.step(budget)
             if not math.isfinite(error):
                 raise FloatingPointError(
                     f"the loss is {error} at step {progress.step}; this is a defect of the program"
                 )
             mean = sum(progress.losses) / len(progress.losses)
-            display.update(trainer, budget, mean)
+            bar(used(), 1, _state(trainer, mean))
             if progress.step % 20 == 0:
-                writer.add_scalar("train/psnr", psnr(mean), progress.step)
+                writer.add_scalar("train/psnr", psnr_from_mse(mean), progress.step)
                 writer.add_scalar("train/mean_square_error", error, progress.step)
-            if watch is not None:
-                watch(trainer, budget.share(progress))
+            if callback is not None:
+                callback(trainer, used())
             now = time.monotonic()
-            if not trainer.leads:
+            if not trainer.is_main_process:
                 continue
             if now - saved > SAVE_SECONDS:
                 trainer.save(folder)
                 saved = now
             if now - pictured > PICTURE_SECONDS:
-                _picture(trainer, writer)
+                _write_picture(trainer, writer)
                 pictured = time.monotonic()
-        if trainer.leads:
+        if trainer.is_main_process:
             trainer.save(folder)
-        if trainer.leads and not interrupted():
-            _picture(trainer, writer)
-    return budget.share(progress) >= 1
+        if trainer.is_main_process and not stop_requested():
+            _write_picture(trainer, writer)
+    return used() >= 1
 
 
-def _picture(trainer: Trainer, writer: SummaryWriter) -> None:
-    """A held-out view, if there is one, as TensorBoard picture."""
+def _state(trainer: Trainer, mean_square: float) -> str:
+    """Step, loss, PSNR and rays per second."""
+    progress = trainer.progress
+    rays = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9)
+    psnr = psnr_from_mse(mean_square)
+    return f"step {progress.step}  loss {mean_square:.5f}  PSNR {psnr:.2f} dB  {rays:,.0f} rays/s"
+
+
+def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:
+    """Write a held-out view, if there is one, as TensorBoard picture."""
     scene = trainer.scene
     index = (scene.test or scene.train)[0]
     (rendering,) = trainer.views([scene.cameras[index]])
@@ -250,22 +244,9 @@ def _picture(trainer: Trainer, writer: SummaryWriter) -> None:
     writer.add_image("truth and rendering", both.numpy(), trainer.progress.step, dataformats="HWC")
 
 
-def scene_ball(scene: Scene) -> tuple[torch.Tensor, float]:
-    """Centre and radius of what the training cameras look at, for the per-scene field."""
-    cameras = scene.cameras[list(scene.train)]
-    if scene.points is not None:
-        centre = scene.points.xyz_world.median(0).values
-        radius = (scene.points.xyz_world - centre).norm(dim=1).quantile(0.9).item()
-        return centre, radius
-    middle = 2 / (1 / cameras.near_far).sum(1)
-    spots = cameras.position_world + cameras.forward_world * middle[:, None]
-    centre = spots.mean(0)
-    return centre, 0.75 * (cameras.position_world - centre).norm(dim=1).max().item()
-
-
 @contextmanager
-def _interruption() -> Iterator[Callable[[], bool]]:
-    """Turns SIGINT and SIGTERM into a question that can be asked between steps; a second SIGINT interrupts at once."""
+def _stop_requests() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a question to ask between steps; a second SIGINT interrupts at once."""
     asked = False
 
     def handler(number: int, frame: FrameType | None) -> None:

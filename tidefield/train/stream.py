@@ -1,8 +1,8 @@
 """An endless stream of scenes to learn from: procedural tidal flats, and real ones.
 
-Scene k of a seed is always the same. A few are at hand at a time; after so many steps the oldest makes room for the
-next, which another process has made meanwhile. Procedural or real, a scene comes with hardships of its own: few sparse
-points, photographs that are a little off, and exposures that are not quite evened out.
+Scene k of a seed is always the same. A pool of a few scenes is drawn from; every so many steps the
+oldest is replaced by the next one, which another process has made meanwhile. Procedural or real, each scene is
+augmented: few sparse points, photographs that are a little misaligned, exposures that are not quite corrected.
 """
 
 from __future__ import annotations
@@ -30,40 +30,41 @@ from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
-AT_HAND = 8
-"""Scenes at a time."""
+POOL_SIZE = 8
+"""Scenes that are drawn from at a time."""
 STEPS_EACH = 200
-"""Steps after which the oldest makes room."""
+"""Steps after which the oldest scene is replaced."""
 REAL_SHARE = 0.5
-"""Of the scenes, where there are real ones."""
+"""Share of real scenes, where there are some."""
 WIDTHS = (256, 400)
-"""Of real scenes' photographs: each is there at both."""
+"""Of the photographs of real scenes, pixels: each scene takes part at both."""
 MISPOSED_DEG = 0.6
+"""Error of attitudes that structure from motion got wrong."""
 SPARSE_SHARE = 0.25
-"""Of the scenes with few points, so that depth is learned from what the views see, too."""
+"""Share of the scenes with few points, so that depth is learned from the views, too."""
 SPARSE_POINTS = 0.01, 0.3
-"""Shares of the points that these have."""
+"""Range of the shares of points that these keep."""
 POINTLESS_SHARE = 0.12
-"""Of the scenes without any points, as some arrive: what the views see must do."""
+"""Share of the scenes without points: depth comes from the views alone."""
 SHIFTED_SHARE = 0.25
-"""Of the scenes whose photographs are off, so that views are averaged where they do not quite fit."""
+"""Share of the scenes with misaligned photographs, so that views are averaged where they do not quite fit."""
 SHIFT_PX = 0.2, 1.0
-"""Standard deviations of that, pixels: one for each of these scenes."""
-UNEVEN_SHARE = 0.25
-"""Of the scenes whose exposures are told wrong, so that no view is preferred for its colours."""
-UNEVEN = 0.01, 0.08
-"""Standard deviations of the logarithms of these: one for each of these scenes."""
+"""Range of the standard deviations of the misalignment, pixels."""
+EXPOSURE_ERROR_SHARE = 0.25
+"""Share of the scenes with wrong exposures, so that no view is preferred for its colours."""
+EXPOSURE_ERROR = 0.01, 0.08
+"""Range of the standard deviations of the logarithms of their gains."""
 RECOLOURED_SHARE = 0.5
-"""Of the scenes with their colours' channels in a random order, so that little is learned of mud being brown."""
+"""Share of the scenes with their colour channels in a random order, so that brown is not learned as a rule."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a procedural scene is made of; equal recipes make equal scenes.
+    """Parameters of a procedural scene; equal recipes make equal scenes.
 
     Attributes:
         category, seed, views, width, flight: of the survey.
-        misposed: photographs whose attitude is told wrong, as structure from motion now and then does.
+        misposed: photographs with a wrong attitude, as structure from motion sometimes gives.
     """
 
     category: str
@@ -75,59 +76,59 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Slot:
-    """What is at hand under a number.
+class Draw:
+    """Which scene a number stands for, and its augmentation.
 
     Attributes:
         recipe: of a procedural scene; None for a real one.
-        choice: which of the real ones, 0 to 1.
-        points_share: of the sparse points that are known.
-        shift_px: standard deviation of how far its photographs are off.
-        uneven: standard deviation of the logarithms of its exposures' errors.
+        choice: which of the real scenes, 0 to 1.
+        points_share: share of the sparse points that are kept.
+        shift_px: standard deviation of the misalignment of its photographs.
+        exposure_error: standard deviation of the logarithms of the errors of its gains.
         channels: the order of its colours' channels.
-        seed: of what is random in this.
+        seed: of the augmentation.
     """
 
     recipe: Recipe | None
     choice: float
     points_share: float
     shift_px: float
-    uneven: float
+    exposure_error: float
     channels: tuple[int, ...]
     seed: int
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A scene with what training asks of it; cameras are where the network is."""
+    """A scene with its depth priors, and its cameras on the network's device."""
 
     scene: Scene
-    surfaces: DepthPriors
+    priors: DepthPriors
     cameras: Cameras
 
 
-@cache  # asked for several at every step
-def slot(seed: int, number: int, real_share: float) -> Slot:
-    """Scene `number` of a seed, and its hardships."""
+@cache  # called several times at every step
+def describe_draw(seed: int, number: int, real_share: float) -> Draw:
+    """Scene `number` of a seed, and its augmentation."""
     random = np.random.default_rng([seed, number, 78])
     made = recipe(seed, number) if random.random() >= real_share else None
-    shares = (SHIFTED_SHARE, UNEVEN_SHARE, RECOLOURED_SHARE)
-    shifted, uneven, recoloured = (random.random() < share for share in shares)
+    shares = (SHIFTED_SHARE, EXPOSURE_ERROR_SHARE, RECOLOURED_SHARE)
+    shifted, wrong_exposure, recoloured = (random.random() < share for share in shares)
     kind, few = random.random(), math.exp(random.uniform(*np.log(SPARSE_POINTS)))
     points_share = 0.0 if kind < POINTLESS_SHARE else few if kind < POINTLESS_SHARE + SPARSE_SHARE else 1.0
-    return Slot(
+    return Draw(
         recipe=made,
         choice=float(random.random()),
         points_share=points_share,
         shift_px=float(random.uniform(*SHIFT_PX)) if shifted else 0.0,
-        uneven=float(random.uniform(*UNEVEN)) if uneven else 0.0,
+        exposure_error=float(random.uniform(*EXPOSURE_ERROR)) if wrong_exposure else 0.0,
         channels=tuple(random.permutation(3).tolist()) if recoloured else (0, 1, 2),
         seed=int(random.integers(1 << 31)),
     )
 
 
 def recipe(seed: int, number: int) -> Recipe:
-    """Procedural scene `number` of a seed: all that deployment may meet, drawn at random."""
+    """Procedural scene `number` of a seed: everything users may bring, drawn at random."""
     random = np.random.default_rng([seed, number, 77])
     views = int(random.integers(18, 32))
     flight = Flight(
@@ -159,7 +160,7 @@ def make(given: Recipe, folder: Path) -> None:
 
 
 def misposed(survey: Survey, given: Recipe) -> Survey:
-    """The survey as structure from motion tells it that got some attitudes wrong."""
+    """The survey as structure from motion gives it, with some attitudes wrong."""
     pose = survey.cameras.T_world_camera.clone()
     random = np.random.default_rng([given.seed, 5])
     for index in given.misposed:
@@ -170,42 +171,42 @@ def misposed(survey: Survey, given: Recipe) -> Survey:
 
 
 def _end_quietly() -> None:
-    """A process that is told to end ends; imported libraries would print where it stood."""
+    """End on SIGTERM without a message; imported libraries would print a traceback."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Where scenes to learn from come from."""
+    """A source of scenes to learn from."""
 
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step; the same for the same step and state of the generator."""
         ...
 
 
-def turned(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
-    """The same scene with other axes for the network; the quaternion need not be of unit length."""
+def rotate(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
+    """Rotate the world axes of a scene for the network; the quaternion need not be of unit length."""
     turn = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
     pose = drawn.cameras.T_world_camera
     return replace(drawn, cameras=replace(drawn.cameras, T_world_camera=turn.to(pose) @ pose))
 
 
 class Stream:
-    """Draws scenes.
+    """Draws scenes from a pool that is renewed as training goes on.
 
     Args:
-        folder: where the procedural ones lie while they are at hand.
-        real: folders of scenes of which only the training photographs are learned from.
-        seed: of the procedural ones.
-        device: where the network is.
+        folder: for the procedural scenes in the pool.
+        real: folders of real scenes; only their training photographs are learned from.
+        seed: of the procedural scenes.
+        device: of the network.
     """
 
     def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
         self.folder, self.seed, self.device = folder, seed, device
         self.real = [load_scene(path, width=width) for path in real for width in WIDTHS]
         self.pool: dict[int, Drawn] = {}
-        self.coming: dict[int, AsyncResult[None]] = {}
-        # A process, because making a scene keeps a core busy; a new one, because a fork of one with threads may hang.
+        self.pending: dict[int, AsyncResult[None]] = {}
+        # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
         self.maker = get_context("spawn").Pool(1, _end_quietly)
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -219,52 +220,52 @@ class Stream:
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step, the same for the same step, seed and state of the generator.
 
-        It is turned at random: directions are the world's, and nothing may be learned of where north is.
+        Its axes are rotated at random: directions are the world's, and north must mean nothing.
         """
         first = step // STEPS_EACH
-        number = first + int(torch.randint(AT_HAND, (), generator=generator))
-        for gone in [k for k in {*self.pool, *self.coming} if k < first]:
+        number = first + int(torch.randint(POOL_SIZE, (), generator=generator))
+        for gone in [k for k in {*self.pool, *self.pending} if k < first]:
             self.pool.pop(gone, None)
-            if gone in self.coming:  # nobody drew it
-                self.coming.pop(gone).get()
+            if gone in self.pending:  # made, but never drawn
+                self.pending.pop(gone).get()
             shutil.rmtree(self._path(gone), ignore_errors=True)
-        for soon in range(first, first + AT_HAND + 1):
+        for soon in range(first, first + POOL_SIZE + 1):
             self._order(soon)
         if number not in self.pool:
-            own = self._slot(number)
+            own = self._describe(number)
             scene = self.real[int(own.choice * len(self.real))] if own.recipe is None else self._made(number)
-            self.pool[number] = self._with_hardships(scene, own)
-        return turned(self.pool[number], torch.randn(4, generator=generator))
+            self.pool[number] = self._augmented(scene, own)
+        return rotate(self.pool[number], torch.randn(4, generator=generator))
 
-    def _slot(self, number: int) -> Slot:
-        return slot(self.seed, number, REAL_SHARE if self.real else 0.0)
+    def _describe(self, number: int) -> Draw:
+        return describe_draw(self.seed, number, REAL_SHARE if self.real else 0.0)
 
     def _made(self, number: int) -> Scene:
-        if number in self.coming:
-            self.coming.pop(number).get()
-        return load_scene(self._path(number), cache=self._path(number) / "decoded")  # forgotten with the scene
+        if number in self.pending:
+            self.pending.pop(number).get()
+        return load_scene(self._path(number), cache=self._path(number) / "decoded")  # deleted with the scene
 
     def _order(self, number: int) -> None:
-        """Have a procedural scene made, unless it is there or coming."""
-        wanted = self._slot(number).recipe
-        if wanted is not None and number not in self.coming and not self._path(number).exists():
-            self.coming[number] = self.maker.apply_async(make, (wanted, self._path(number)))
+        """Start making a procedural scene, unless it exists or is pending."""
+        recipe_ = self._describe(number).recipe
+        if recipe_ is not None and number not in self.pending and not self._path(number).exists():
+            self.pending[number] = self.maker.apply_async(make, (recipe_, self._path(number)))
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
 
-    def _with_hardships(self, scene: Scene, own: Slot) -> Drawn:
-        """A scene with what makes it harder; the loss is told of all points that were observed."""
+    def _augmented(self, scene: Scene, own: Draw) -> Drawn:
+        """Augment a scene; the depth loss keeps all points that were observed."""
         random = np.random.default_rng(own.seed)
-        off = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
-        light = torch.from_numpy(np.exp(random.normal(scale=own.uneven, size=(len(scene.names), 1)))).float()
-        principal, gain = scene.cameras.principal_px + off, scene.cameras.gain[:, own.channels] * light
+        shift = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
+        light = torch.from_numpy(np.exp(random.normal(scale=own.exposure_error, size=(len(scene.names), 1)))).float()
+        principal, gain = scene.cameras.principal_px + shift, scene.cameras.gain[:, own.channels] * light
         cameras = replace(scene.cameras, principal_px=principal, gain=gain)
-        known = scene.points if own.points_share else None
-        if known is not None and own.points_share < 1:
-            known = known.subset(torch.from_numpy(random.random(len(known.xyz_world)) < own.points_share))
+        points = scene.points if own.points_share else None
+        if points is not None and own.points_share < 1:
+            points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))
         photographs = scene.photographs
         if own.channels != (0, 1, 2):
             photographs = replace(photographs, colours=tuple(c[..., own.channels] for c in photographs.colours))
-        hard = replace(scene, cameras=cameras, photographs=photographs, points=known)
-        return Drawn(hard, DepthPriors(hard, scene.points), cameras.to(self.device))
+        augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
+        return Drawn(augmented, DepthPriors(augmented, scene.points), cameras.to(self.device))

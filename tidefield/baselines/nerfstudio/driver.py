@@ -18,6 +18,7 @@ import torch
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.baselines.nerfstudio.export import camera_to_json, export
+from tidefield.config import Budget
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, Curve
@@ -25,7 +26,6 @@ from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
 from tidefield.train.checkpoint import TrainingProgress
-from tidefield.train.loop import Budget
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from tidefield.config import SWIFT
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
-from tidefield.model.intervals import sample
-from tidefield.model.network import Network
-from tidefield.train.objective import Objective
-from tidefield.train.parallel_backward import side_by_side
+from tidefield.model.network import make_network
+from tidefield.model.sampling import sample
+from tidefield.parallel import differentiable_parts
+from tidefield.train.losses import BatchLoss
 
 CPU = torch.device("cpu")
 
@@ -49,7 +49,7 @@ def test_values_and_gradients_are_those_of_all_at_once() -> None:
     plain = {name: p.grad for name, p in layers.named_parameters()}
     layers.zero_grad()
     parts = [partial(layers, part) for part in x.split([2, 2, 1])]
-    found = side_by_side(parts, list(layers.parameters()), CPU)
+    found = differentiable_parts(parts, list(layers.parameters()), CPU)
     for one, other in zip(found, layers(x), strict=True):
         torch.testing.assert_close(one, other)
     loss(found).backward()
@@ -58,12 +58,12 @@ def test_values_and_gradients_are_those_of_all_at_once() -> None:
     assert layers.idle.weight.grad is None, "what takes no part has no gradient, rather than one of nothing"
 
 
-def test_what_fails_in_a_part_is_told() -> None:
+def test_an_error_in_a_part_is_raised() -> None:
     def failing() -> tuple[Tensor, ...]:
         raise ValueError("no")
 
     with pytest.raises(ValueError, match="no"):
-        side_by_side([failing], [], CPU)
+        differentiable_parts([failing], [], CPU)
 
 
 def batch_of(count: int, crop_px: int | None = 48):
@@ -96,15 +96,15 @@ def test_a_network_learns_from_parts_as_from_the_whole(monkeypatch: pytest.Monke
     """Without jitter, up to rounding: matrices of other sizes are multiplied in another order."""
     scene = wall.scene(wall.cameras(7, 96, 72, step=0.25), (3,))
     torch.manual_seed(0)
-    network = Network(SWIFT.network)
-    monkeypatch.setattr("tidefield.model.network.sample", lambda density, count, _: sample(density, count, None))
-    surfaces = DepthPriors(scene)
+    network = make_network(SWIFT.network)
+    monkeypatch.setattr("tidefield.model.swift.sample", lambda density, count, _: sample(density, count, None))
+    priors = DepthPriors(scene)
     found = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
         network.zero_grad()
         generator = torch.Generator().manual_seed(1)
-        loss, error = Objective(network, SWIFT.train)(scene, surfaces, scene.cameras, 3, generator)
+        loss, error = BatchLoss(network, SWIFT.train)(scene, priors, scene.cameras, 3, generator)
         loss.backward()
         gradient = torch.cat([p.grad.flatten() for p in network.parameters() if p.grad is not None])
         found.append((loss.detach(), error.detach(), gradient))

@@ -6,7 +6,7 @@ import torch
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from tidefield.model.harmonics import HIGHEST_DEGREE, basis, expand
+from tidefield.model.colour import HIGHEST_DEGREE, basis, expand
 
 DEGREES = range(HIGHEST_DEGREE + 1)
 

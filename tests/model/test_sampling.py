@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tidefield.model.intervals import Intervals, histogram, refined, sample
+from tidefield.model.sampling import Intervals, histogram, refine, sample
 
 DENSITY = torch.tensor([0.5, 0.0, 2.0, 4.0, 0.1, 0.0, 1.0, 0.4])
 
@@ -68,11 +68,11 @@ def test_places_and_inverse_depths_are_each_others_inverse():
     intervals = some_intervals()
     place = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(1))
     for k in range(3):
-        met = replace(intervals, expected=intervals.inverse_depth(place)[..., k])
-        torch.testing.assert_close(met.expected_place, place[..., k])
+        met = replace(intervals, inv_expected=intervals.inverse_depth(place)[..., k])
+        torch.testing.assert_close(met.s_expected, place[..., k])
     ends = intervals.inverse_depth(torch.tensor([0.0, 1.0]).expand(2, 5, 2))
-    torch.testing.assert_close(ends, torch.stack([intervals.near, intervals.far], -1))
-    torch.testing.assert_close(intervals.expected_place, torch.full((2, 5), 0.5))
+    torch.testing.assert_close(ends, torch.stack([intervals.inv_near, intervals.inv_far], -1))
+    torch.testing.assert_close(intervals.s_expected, torch.full((2, 5), 0.5))
 
 
 @pytest.mark.parametrize("bins", [1, 2, 6, 24])
@@ -124,10 +124,10 @@ def test_refining_interpolates_planes_of_inverse_depths_exactly(ratio: int, marg
 
     near, far, expected, bin_ = planes(coarse).unbind(-1)
     density = torch.stack([bin_, torch.full_like(bin_, 0.7)], -1)
-    result, looked = refined(Intervals(near, far, expected), density, ratio, margin)
+    result, looked = refine(Intervals(near, far, expected), density, ratio, margin)
     true = planes(fine)
-    torch.testing.assert_close(result.near, true[..., 0])
-    torch.testing.assert_close(result.far, true[..., 1])
-    torch.testing.assert_close(result.expected, true[..., 2])
+    torch.testing.assert_close(result.inv_near, true[..., 0])
+    torch.testing.assert_close(result.inv_far, true[..., 1])
+    torch.testing.assert_close(result.inv_expected, true[..., 2])
     torch.testing.assert_close(looked[..., 0], true[..., 3])
     torch.testing.assert_close(looked[..., 1], torch.full_like(true[..., 3], 0.7))

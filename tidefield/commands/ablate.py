@@ -1,0 +1,54 @@
+"""`tidefield ablate`: what each part of a preset contributes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import Device, Preset, Verbosity
+from tidefield.commands.compare import make_settings, print_lines, run_all
+from tidefield.config import PRESETS, Budget
+from tidefield.variants import vary
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Train and evaluate variants of a preset, each with one part left out or changed; write a table for each scene.
+
+    What is done is not repeated: the same command continues after an interruption, and with more variants or scenes.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
+    variants: tuple[str, ...] = ()
+    """Which; all of them if not given."""
+    preset: Preset = "swift"
+    """What they are variants of."""
+    budget: OmitArgPrefixes[Budget] = Budget()
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    out: Path = Path("ablation")
+    """Folder for the runs and the table."""
+    device: Device = "auto"
+    seed: int = 0
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def ablate(options: Ablate, console: Console) -> None:
+    """Run `tidefield ablate`."""
+    from tidefield.compare import protocols
+    from tidefield.compare.ablation import variants
+    from tidefield.compare.write import write_ablation
+
+    for name in options.variants:
+        vary(PRESETS[options.preset], name)  # before anything is trained
+    # From scratch, all of them: trained weights would belong to one of the variants only.
+    settings = make_settings(options.budget, options.width, options.device, options.seed, True, options.preset)
+    scenes = protocols.named(options.scenes)
+    results = run_all(scenes, variants(options.variants), settings, options.out, console)
+    print_lines(console, write_ablation(results, settings, options.out))

@@ -1,0 +1,92 @@
+"""Options that several commands share, and how a run or a scene is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+from tyro.extras import literal_type_from_choices
+
+from tidefield.config import PRESETS, config_to_json
+from tidefield.methods import names
+
+if TYPE_CHECKING:
+    import torch
+    from rich.console import Console
+
+    from tidefield.data.scene import Scene
+    from tidefield.model.rendering import Render
+
+Preset = Literal["swift", "paper"]
+Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
+AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
+
+
+def choice(*method_names: str) -> Any:
+    """An option that takes one of some methods' names."""
+    return arg(constructor=literal_type_from_choices(method_names))
+
+
+TrainedMethod = Annotated[str, choice("tidefield", *names("nerf", "nerfstudio"))]
+UntrainedMethod = Annotated[str, choice(*names("untrained"))]
+AnyMethod = Annotated[str, choice(*names())]
+
+
+@dataclass(frozen=True)
+class Verbosity:
+    """How much is printed."""
+
+    verbose: Annotated[bool, arg(aliases=["-v"])] = False
+    """Print more."""
+    quiet: Annotated[bool, arg(aliases=["-q"])] = False
+    """Print nothing but errors."""
+
+
+@dataclass(frozen=True)
+class ZeroShot:
+    """Trained weights on a scene they were not trained on, instead of a run."""
+
+    zero_shot: bool = False
+    """Use a scene with trained weights, without training on it."""
+    preset: Preset = "swift"
+    """The network."""
+    weights: Path | None = None
+    """Its weights, of `tidefield pretrain`; the installed ones if not given."""
+
+
+def load(scene: Path, width: int | None, allow_missing: bool, console: Console) -> Scene:
+    """Read a scene, with progress while photographs are decoded."""
+    from tidefield.data.load import load_scene
+    from tidefield.progress import ProgressBar
+
+    with ProgressBar(console, "Reading photographs") as bar:
+        return load_scene(scene, width=width, allow_missing=allow_missing, progress=bar)
+
+
+def open_zero_shot(zero: ZeroShot, scene: Scene, device: torch.device) -> tuple[Render, dict[str, Any]]:
+    """Trained weights as a method on a scene, and its record."""
+    from tidefield.methods import zero_shot
+    from tidefield.train.checkpoint import given_or_shipped
+
+    config = PRESETS[zero.preset]
+    render, digest = zero_shot(config, given_or_shipped(zero.weights, zero.preset), scene, device)
+    return render, {**config_to_json(config), "weights": digest}
+
+
+@contextmanager
+def open_trained(
+    folder: Path, device: torch.device, allow_missing: bool, console: Console
+) -> Iterator[tuple[Scene, Render, dict[str, Any]]]:
+    """The scene and the method of a run, while the block lasts, and its record."""
+    from tidefield.methods import trained
+    from tidefield.train.checkpoint import read_run
+
+    run = read_run(folder)
+    scene = load(run.scene, run.width, allow_missing, console)
+    with trained(folder, run, scene, device) as (render, progress):
+        done = {"steps": progress.step, "seconds": progress.seconds}
+        yield scene, render, {**config_to_json(run.config), "seed": run.seed, "weights": run.weights, "trained": done}

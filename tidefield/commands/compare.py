@@ -1,0 +1,113 @@
+"""`tidefield compare`: methods on the same scenes, under the same conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import AnyMethod, Device, Verbosity
+from tidefield.config import Budget
+from tidefield.errors import RunError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from tidefield.compare.results import Results
+    from tidefield.compare.run import Settings
+
+SYNTHETIC_WIDTH = 400
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train and evaluate methods on the same scenes, split, resolution, machine and budget; write tables and figures.
+
+    What is done is not repeated: the same command continues after an interruption, and with more methods or scenes.
+    """
+
+    scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="[SCENE ...]")] = ()
+    """Scenes; with --protocol tidalflats in addition to its own, with --protocol mipnerf360 the folder of the data
+    set."""
+    methods: tuple[AnyMethod, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
+    """Which, in the order of the tables. tidefield and paper are our presets, zero-shot and paper-zero-shot the same
+    without training on the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; the others need no
+    training."""
+    budget: OmitArgPrefixes[Budget] = Budget()
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    from_scratch: bool = False
+    """Start our presets from random weights."""
+    protocol: Literal["mipnerf360", "tidalflats"] | None = None
+    """A named set of scenes: the seven public ones of mip-NeRF 360, or five synthetic tidal flats."""
+    out: Path = Path("comparison")
+    """Folder for the runs, tables and figures."""
+    device: Device = "auto"
+    seed: int = 0
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def compare(options: Compare, console: Console) -> None:
+    """Run `tidefield compare`."""
+    from tidefield.baselines.nerfstudio import driver
+    from tidefield.compare.write import write_comparison
+    from tidefield.device import choose_device
+
+    if find_spec("matplotlib") is None:
+        raise RunError("matplotlib is not installed: expected it, for the curves; pip install 'tidefield[compare]'")
+    for method in ("nerfacto", "splatfacto"):
+        if method in options.methods:
+            driver.require(method, choose_device(options.device))  # before anything is trained
+    scenes = _scenes(options)
+    settings = make_settings(options.budget, options.width, options.device, options.seed, options.from_scratch)
+    results = run_all(scenes, options.methods, settings, options.out, console)
+    print_lines(console, write_comparison(results, scenes, settings, options.out))
+
+
+def make_settings(
+    budget: Budget, width: int | None, device: str, seed: int, from_scratch: bool, preset: str = "swift"
+) -> Settings:
+    """What all methods of a comparison share; the record has the device that "auto" stands for."""
+    from tidefield.compare.run import Settings
+    from tidefield.device import choose_device
+
+    budget = budget.checked()
+    return Settings(
+        budget.minutes, budget.steps, width, str(choose_device(device)), seed, preset=preset, from_scratch=from_scratch
+    )
+
+
+def run_all(
+    scenes: Mapping[str, Path], methods: Sequence[str], settings: Settings, out: Path, console: Console
+) -> Results:
+    """Train and evaluate what has not been done yet, and read all results."""
+    from tidefield.compare.record import run_measured
+    from tidefield.compare.results import read_results
+    from tidefield.compare.run import compare
+
+    compare(scenes, methods, settings, out, run_measured, lambda text: print_lines(console, [text]))
+    return read_results(out, list(scenes), methods)
+
+
+def print_lines(console: Console, lines: Iterable[object]) -> None:
+    for line in lines:
+        console.print(str(line), highlight=False, soft_wrap=True)
+
+
+def _scenes(options: Compare) -> dict[str, Path]:
+    """Folders of the scenes by name."""
+    from tidefield.compare import protocols
+
+    if options.protocol == "mipnerf360":
+        if len(options.scenes) != 1:
+            raise RunError("--protocol mipnerf360 compares on one data set: expected its folder; name it alone")
+        return protocols.mipnerf360(options.scenes[0], options.out / "scenes")
+    if options.protocol == "tidalflats":
+        return protocols.tidal_flats(options.out / "scenes", options.width or SYNTHETIC_WIDTH, options.scenes)
+    if not options.scenes:
+        raise RunError("nothing to compare on: expected scenes, or --protocol; name some")
+    return protocols.named(options.scenes)

@@ -1,0 +1,80 @@
+"""`tidefield evaluate`: measure a method on held-out photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import (
+    AllowMissing,
+    Device,
+    UntrainedMethod,
+    Verbosity,
+    ZeroShot,
+    load,
+    open_trained,
+    open_zero_shot,
+)
+from tidefield.errors import RunError
+from tidefield.methods import untrained
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from tidefield.evaluation.evaluate import Evaluation
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare renderings of the held-out photographs with the photographs.
+
+    Writes evaluation.json and pictures: `tidefield evaluate RUN` into the run, `tidefield evaluate SCENE OUT --method
+    sparse-depth` into a folder of its own, for methods that need no training.
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A run, or with --method or --zero-shot a scene."""
+    out: Annotated[Positional[Path | None], arg(metavar="[OUT]")] = None
+    """Where to write; the run itself if not given."""
+    method: UntrainedMethod | None = None
+    """Evaluate this method on a scene instead of a run."""
+    zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
+    width: int | None = None
+    """Width of the photographs in pixels, with --method or --zero-shot; a run has its own."""
+    device: Device = "auto"
+    download_lpips: bool = False
+    """Download the weights that LPIPS needs (AlexNet 233 MB, VGG 528 MB) if they are missing."""
+    overwrite: bool = False
+    """Replace an existing evaluation."""
+    allow_missing: AllowMissing = False
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def evaluate(options: Evaluate, console: Console) -> Evaluation:
+    """Run `tidefield evaluate`."""
+    from tidefield.device import choose_device
+    from tidefield.evaluation.evaluate import evaluate as evaluate_method
+    from tidefield.evaluation.lpips import download_lpips_weights
+
+    if options.download_lpips:
+        download_lpips_weights()
+    source, out, method, zero_shot = options.source, options.out, options.method, options.zero.zero_shot
+    settings = {"overwrite": options.overwrite, "console": console}
+    if method is not None and zero_shot:
+        raise RunError("both --method and --zero-shot are given: expected one of them; leave one out")
+    if method is None and not zero_shot:
+        if options.width is not None:
+            raise RunError("--width belongs to --method and --zero-shot: a run has its own width; leave it out")
+        with open_trained(source, choose_device(options.device), options.allow_missing, console) as opened:
+            scene, render, record = opened
+            return evaluate_method(render, scene, out or source, configuration=record, **settings)
+    if out is None:
+        raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
+    scene = load(source, options.width, options.allow_missing, console)
+    if method is not None:
+        return evaluate_method(untrained(method, scene), scene, out, configuration={"method": method}, **settings)
+    render, record = open_zero_shot(options.zero, scene, choose_device(options.device))
+    return evaluate_method(render, scene, out, configuration=record, **settings)

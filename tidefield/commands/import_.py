@@ -1,0 +1,52 @@
+"""`tidefield import`: from a project of another program to a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import AllowMissing, Verbosity
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make a scene of a project of ODM or OpenSfM, of a COLMAP model, or of nerfstudio's transforms.json.
+
+    Poses and photographs stay as they are. The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio,
+    gsplat and OpenSplat open it, too.
+    """
+
+    project: Annotated[Positional[Path], arg(metavar="PROJECT")]
+    """Folder of the project or scene."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder for the scene; must be new."""
+    link: bool = False
+    """Give the photographs a second name (hard links) instead of copying them."""
+    allow_missing: AllowMissing = False
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def import_project(options: Import, console: Console) -> None:
+    """Run `tidefield import`."""
+    from tidefield.progress import ProgressBar
+    from tidefield.survey import import_project as importing
+
+    with ProgressBar(console, "Copying photographs") as bar:
+        made = importing.import_project(
+            options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=bar
+        )
+    observed = f", observed {made.observations:,} times" if made.observations else ""
+    frame = made.georeference and made.georeference.frame
+    where = f"; in metres about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f} ({frame.crs})" if frame else ""
+    console.print(
+        f"{options.scene}: {made.photographs} photographs, {made.held_out} of them held out; {made.cameras} "
+        f"camera{'s' * (made.cameras > 1)}; {made.points:,} sparse points{observed}{where}",
+        highlight=False,
+        soft_wrap=True,
+    )

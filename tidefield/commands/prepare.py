@@ -1,0 +1,90 @@
+"""`tidefield prepare`: from a folder of photographs to a scene."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import Verbosity
+from tidefield.errors import RunError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+log = logging.getLogger(__name__)
+
+Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Make a scene of a folder of drone photographs: quality, poses, georeference, colours and a report.
+
+    The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio, gsplat and OpenSplat open it, too. Ctrl-C
+    loses at most the running stage; the same command continues, and a changed option redoes only what depends on it.
+    """
+
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder with the photographs (JPEG, PNG, TIFF), in sub-folders too."""
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder for the scene: a new one, or one to continue."""
+    gps: Path | None = None
+    """Positions of the photographs (gps.csv or ODM's geo.txt), instead of EXIF's; without it, such a file next to the
+    photographs is used where EXIF has none."""
+    control: Path | None = None
+    """Ground control (ODM's gcp_list.txt); without it, such a file next to the photographs is used."""
+    no_control: Annotated[bool, arg(name="no-control", help="Use no ground control, even if a file is there.")] = False
+    keep_all: bool = False
+    """Use photographs of low quality, too."""
+    colour: Literal["auto", "on", "off"] = "auto"
+    """Correct exposures and the lens' falloff: where it helps, always, or never."""
+    features: int = 6000
+    """Most features to find in a photograph."""
+    feature_width: int = 2400
+    """Longer side in pixels to which larger photographs are reduced to find features."""
+    redo: Stage | None = None
+    """Repeat this stage, and all that follow."""
+    device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def prepare(options: Prepare, console: Console) -> None:
+    """Run `tidefield prepare`."""
+    import pycolmap
+
+    from tidefield.survey.findings import findings
+    from tidefield.survey.io.photographs import read_survey
+    from tidefield.survey.prepare import PrepareOptions
+    from tidefield.survey.prepare import prepare as prepare_scene
+    from tidefield.survey.report import write_report
+    from tidefield.survey.sfm.features import FeatureOptions, choose_device
+
+    if options.control is not None and options.no_control:
+        raise RunError("both --control and --no-control are given: expected one of them; leave one out")
+    survey = read_survey(options.photographs, options.gps, options.control)
+    # pycolmap logs every step of structure from motion.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.verbosity.verbose else pycolmap.logging.ERROR)
+    if options.no_control:
+        survey = replace(survey, control=None)
+    for remark in survey.remarks:
+        log.warning(remark)
+    how = PrepareOptions(
+        keep_all=options.keep_all,
+        colour=options.colour,
+        features=FeatureOptions(options.feature_width, options.features),
+        redo=options.redo,
+    )
+    prepared = prepare_scene(survey, options.scene, how, choose_device(options.device), console)
+    given = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
+    report = write_report(findings(prepared, options.scene, given), options.scene)
+    missing = len(survey.photographs) - len(prepared.models[0])
+    reasons = f"; why {missing} are missing, and more, is in {report.page}" if missing else f"; see {report.page}"
+    console.print(
+        f"{options.scene}: {len(prepared.models[0])} of {len(survey.photographs)} photographs{reasons}",
+        highlight=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,81 @@
+"""`tidefield pretrain`: learn across scenes, for weights that work on new ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import Device, Preset, Verbosity
+from tidefield.commands.train import report_end
+from tidefield.config import PRESETS, Budget
+from tidefield.errors import RunError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    """Train across scenes, procedural tidal flats and real ones, for weights that work without training on a scene.
+
+    Writes OUT/weights.safetensors. Ctrl-C saves before it stops; --resume continues from there. Several GPUs or
+    machines train together under torchrun: `torchrun --nproc-per-node 4 -m tidefield.cli pretrain OUT --steps 100000`.
+    """
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder for the result; must be new, unless --resume is given."""
+    real: tuple[Path, ...] = ()
+    """Scenes to learn from, too; only their training photographs are used."""
+    preset: Preset = "swift"
+    budget: OmitArgPrefixes[Budget] = Budget()
+    seed: int = 0
+    """Of the weights, the scenes and their order."""
+    device: Device = "auto"
+    resume: bool = False
+    """Continue the training in the folder."""
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def pretrain(options: Pretrain, console: Console) -> None:
+    """Run `tidefield pretrain`."""
+    from rich.console import Console
+
+    from tidefield import machine
+    from tidefield.device import choose_device
+    from tidefield.train import pretrain as across
+    from tidefield.train.checkpoint import WEIGHTS_FILE, write_weights
+    from tidefield.train.loop import train
+    from tidefield.train.stream import Stream
+
+    budget, folder, config = options.budget.checked(), options.out, PRESETS[options.preset]
+    occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
+    if occupied:
+        raise RunError(f"{folder} is not empty: expected a new folder; choose another, or continue it with --resume")
+    if not across.is_main_process():
+        console = Console(quiet=True)
+    if across.is_distributed() and budget.steps is None:
+        raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
+    validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
+    with Stream(folder / "scenes", options.real, across.process_seed(options.seed), device) as stream:
+        shown = next(iter(validation.scenes.values()))
+        trainer = across.Pretrainer(config, stream, shown, options.seed, device)
+        if options.resume:
+            trainer.resume(folder)
+        finished = train(trainer, folder, budget, console, validation)
+    if trainer.is_main_process:
+        done = trainer.progress
+        description = {
+            "steps": done.step,
+            "seconds": done.seconds,
+            "seed": options.seed,
+            "real": [scene.resolve().name for scene in options.real],
+            **machine.describe(),
+            "processes": across.world_size(),
+            "validation": validation.points,
+        }
+        write_weights(folder / WEIGHTS_FILE, trainer.network, config, description)
+    report_end(trainer.progress, finished, folder, console)

@@ -1,0 +1,103 @@
+"""`tidefield render`: views and videos."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.errors import RunError, TidefieldError
+from tidefield.files import refuse_existing
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from tidefield.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a video along a camera path (OUT.mp4), or the view of one photograph's camera with its depth (OUT.png)."""
+
+    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A trained run, or with --zero-shot a scene."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """The file to write; .mp4 for a video, .png with --camera."""
+    path: str = "orbit"
+    """orbit, cameras (a flight past the photographs), strip (straight down) or a camera path of nerfstudio's viewer
+    (JSON)."""
+    camera: str | None = None
+    """Name of a photograph whose camera is rendered instead of a path."""
+    zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
+    frames: int = 240
+    """Frames of the video, 24 a second."""
+    width: int | None = None
+    """Width of the picture in pixels; that of the run's photographs if not given."""
+    height: int | None = None
+    """Height of the picture in pixels; in proportion to the width if not given."""
+    device: Device = "auto"
+    overwrite: bool = False
+    """Replace existing files."""
+    allow_missing: AllowMissing = False
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def render(options: Render, console: Console) -> None:
+    """Run `tidefield render`."""
+    from tidefield.device import choose_device
+    from tidefield.progress import ProgressBar
+    from tidefield.render.stills import write_still
+    from tidefield.render.trajectory import make_trajectory
+
+    out, camera, overwrite = options.out, options.camera, options.overwrite
+    suffix = ".mp4" if camera is None else ".png"
+    if out.suffix.lower() != suffix:
+        what = "a video" if camera is None else "one view (--camera)"
+        raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
+    if not overwrite:
+        refuse_existing(out)
+    device = choose_device(options.device)
+    with ExitStack() as stack:
+        if options.zero.zero_shot:
+            scene = load(options.source, None, options.allow_missing, console)
+            view, _ = open_zero_shot(options.zero, scene, device)
+        else:
+            opened = open_trained(options.source, device, options.allow_missing, console)
+            scene, view, _ = stack.enter_context(opened)
+        if camera is not None:
+            own = scene.cameras[scene.index(camera)]
+            size = _size(own, options.width, options.height)
+            for file in write_still(view(own.resized(*size)), out, overwrite=overwrite):
+                console.print(str(file), highlight=False, soft_wrap=True)
+            return
+        width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
+        trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
+        cameras = trajectory.cameras
+        from tidefield.render.video import write_video
+
+        with ProgressBar(console, "Rendering") as bar:
+            write_video(
+                (view(cameras[k]) for k in range(len(cameras))),
+                out,
+                trajectory.frames_per_second,
+                overwrite=overwrite,
+                progress=lambda done: bar(done, len(cameras)),
+            )
+    console.print(f"{out}: {len(cameras)} frames", highlight=False, soft_wrap=True)
+
+
+def _size(camera: Cameras, width: int | None, height: int | None) -> tuple[int, int]:
+    """Width and height of a picture: the given ones, else in the camera's proportion, else the camera's."""
+    for name, value in (("width", width), ("height", height)):
+        if value is not None and not 16 <= value <= 16384:
+            raise TidefieldError(f"--{name} {value} was asked for: expected 16 to 16384 pixels; choose another")
+    if width is None and height is None:
+        return camera.width, camera.height
+    if width is None:
+        assert height is not None
+        return max(16, round(height * camera.width / camera.height)), height
+    return width, height if height is not None else max(16, round(width * camera.height / camera.width))

@@ -1,0 +1,188 @@
+"""`tidefield train`: learn one scene."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
+from tidefield.config import AnyConfig, Budget, Config, NerfstudioConfig, warm_start
+from tidefield.errors import RunError, SceneError
+from tidefield.methods import configuration, make_trainer
+from tidefield.variants import vary
+
+if TYPE_CHECKING:
+    import torch
+    from rich.console import Console
+
+    from tidefield.data.scene import Scene
+    from tidefield.evaluation.curves import Curve
+    from tidefield.train.checkpoint import Run, TrainingProgress
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train on one scene and keep the result in a run folder.
+
+    Ctrl-C saves before it stops; --resume continues from there.
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder with posed photographs: a COLMAP model, transforms.json, a project of ODM or OpenSfM, Blender or LLFF."""
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder for the result; must be new, unless --resume or --overwrite is given."""
+    preset: Preset = "swift"
+    """swift gives the best quality for the time; paper is the network as printed."""
+    variant: str | None = None
+    """Change one part of the preset, as `tidefield ablate` does."""
+    method: TrainedMethod = "tidefield"
+    """Train another method instead: classical NeRF, or nerfstudio's nerfacto or splatfacto, which `tidefield baselines
+    install nerfacto` installs."""
+    budget: OmitArgPrefixes[Budget] = Budget()
+    width: int | None = None
+    """Width of the photographs in pixels; their own if not given."""
+    device: Device = "auto"
+    seed: int = 0
+    """Of the weights and of the order of the photographs."""
+    from_scratch: bool = False
+    """Start from random weights instead of the installed trained ones."""
+    weights: Path | None = None
+    """Start from these weights, of `tidefield pretrain`."""
+    resume: bool = False
+    """Continue the run in the folder."""
+    overwrite: bool = False
+    """Replace the run in the folder."""
+    curve: bool = False
+    """Render two held-out views at a quarter of their size from time to time, for a curve of quality against time; the
+    time for it does not count."""
+    allow_missing: AllowMissing = False
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def train(options: Train, console: Console) -> None:
+    """Run `tidefield train`."""
+    from tidefield.device import choose_device
+    from tidefield.evaluation.curves import make_curve
+    from tidefield.train.checkpoint import write_run
+    from tidefield.train.loop import train as run_training
+
+    budget, folder = options.budget.checked(), options.run
+    device = choose_device(options.device)
+    run = _resumed_run(options) if options.resume else _new_run(options)
+    scene = load(run.scene, run.width, options.allow_missing, console)
+    if not scene.train:
+        raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
+    if options.curve and not scene.test:
+        raise SceneError(f"{options.scene} holds no photograph out: expected one for --curve; leave --curve out")
+    curve = make_curve(scene) if options.curve else None
+    weights = None if options.resume else _initial_weights(options)
+    start = f", starting from {weights}" if weights else ""
+    log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
+    if isinstance(run.config, NerfstudioConfig):
+        if options.resume:
+            raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
+        write_run(folder, run)
+        progress, finished = _train_nerfstudio(run, scene, folder, budget, device, curve, console), True
+    else:
+        trainer = make_trainer(run.config, scene, run.seed, device, weights)
+        if options.resume:
+            trainer.resume(folder)
+        else:
+            write_run(folder, run)
+        used = budget.share(trainer.progress.step, trainer.progress.seconds)
+        callback = curve and curve.watch(folder, used)
+        finished, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
+    report_end(progress, finished, folder, console)
+
+
+def report_end(progress: TrainingProgress, finished: bool, folder: Path, console: Console) -> None:
+    """Print what was done; an interrupted training ends its command as an interruption."""
+    console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
+    if not finished:
+        console.print("interrupted; the same command with --resume continues")
+        raise KeyboardInterrupt
+
+
+def _train_nerfstudio(
+    run: Run, scene: Scene, folder: Path, budget: Budget, device: torch.device, curve: Curve | None, console: Console
+) -> TrainingProgress:
+    """Train one of nerfstudio's methods, with progress."""
+    from tidefield.baselines.nerfstudio import driver
+    from tidefield.progress import ProgressBar
+
+    config = run.config
+    assert isinstance(config, NerfstudioConfig), "the others train in this process"
+    with ProgressBar(console, "Training") as bar:
+
+        def progress(step: int, seconds: float) -> None:
+            bar(budget.share(step, seconds), 1, f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
+
+        return driver.train(config.method, scene, folder, budget, run.seed, device, curve, progress)
+
+
+def _new_run(options: Train) -> Run:
+    from tidefield.train.checkpoint import Run, weights_sha256
+
+    _require_free(options.run, options.overwrite)
+    weights = _initial_weights(options)
+    config, digest = _configuration(options), None
+    if weights is not None:
+        assert isinstance(config, Config), "only our networks start from weights"
+        config, digest = warm_start(config), weights_sha256(weights)
+    return Run(options.scene.resolve(), options.width, options.seed, config, digest)
+
+
+def _initial_weights(options: Train) -> Path | None:
+    """Weights to start from: the named ones, else the installed ones of the unchanged preset."""
+    from tidefield.train.checkpoint import shipped_weights
+
+    if options.weights is not None and (options.from_scratch or options.method != "tidefield"):
+        raise RunError(
+            "--weights is given for a training that starts without: expected one or the other; leave one out"
+        )
+    if options.from_scratch or options.method != "tidefield":
+        return None
+    return options.weights or (shipped_weights(options.preset) if options.variant is None else None)
+
+
+def _configuration(options: Train) -> AnyConfig:
+    config = configuration(options.method, options.preset)
+    if options.variant is None:
+        return config
+    if not isinstance(config, Config):
+        raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
+    return vary(config, options.variant)
+
+
+def _resumed_run(options: Train) -> Run:
+    """The run in the folder; its other options were settled when it was started."""
+    from tidefield.train.checkpoint import read_run
+
+    run = read_run(options.run)
+    if run.scene != options.scene.resolve():
+        raise RunError(
+            f"{options.run} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
+        )
+    return run
+
+
+def _require_free(folder: Path, overwrite: bool) -> None:
+    """Raises: RunError when a folder holds a run, or is something else that a run would be mixed into."""
+    from tidefield.train.checkpoint import RUN_FILE
+
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
+    if (folder / RUN_FILE).exists():
+        if overwrite:
+            return
+        raise RunError(f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite")
+    if any(folder.iterdir()):
+        raise RunError(f"{folder} holds other files: expected a new or empty folder; choose a new name")

@@ -1,0 +1,277 @@
+"""Our network: the paper's boxes in two passes, with geometry first looked for where sparse points and photographs
+say it is.
+
+What it adds to `model.paper`:
+
+- A coarse pass with one ray for 4 x 4 pixels finds the surface; a fine pass searches around it.
+- Densities start from a score (`Pass.weights`): the prior from sparse points and the agreement of the views. The ray
+  transformer corrects it.
+- The views' colours are read by cubic interpolation from learnedly sharpened photographs, and blended by angle
+  (`colour.AngularColourBlend`).
+- Views fade in and out (`blend_weight`), so that neither tiles nor frames of a video jump.
+- The aggregation's first layer is applied to the feature maps, once per photograph instead of once per sample.
+
+Alphabet: T tiles, R rays of a tile, M samples of a ray, P = R M, H hidden channels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tidefield.config import NetworkConfig, PassConfig
+from tidefield.model.aggregate import Aggregate, Evidence, weighted_sum
+from tidefield.model.colour import AngularColourBlend
+from tidefield.model.compositing import composite, weights
+from tidefield.model.encoder import Encoder
+from tidefield.model.network import Network, TileRendering
+from tidefield.model.ray_transformer import RayTransformer
+from tidefield.model.sampling import Intervals, Samples, Tiles, histogram, place_samples, refine, sample
+from tidefield.model.views import Encoded, Gathered, Views, maps_from_images, upsample_twice
+
+LOGIT_LIMIT = 12.0
+"""Of opacities: beyond it a sample is opaque, or empty, for all that single precision tells."""
+UNSEEN_SCORE = -30.0
+"""Score of a sample that no view sees."""
+COLOUR_NOISE = 1e-4
+"""Variance of a colour below which views agree: 2.5 of 255 levels."""
+LOWEST_PRIOR = -4.0
+"""Beyond it the prior would shut off, for good, samples that the views may yet find to be the surface."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the samples of a ray contribute.
+
+    Attributes:
+        colour: to its colour: volume rendering of densities, which are 0 where no view sees.
+        surface: probability that the surface is at each sample, including samples that no view sees.
+        visibility: probability that a view sees the surface.
+    """
+
+    colour: Float[Tensor, "T R M"]
+    surface: Float[Tensor, "T R M"]
+    visibility: Float[Tensor, "T R"]
+
+
+class SwiftNetwork(Network):
+    """Coarse and fine pass: features -> samples -> aggregation -> density; then colour and volume rendering."""
+
+    fills_unseen = True
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        channels = {one.feature_stride: one.feature_channels for one in config.passes}
+        self.encoder = Encoder(config.encoder, tuple(sorted(channels.items(), reverse=True)))
+        self.descriptors = nn.ModuleDict(
+            {
+                str(stride): nn.Conv2d(3, c, 5, padding=2, padding_mode="replicate", bias=False)
+                for stride, c in channels.items()
+            }
+        )
+        self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
+        self.passes = nn.ModuleList(Pass(config, one, first=k == 0) for k, one in enumerate(config.passes))
+        neighbours_only = "target colour" in config.without
+        self.colour = AngularColourBlend(config.passes[-1].hidden, config.harmonics_degree, neighbours_only)
+
+    def forward(
+        self, tiles: Tiles, views: Views, start: Intervals, opaque: bool, generator: torch.Generator | None = None
+    ) -> TileRendering:
+        intervals, pdf = start, torch.ones_like(start.inv_near)[..., None]
+        inverse_depths, coarse_colours = [], []
+        for k, one in enumerate(self.config.passes):
+            uv = tiles.rays_px(*self.grids[k])
+            samples = place_samples(tiles.cameras, uv, intervals, sample(pdf, one.samples, generator))
+            in_tile = ((uv - tiles.corner_px[:, None]) / tiles.side_px).clamp(0, 1)
+            last = one is self.config.passes[-1]
+            gathered = views.read(
+                one.feature_stride,
+                samples.points_world,
+                samples.directions,
+                in_tile,
+                mean_colours=not last and one.feature_stride > 1,
+            )
+            this = cast(Pass, self.passes[k])
+            evidence = this.aggregate(gathered.features, gathered.cosine, gathered.valid, gathered.blend_weight)
+            weight = this.weights(evidence, samples, intervals, opaque)
+            # 1e-6: a ray that nothing stops has its depth in the middle of its samples.
+            known = weight.surface + 1e-6 / one.samples
+            inverse_depths.append((known * samples.inverse_depth).sum(-1) / known.sum(-1))
+            mean_colour = mean_colours(evidence, gathered)
+            if last:
+                colours = self.colour(evidence, gathered, samples.directions, mean_colour)
+                return TileRendering(
+                    colour=composite(weight.colour, colours.unflatten(1, samples.s.shape[1:])),
+                    depth=1 / inverse_depths[-1],
+                    opacity=weight.colour.sum(-1),
+                    visibility=weight.visibility,
+                    inverse_depths=tuple(inverse_depths),
+                    coarse_colours=tuple(coarse_colours),
+                )
+            coarse_colours.append(composite(weight.colour, mean_colour.unflatten(1, samples.s.shape[1:])))
+            following = self.grids[k + 1]
+            pdf = histogram(weight.surface.detach(), samples.s, one.samples, self.config.uniform_fraction)
+            intervals, pdf = refine(intervals, pdf, one.stride // following.stride, following.margin)
+        raise AssertionError("a network has at least one pass")
+
+    def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
+        corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
+        maps = {}
+        for stride, features in zip(self.encoder.strides, self.encoder(photographs), strict=True):
+            colours = means_over_texels(photographs, stride)
+            features = features.float() + self.descriptors[str(stride)](colours)
+            channels = torch.cat([colours, features], dim=1) if stride > 1 else features
+            maps[stride] = maps_from_images(channels, corner, stride)
+        photographs = upsample_twice(self._sharpened(photographs))
+        with_colours = frozenset(stride for stride in maps if stride > 1)
+        return Encoded(maps, maps_from_images(photographs, corner, 0.5), with_colours)
+
+    def _sharpened(self, photographs: Float[Tensor, "K 3 H W"]) -> Float[Tensor, "K 3 H W"]:
+        """Sharpen against the blur of interpolation and blending: learned, starts as the identity, sums to one."""
+        planes = F.pad(photographs.flatten(0, 1)[:, None], (2, 2, 2, 2), mode="replicate")
+        detail = F.conv2d(planes, self.sharpen - self.sharpen.mean())
+        return photographs + detail.reshape(photographs.shape)
+
+
+class Pass(nn.Module):
+    """Aggregation, ray transformer and density of one pass.
+
+    Args:
+        network, config: of the whole and of this pass.
+        first: only the prior says where the surface is; later passes search around what the one before has found.
+    """
+
+    def __init__(self, network: NetworkConfig, config: PassConfig, first: bool) -> None:
+        super().__init__()
+        hidden = config.hidden
+        uniform = "direction weights" in network.without
+        self.aggregate = ComparingAggregate(config.feature_channels, hidden, folded=True, uniform_weights=uniform)
+        if "ray transformer" not in network.without:
+            self.transformer = RayTransformer(hidden, network.heads)
+        self.density = nn.Linear(hidden, 1)
+        self.prior_features = nn.Linear(3, hidden)
+        # At the start the surface is where the views agree and, in the first pass, within about two samples of where
+        # it is expected (2 - 0.3 x^2 changes sign at x = 2.6); the network corrects it.
+        self.agreement = nn.Parameter(torch.tensor(3.0))
+        self.prior_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
+        self.prior_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
+        self.single_view_steepness = nn.Parameter(torch.tensor(10.0 if first else 0.0))
+        nn.init.zeros_(self.density.weight)
+        nn.init.zeros_(self.density.bias)
+
+    def weights(self, evidence: Evidence, samples: Samples, intervals: Intervals, opaque: bool) -> Weights:
+        """How much each sample contributes to its ray.
+
+        Density is predicted per interval of each sample, a length that features resolve whatever the scale of the
+        scene. It starts from the logits with which the weights are a softmax of the scores.
+        """
+        rays = samples.s.shape
+        valid = evidence.valid.unflatten(1, rays[1:])
+        degrees = degrees_of_freedom(evidence).unflatten(1, rays[1:])
+        x, prior = self._prior(evidence.density.unflatten(1, rays[1:]), samples, intervals, degrees)
+        score = prior + self._agreement_score(evidence, degrees)
+        likely = surface_shares(score, opaque)
+        bias = surface_logits(score.masked_fill(~valid, UNSEEN_SCORE), opaque)
+        if hasattr(self, "transformer"):
+            x = self.transformer(*(t.flatten(0, 1) for t in (x, samples.s, valid))).unflatten(0, rays[:2])
+        delta = samples.delta
+        sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / delta.clamp(min=1e-9)
+        if opaque:
+            delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)
+        weight = weights(sigma, delta)
+        unseen = likely * ~valid
+        visibility = 1 - unseen.sum(-1)
+        return Weights(weight, unseen + weight * visibility[..., None], visibility)
+
+    def _agreement_score(self, evidence: Evidence, degrees: Float[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
+        """How much likelier the surface is at each sample than at the ray's usual one, from how well the views agree.
+
+        As if what k views see were normally distributed: with a small variance on one surface, with a large one
+        elsewhere. The logarithm of the likelihood ratio grows with k - 1, so a single view, which always agrees with
+        itself, says nothing.
+        """
+        variance = self.aggregate.disagreement(evidence).unflatten(1, degrees.shape[1:])
+        log_variance = torch.log(variance + COLOUR_NOISE)
+        # The floor keeps rays that no two views see at 0.
+        usual = (degrees * log_variance).sum(-1, keepdim=True) / degrees.sum(-1, keepdim=True).clamp(min=1e-3)
+        return self.agreement * degrees * (usual - log_variance)
+
+    def _prior(
+        self,
+        x: Float[Tensor, "T R M H"],
+        samples: Samples,
+        intervals: Intervals,
+        degrees: Float[Tensor, "T R M"],
+    ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
+        """Where the surface is expected, as a feature added to F_sigma, and as a score."""
+        expected = intervals.s_expected
+        known = expected.isfinite()[..., None]
+        # In samples, so that it means the same for any number of them and any interval.
+        offset = (samples.s - expected[..., None]) * samples.s.shape[-1]
+        offset = torch.where(known, offset, 0.0)
+        features = torch.stack([offset / 4, torch.exp(-((offset / 2) ** 2)), torch.exp(-((offset / 8) ** 2))], dim=-1)
+        # Where no two views see it, samples around where it is expected would only smear what one of them sees.
+        steepness = self.prior_steepness + self.single_view_steepness * torch.exp(-degrees)
+        score = (self.prior_height - steepness * offset.square()).clamp(min=LOWEST_PRIOR)
+        return x + self.prior_features(features) * known[..., None], torch.where(known, score, self.prior_height)
+
+
+class ComparingAggregate(Aggregate):
+    """The paper's aggregation, with a learned weight of each feature in how much the views disagree."""
+
+    def __init__(self, channels: int, hidden: int, folded: bool, uniform_weights: bool) -> None:
+        super().__init__(channels, hidden, folded, uniform_weights)
+        self.log_metric = nn.Parameter(torch.full((channels,), -math.log(channels)))
+
+    def disagreement(self, evidence: Evidence) -> Float[Tensor, "T P"]:
+        """How differently the views see each sample: a weighted sum of the variances of their features."""
+        return evidence.variance @ self.log_metric.exp()
+
+
+def degrees_of_freedom(evidence: Evidence) -> Float[Tensor, "T P"]:
+    """Effective number of views, 1 / sum w_i^2 of the direction weights, less one; 0 where none or one is valid."""
+    effective = evidence.valid / evidence.direction_weight.square().sum(1).clamp(min=1e-6)
+    return (effective - 1).clamp(min=0) * evidence.valid
+
+
+def mean_colours(evidence: Evidence, gathered: Gathered) -> Float[Tensor, "T P 3"]:
+    """The views' colours averaged with the direction weights; middle grey where no view sees."""
+    return weighted_sum(gathered.colours, evidence.direction_weight) + 0.5 * ~evidence.valid[..., None]
+
+
+def means_over_texels(photographs: Float[Tensor, "K 3 H W"], stride: int) -> Float[Tensor, "K 3 h w"]:
+    """Photographs averaged over the texels of a map: over an odd number of pixels, so that they are centred there."""
+    if stride == 1:
+        return photographs
+    odd = stride + 1 - stride % 2
+    return F.avg_pool2d(photographs, odd, stride, odd // 2, count_include_pad=False)
+
+
+def surface_shares(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
+    """Probability of the surface at each sample: softmax(score), where the score of what lies behind the last sample is
+    0 unless the scene is opaque."""
+    return torch.softmax(score if opaque else F.pad(score, (0, 1)), dim=-1)[..., : score.shape[-1]]
+
+
+def surface_logits(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
+    """Logits of the opacities 1 - exp(-sigma_i delta_i) with which samples get the weights softmax(score).
+
+    T_i a_i is a softmax's p_i where a_i = p_i / sum_{j>=i} p_j, whose logit is score_i - log sum_{j>i} exp(score_j).
+    As 1 - exp(-softplus(x)) = sigmoid(x), it is a bias of a density that is a softplus. A score means the same wherever
+    on the ray its sample lies; were scores such biases themselves, many unlikely samples in front would hide the likely
+    one.
+
+    Args:
+        score: of each sample, finite.
+        opaque: nothing lies behind the last sample; otherwise what does has the score 0.
+    """
+    behind = score[..., 1:] if opaque else F.pad(score[..., 1:], (0, 1))
+    later = behind.flip(-1).logcumsumexp(-1).flip(-1)
+    # The last sample of an opaque ray stops all light whatever its logit.
+    return (score - (F.pad(later, (0, 1)) if opaque else later)).clamp(-LOGIT_LIMIT, LOGIT_LIMIT)
