@@ -40,7 +40,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.machine import describe
 from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render, Rendering
-from tidefield.render.trajectory import make_trajectory
+from tidefield.render.camera_paths import make_trajectory
 from tidefield.train.weights import given_or_shipped
 
 FRAMES_FILE = "frames.json"

@@ -14,8 +14,8 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.methods import untrained
 from tidefield.options import Evaluate, Render
 from tidefield.progress import ProgressBar
+from tidefield.render.camera_paths import make_trajectory
 from tidefield.render.stills import write_still
-from tidefield.render.trajectory import make_trajectory
 
 
 def evaluate(options: Evaluate, console: Console) -> Evaluation:
