@@ -15,7 +15,7 @@ from tidefield.config import PRESETS, AnyConfig, Config, FieldConfig, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
-from tidefield.evaluation.curves import Curve, make_curve
+from tidefield.evaluation.curves import QualityCurve, make_curve
 from tidefield.machine import describe
 from tidefield.methods import make_trainer
 from tidefield.options import Pretrain, Train
@@ -97,7 +97,13 @@ def _end(progress: TrainingProgress, finished: bool, folder: Path, console: Cons
 
 
 def _train_nerfstudio(
-    run: Run, scene: Scene, folder: Path, budget: Budget, device: torch.device, curve: Curve | None, console: Console
+    run: Run,
+    scene: Scene,
+    folder: Path,
+    budget: Budget,
+    device: torch.device,
+    curve: QualityCurve | None,
+    console: Console,
 ) -> TrainingProgress:
     """Train one of nerfstudio's methods, with progress."""
     config = run.config
