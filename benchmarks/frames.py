@@ -25,7 +25,6 @@ from unittest.mock import patch
 
 import torch
 from jaxtyping import Float
-from tidefield.train.weights import given_or_shipped
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -41,7 +40,8 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.machine import describe
 from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render, Rendering
-from tidefield.render.trajectory import make_trajectory
+from tidefield.render.camera_paths import make_trajectory
+from tidefield.train.checkpoint import given_or_shipped
 
 FRAMES_FILE = "frames.json"
 SIZE_PX = (800, 600)

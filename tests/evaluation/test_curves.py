@@ -1,9 +1,10 @@
-"""Quality against time."""
+"""Quality against training time."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import textured_wall as wall
@@ -12,12 +13,12 @@ from networks import SMALL
 from rich.console import Console
 
 from tidefield.config import Budget
-from tidefield.evaluation.curves import SHARES, SMALLER, make_curve
+from tidefield.evaluation.curves import SHARES, SMALLER, QualityCurve, make_curve
 from tidefield.model.rendering import Rendering
 from tidefield.train.loop import SceneTrainer, train
 
 
-def test_small_views_are_judged_by_their_mean_error():
+def test_a_point_is_the_mean_psnr_of_small_views():
     scene = wall.scene(wall.cameras(6), (1, 3, 4))
     curve = make_curve(scene)
     assert [camera.width for camera in curve.cameras] == [scene.cameras.width // SMALLER] * 2
@@ -30,6 +31,29 @@ def test_small_views_are_judged_by_their_mean_error():
     curve.add(2.0, off)
     assert curve.points[0][1] > 50
     assert curve.points[1] == (2.0, pytest.approx(20, abs=1))
+
+
+class StillTrainer:
+    """A trainer whose views are always the truth."""
+
+    def __init__(self, curve: QualityCurve) -> None:
+        depth = torch.ones(curve.truths[0].shape[:2])
+        self.renderings = [Rendering(truth.float() / 255, depth, depth) for truth in curve.truths]
+        self.progress, self.asked = SimpleNamespace(seconds=7.0), 0
+
+    def views(self, cameras):
+        self.asked += 1
+        return self.renderings
+
+
+def test_a_resumed_training_renders_once_for_each_share_that_is_left(tmp_path: Path):
+    curve = make_curve(wall.scene(wall.cameras(6), (1, 3)))
+    trainer = StillTrainer(curve)
+    watch = curve.watch(tmp_path, used=1 / 8)
+    for share, asked in ((0.13, 0), (0.24, 0), (0.26, 1), (0.49, 1), (0.99, 2), (1.0, 3), (1.0, 3)):
+        watch(trainer, share)
+        assert trainer.asked == asked
+    assert json.loads((tmp_path / "curve.json").read_text()) == [[7.0, 100.0]] * 3
 
 
 def test_a_training_leaves_a_point_for_each_share_of_its_budget(tmp_path: Path):

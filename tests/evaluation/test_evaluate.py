@@ -32,7 +32,7 @@ def no_lpips(monkeypatch):
 
 
 def perfect(camera: Cameras) -> Rendering:
-    """The wall itself."""
+    """The wall as it is."""
     colour = wall.photograph(camera).float() / 255
     depth = wall.true_depth(camera)
     return Rendering(colour=colour, depth=depth, opacity=torch.ones_like(depth))
@@ -47,7 +47,7 @@ def quiet() -> Console:
     return Console(file=io.StringIO(), width=120)
 
 
-def test_the_report_holds_everything_that_scripts_rely_on(scene, tmp_path):
+def test_the_report_holds_every_key_that_scripts_rely_on(scene, tmp_path):
     evaluation = evaluate(darker, scene, tmp_path / "out", configuration={"method": "wall"}, console=quiet())
     report = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert report == evaluation.report
@@ -105,9 +105,9 @@ def test_means_are_over_the_photographs_that_have_a_value(tmp_path):
     assert report["mean"]["psnr"] == pytest.approx((seen["psnr"] + unseen["psnr"]) / 2)
 
 
-def test_an_evaluation_is_never_overwritten_unasked(scene, tmp_path):
+def test_an_evaluation_is_only_overwritten_on_request(scene, tmp_path):
     (tmp_path / "evaluation.json").write_text("precious")
-    with pytest.raises(RunError, match="choose another, or add --overwrite"):
+    with pytest.raises(RunError, match=r"evaluation\.json is there already.*--overwrite"):
         evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())
     assert (tmp_path / "evaluation.json").read_text() == "precious"
     assert [path.name for path in tmp_path.iterdir()] == ["evaluation.json"]
@@ -131,7 +131,7 @@ def test_a_rendering_that_is_not_finite_is_named(scene, tmp_path):
         evaluate(diverged, scene, tmp_path, configuration={}, console=quiet())
 
 
-def test_a_scene_without_held_out_photographs_cannot_be_judged(tmp_path):
+def test_a_scene_without_held_out_photographs_cannot_be_evaluated(tmp_path):
     scene = wall.scene(wall.cameras(3), test=())
     with pytest.raises(RunError, match="holds no photograph out"):
         evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())

@@ -1,9 +1,12 @@
+import shutil
+
 import pytest
 import torch
 
 from tidefield.errors import RunError
 from tidefield.evaluation import lpips
 from tidefield.evaluation.metrics import score
+from tidefield.files import file_sha256
 
 HAS_TORCHVISION = lpips.prepare_torchvision() is None
 needs_torchvision = pytest.mark.skipif(not HAS_TORCHVISION, reason="torchvision is not installed (the extra [lpips])")
@@ -19,13 +22,17 @@ def checkpoints(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def alexnet(checkpoints):
-    """AlexNet with random weights, saved where its trained ones would be."""
+def alexnet(checkpoints, monkeypatch):
+    """AlexNet with random weights, saved where its trained ones would be, and under the name of its own hash."""
     from torchvision.models import alexnet
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        torch.save(alexnet().state_dict(), checkpoints / lpips.BACKBONES["lpips_alex"][1])
+        weights = alexnet().state_dict()
+    torch.save(weights, checkpoints / lpips.BACKBONES["lpips_alex"][1])
+    sha256 = file_sha256(checkpoints / lpips.BACKBONES["lpips_alex"][1])
+    shutil.copy(checkpoints / lpips.BACKBONES["lpips_alex"][1], checkpoints / f"alexnet-random-{sha256[:8]}.pth")
+    monkeypatch.setitem(lpips.BACKBONES, "lpips_alex", ("alex", f"alexnet-random-{sha256[:8]}.pth"))
     return checkpoints
 
 
@@ -51,7 +58,7 @@ def test_without_weights_the_reason_names_the_file_and_the_commands(checkpoints,
         assert f'curl --create-dirs --output "{checkpoints / file}" {lpips.WEIGHTS_URL}{file}' in reason
 
 
-def test_the_reason_does_not_tell_whose_home_folder_it_was(checkpoints, monkeypatch):
+def test_the_reason_does_not_name_the_home_folder(checkpoints, monkeypatch):
     monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
     monkeypatch.setattr(lpips.Path, "home", lambda: checkpoints.parent)
     reason = lpips.load_lpips()["lpips_vgg"]
@@ -60,7 +67,7 @@ def test_the_reason_does_not_tell_whose_home_folder_it_was(checkpoints, monkeypa
     assert str(checkpoints) not in reason
 
 
-def test_a_missing_network_leaves_nulls_with_its_reason_and_all_else_whole():
+def test_a_missing_network_leaves_nulls_with_its_reason_and_all_other_metrics():
     image, truth = noise(1), noise(2)
     seen = torch.ones(image.shape[:2], dtype=torch.bool)
     scores = score(image, truth, seen, dict.fromkeys(lpips.BACKBONES, "it is not here"))
@@ -80,26 +87,32 @@ def test_a_download_without_a_connection_says_what_to_do(checkpoints, monkeypatc
         lpips.download_lpips_weights()
 
 
-def test_weights_that_are_there_are_not_downloaded_again(checkpoints, monkeypatch):
-    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("downloaded"))
-    for _, file in lpips.BACKBONES.values():
+def test_only_published_files_are_not_downloaded_again(checkpoints, monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda url, *_: asked.append(url))
+    here, other = "alexnet-e244f187.pth", lpips.BACKBONES["lpips_vgg"][1]  # of b"there"
+    monkeypatch.setitem(lpips.BACKBONES, "lpips_alex", ("alex", here))
+    for file in (here, other):
         (checkpoints / file).write_bytes(b"there")
-    assert [path.name for path in lpips.download_lpips_weights()] == [file for _, file in lpips.BACKBONES.values()]
+    assert [path.name for path in lpips.download_lpips_weights()] == [here, other]
+    assert asked == [lpips.WEIGHTS_URL + other]
 
 
-@needs_torchvision
-def test_a_damaged_file_of_weights_is_a_reason_not_an_error(checkpoints):
-    for content in (b"", b"not weights"):
-        path = checkpoints / lpips.BACKBONES["lpips_alex"][1]
+def test_a_file_that_is_not_the_published_one_is_a_reason_not_an_error(checkpoints, monkeypatch):
+    monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("an unknown file was read"))
+    path = checkpoints / lpips.BACKBONES["lpips_alex"][1]
+    for content, sha256 in ((b"", "e3b0c442"), (b"not weights", "3f0c3b7f")):
         path.write_bytes(content)
         reason = lpips.load_lpips()["lpips_alex"]
         assert isinstance(reason, str)
+        assert f"is not the published file (its SHA-256 starts with {sha256})" in reason
         assert str(path) in reason
         assert "curl" in reason
 
 
 @needs_torchvision
-def test_a_full_mask_gives_lpips_as_the_library_does(alexnet):
+def test_a_full_mask_gives_the_lpips_of_torchmetrics(alexnet):
     from torchmetrics.functional.image.lpips import learned_perceptual_image_patch_similarity
 
     network = lpips.load_lpips()["lpips_alex"]
@@ -130,9 +143,9 @@ def test_a_mask_keeps_far_differences_out(alexnet):
 
 
 @needs_torchvision
-def test_loading_leaves_the_random_numbers_alone(alexnet):
+def test_loading_does_not_change_the_random_state(alexnet):
     before = torch.get_rng_state()
-    lpips.load_lpips()
+    assert isinstance(lpips.load_lpips()["lpips_alex"], lpips.Lpips)
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -155,7 +168,7 @@ def test_operators_are_declared_only_when_torchvision_failed_to_register_them(mo
     assert len(declared) == 2
 
 
-def test_a_torchvision_of_another_kind_of_failure_is_a_reason(monkeypatch):
+def test_another_failure_of_torchvision_is_a_reason(monkeypatch):
     def importing(name: str) -> None:
         raise RuntimeError("compiled with different CUDA versions")
 

@@ -9,9 +9,10 @@ from tidefield.evaluation.metrics import (
     METRICS,
     PSNR_LIMIT_DB,
     SUFFIXES,
-    colour_fitted,
+    fit_colours,
     flip_map,
     psnr,
+    psnr_from_mse,
     score,
     ssim_map,
 )
@@ -44,12 +45,20 @@ def test_psnr_of_identical_images_is_the_documented_limit():
     assert psnr(noise(), noise(), full(noise())) == PSNR_LIMIT_DB
 
 
+def test_psnr_of_an_mse_is_limited_and_keeps_nan():
+    assert psnr_from_mse(0.01) == pytest.approx(20)
+    assert psnr_from_mse(1.0) == 0
+    assert psnr_from_mse(0.0) == psnr_from_mse(1e-300) == PSNR_LIMIT_DB
+    assert math.isnan(psnr_from_mse(math.nan)), "a diverged training must not look perfect"
+
+
 def test_a_masked_psnr_counts_the_masked_pixels_only():
     truth = torch.full((10, 12, 3), 100, dtype=torch.uint8)
     image = truth.clone()
     image[:, :6] += 10
     image[:, 6:] += 90
     assert psnr(image, truth, left_half(truth)) == pytest.approx(20 * math.log10(255 / 10))
+    assert psnr(image, truth) == psnr(image, truth, full(truth)) == pytest.approx(10 * math.log10(255**2 / 4100))
 
 
 def test_colours_are_clipped_and_rounded_to_8_bits():
@@ -99,7 +108,7 @@ def test_the_colour_fit_recovers_a_known_colour_map():
     image = noise() // 2 + 50
     mixing = torch.tensor([[0.8, 0.1, 0.05], [0.05, 0.7, 0.1], [0.0, 0.1, 0.9]], dtype=torch.double)
     truth = (image.double() @ mixing + torch.tensor([5.0, -7.0, 3.0])).round().to(torch.uint8)
-    assert (colour_fitted(image, truth, full(image)).int() - truth.int()).abs().max() <= 1
+    assert (fit_colours(image, truth, full(image)).int() - truth.int()).abs().max() <= 1
 
 
 def test_the_colour_fit_sees_the_masked_pixels_only():
@@ -107,14 +116,14 @@ def test_the_colour_fit_sees_the_masked_pixels_only():
     truth = image.clone()
     mask = left_half(image)
     truth[~mask] = 255
-    assert torch.equal(colour_fitted(image, truth, mask), image)
+    assert torch.equal(fit_colours(image, truth, mask), image)
 
 
 def test_the_colour_fit_of_one_flat_colour_is_the_mean_of_the_truth():
     truth = noise()
     flat = torch.full_like(truth, 77)
     expected = truth.double().mean((0, 1)).round().to(torch.uint8).expand_as(truth)
-    assert torch.equal(colour_fitted(flat, truth, full(truth)), expected)
+    assert torch.equal(fit_colours(flat, truth, full(truth)), expected)
 
 
 def test_a_full_mask_changes_no_metric():
@@ -130,7 +139,7 @@ def test_masked_metrics_are_the_mean_of_the_map_over_the_mask():
     scores = score(image, truth, mask, NO_LPIPS).values
     assert scores["ssim_seen"] == pytest.approx(float(ssim_map(image, truth)[:, :16].mean()))
     assert scores["flip_seen"] == pytest.approx(float(flip_map(image, truth)[:, :16].mean()))
-    fitted = colour_fitted(image, truth, mask)
+    fitted = fit_colours(image, truth, mask)
     assert scores["psnr_seen_cc"] == pytest.approx(psnr(fitted, truth, mask))
 
 

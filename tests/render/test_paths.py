@@ -1,4 +1,4 @@
-"""Shapes of camera paths: true rotations, steady speed, no jumps, looking where they should."""
+"""Shapes of camera paths: valid rotations, constant speed, no jumps, right viewing directions."""
 
 from dataclasses import replace
 
@@ -9,8 +9,7 @@ from captures import SCENES, TILT, UP, angle, object_scene, oblique, scene_of, s
 from torch import Tensor
 
 from tidefield.data.scene import Scene
-from tidefield.render.layout import layout_of
-from tidefield.render.paths import AHEAD, GENTLE, Shape, among_cameras, orbit, strip
+from tidefield.render.camera_paths import AHEAD, GENTLE, Shape, among_cameras, layout_of, orbit, strip
 
 SHAPES = {"cameras": among_cameras, "orbit": orbit, "strip": strip}
 
@@ -43,7 +42,7 @@ def test_every_path_is_made_of_rotations(kind: str, path: str):
 
 @pytest.mark.parametrize("path", SHAPES)
 @pytest.mark.parametrize("kind", SCENES)
-def test_no_path_jumps_or_turns_at_once(kind: str, path: str):
+def test_no_path_jumps_or_turns_abruptly(kind: str, path: str):
     position, rotation = poses(SHAPES[path], SCENES[kind](), 600)
     step = position.diff(dim=0).norm(dim=1) / layout_of(SCENES[kind]()).distance
     assert step.max() < 0.1
@@ -83,7 +82,7 @@ def test_the_tour_passes_through_the_cameras_in_order_at_constant_speed():
     assert step.max() / step.mean() < 1.05
 
 
-def test_the_tour_turns_no_faster_than_the_eye_follows():
+def test_the_tour_turns_at_constant_apparent_speed():
     scene = oblique()
     turned = scene.cameras.T_world_camera.clone()
     turned[13:26, :, :2] *= -1  # the second line is flown with the opposite heading
@@ -95,7 +94,7 @@ def test_the_tour_turns_no_faster_than_the_eye_follows():
     assert speed.max() / speed.mean() < 1.1
 
 
-def test_cameras_named_in_no_order_are_toured_without_leaping():
+def test_cameras_named_in_no_order_are_toured_without_long_jumps():
     scene = object_scene()
     position, _ = poses(among_cameras, scene, 600)
     named = scene.cameras.position_world.diff(dim=0).norm(dim=1).sum()
@@ -103,7 +102,7 @@ def test_cameras_named_in_no_order_are_toured_without_leaping():
     assert torch.cdist(scene.cameras.position_world, position).min(1).values.max() < 0.1
 
 
-def test_a_flight_over_a_survey_goes_forward_gently_and_looks_a_little_ahead():
+def test_a_flight_over_a_survey_goes_forward_slowly_and_looks_a_little_ahead():
     position, rotation = poses(among_cameras, survey(), 240)
     travel = torch.nn.functional.normalize(position.diff(dim=0), dim=1)
     ahead, up = rotation[:, :, 2], -rotation[:, :, 1]

@@ -1,4 +1,4 @@
-"""Camera paths of a scene: size, range and what they show; a viewer's file."""
+"""Camera paths of a scene: size, depth range and visible content; files of nerfstudio's viewer."""
 
 import json
 import math
@@ -14,9 +14,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
 from tidefield.geometry.cameras import Cameras
-from tidefield.render.layout import layout_of
-from tidefield.render.paths import strip
-from tidefield.render.trajectory import Trajectory, make_trajectory
+from tidefield.render.camera_paths import Trajectory, layout_of, make_trajectory, strip
 
 PATHS = ["cameras", "orbit", "strip"]
 
@@ -60,7 +58,7 @@ def test_frames_over_a_survey_are_nearly_full_of_what_two_photographs_see(path: 
     assert min(seen_shares(scene, path_of(path, scene, 15))) > 0.9
 
 
-def test_a_path_is_drawn_in_only_where_it_must_be():
+def test_a_path_is_shortened_only_where_photographs_are_sparse():
     dense, thin = survey(), survey(every=7)
     for scene, whole in ((dense, True), (thin, False)):
         drawn = strip_length(path_of("strip", scene, 20))
@@ -81,7 +79,7 @@ def test_the_same_call_gives_the_same_path(path: str):
     assert torch.equal(first.near_far, second.near_far)
 
 
-def test_frames_that_look_aside_reach_as_far_as_they_see():
+def test_the_far_of_oblique_frames_includes_what_they_see():
     scene = survey()
     aside, down = path_of("orbit", scene, 24), path_of("strip", scene, 24)
     assert aside.near_far[:, 1].mean() > 1.1 * down.near_far[:, 1].mean()
@@ -131,7 +129,7 @@ def load(tmp_path: Path, content: object, scene: Scene | None = None) -> Traject
     return make_trajectory(str(file), scene or survey(), frames=1, width=1, height=1)
 
 
-def test_a_viewers_path_comes_back_as_it_was(tmp_path: Path, poses: np.ndarray):
+def test_an_exported_path_is_read_back_unchanged(tmp_path: Path, poses: np.ndarray):
     origin = torch.tensor([7.0, 8.0, 9.0], dtype=torch.float64)
     absolute = poses.copy()
     absolute[:, :3, 3] += origin.numpy()
@@ -143,7 +141,7 @@ def test_a_viewers_path_comes_back_as_it_was(tmp_path: Path, poses: np.ndarray):
     assert torch.equal(found.cameras.principal_px[0], torch.tensor([80.0, 45.0]))
 
 
-def test_matrices_stored_by_columns_are_understood(tmp_path: Path, poses: np.ndarray):
+def test_matrices_stored_by_columns_are_transposed(tmp_path: Path, poses: np.ndarray):
     content = exported(poses)
     for frame in content["camera_path"]:
         frame["camera_to_world"] = np.array(frame["camera_to_world"]).reshape(4, 4).T.flatten().tolist()
@@ -166,7 +164,7 @@ def test_nerfstudios_normalisation_is_undone(tmp_path: Path, poses: np.ndarray):
     assert torch.allclose(found.cameras.T_world_camera.double(), torch.tensor(poses[:, :3]), atol=1e-4)
 
 
-def test_the_mapping_ends_in_the_coordinates_of_a_transforms_json(tmp_path: Path, poses: np.ndarray):
+def test_the_normalisation_starts_before_the_applied_transform(tmp_path: Path, poses: np.ndarray):
     # nerfstudio saves transform @ applied_transform: it starts from the coordinates before its own data preparation.
     applied = np.eye(4)[[0, 2, 1, 3]]
     applied[2] *= -1
@@ -212,14 +210,14 @@ def test_a_malformed_path_is_one_clear_error(tmp_path: Path, poses: np.ndarray, 
         load(tmp_path, content)
 
 
-def test_files_that_are_no_json_or_not_there_are_one_clear_error(tmp_path: Path):
+def test_invalid_json_and_missing_files_are_one_clear_error(tmp_path: Path):
     with pytest.raises(TidefieldError, match="not whole JSON"):
         load(tmp_path, '{"camera_path": [')
     with pytest.raises(TidefieldError, match=r"absent\.json"):
         make_trajectory(str(tmp_path / "absent.json"), survey(), frames=1, width=1, height=1)
 
 
-def test_a_malformed_mapping_is_one_clear_error(tmp_path: Path, poses: np.ndarray):
+def test_a_malformed_normalisation_is_one_clear_error(tmp_path: Path, poses: np.ndarray):
     mapping = tmp_path / "dataparser_transforms.json"
     mapping.write_text(json.dumps({"transform": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "scale": 1.0}))
     with pytest.raises(TidefieldError, match="transform is missing or malformed: expected 3 x 4"):

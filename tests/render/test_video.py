@@ -1,8 +1,9 @@
-"""Videos and stills: what is decoded again is what was written, and nothing half done ever carries the final name."""
+"""Videos and stills: decoded frames are those that were written, and no partial file has the final name."""
 
 import itertools
 import os
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -13,7 +14,7 @@ from PIL import Image
 
 from tidefield.errors import RunError
 from tidefield.model.rendering import Rendering
-from tidefield.render.stills import depth_picture, to_8bit, write_still
+from tidefield.render.stills import colour_picture, depth_picture, write_still
 from tidefield.render.video import write_video
 
 COLOURS = [(200, 30, 40), (30, 180, 60), (40, 60, 210), (128, 128, 128), (250, 240, 230)]
@@ -36,7 +37,7 @@ def decode(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def test_a_video_comes_back_with_its_frames_size_speed_and_colours(tmp_path: Path):
+def test_a_decoded_video_has_its_frames_size_speed_and_colours(tmp_path: Path):
     path = tmp_path / "new" / "clip.mp4"
     done: list[int] = []
     count = write_video((flat(c) for c in COLOURS), path, 25.0, progress=done.append)
@@ -56,7 +57,7 @@ def test_a_video_comes_back_with_its_frames_size_speed_and_colours(tmp_path: Pat
         assert float(stream.duration * stream.time_base) == pytest.approx(0.2)
 
 
-def test_the_index_lies_before_the_pictures_so_that_browsers_start_at_once(tmp_path: Path):
+def test_the_index_comes_before_the_frames_so_that_browsers_can_start(tmp_path: Path):
     write_video((flat(c) for c in COLOURS), tmp_path / "clip.mp4", 24.0)
     content = (tmp_path / "clip.mp4").read_bytes()
     assert 0 < content.index(b"moov") < content.index(b"mdat")
@@ -70,7 +71,7 @@ def test_renderings_are_frames_and_odd_sizes_are_made_even(tmp_path: Path):
     assert np.abs(frames[0].astype(int) - 128).max() <= 4
 
 
-def test_a_video_that_is_there_is_kept_unless_asked(tmp_path: Path):
+def test_an_existing_video_is_only_overwritten_on_request(tmp_path: Path):
     path = tmp_path / "clip.mp4"
     path.write_bytes(b"precious")
 
@@ -85,7 +86,7 @@ def test_a_video_that_is_there_is_kept_unless_asked(tmp_path: Path):
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError])
-def test_an_interruption_leaves_nothing_behind_and_keeps_what_was_there(tmp_path: Path, interruption: type):
+def test_an_interruption_leaves_no_partial_file_and_keeps_the_old_one(tmp_path: Path, interruption: type):
     path = tmp_path / "clip.mp4"
     path.write_bytes(b"precious")
 
@@ -108,7 +109,7 @@ def test_no_frames_and_other_formats_are_refused(tmp_path: Path):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_that_cannot_be_is_one_clear_error(tmp_path: Path):
+def test_an_impossible_folder_is_one_clear_error(tmp_path: Path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(RunError, match="cannot be written"):
         write_video([flat(COLOURS[0])], tmp_path / "file" / "clip.mp4", 24.0)
@@ -129,7 +130,7 @@ def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
     view = rendering()
     colour, depths, look = write_still(view, tmp_path / "DJI_0001.png")
     assert [p.name for p in (colour, depths, look)] == ["DJI_0001.png", "DJI_0001_depth.npy", "DJI_0001_depth.png"]
-    assert np.array_equal(np.asarray(Image.open(colour)), to_8bit(view.colour))
+    assert np.array_equal(np.asarray(Image.open(colour)), colour_picture(view))
     depth = np.load(depths)
     assert depth.dtype == np.float32
     assert np.isnan(depth[:, -4:]).all()
@@ -141,7 +142,7 @@ def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
     assert sorted(os.listdir(tmp_path)) == ["DJI_0001.png", "DJI_0001_depth.npy", "DJI_0001_depth.png"]
 
 
-def test_depth_goes_from_red_to_blue_and_nothing_is_black():
+def test_depth_goes_from_red_to_blue_and_empty_pixels_are_black():
     picture = depth_picture(rendering()).astype(int)
     assert picture[0, 0, 0] > picture[0, 0, 2]
     assert picture[0, -6, 2] > picture[0, -6, 0]
@@ -150,7 +151,7 @@ def test_depth_goes_from_red_to_blue_and_nothing_is_black():
     assert (depth_picture(empty) == 0).all()
 
 
-def test_a_still_replaces_nothing_unless_asked(tmp_path: Path):
+def test_existing_stills_are_only_overwritten_on_request(tmp_path: Path):
     (tmp_path / "view_depth.npy").write_bytes(b"precious")
     with pytest.raises(RunError, match=r"view_depth\.npy is there already"):
         write_still(rendering(), tmp_path / "view.png")
@@ -161,6 +162,9 @@ def test_a_still_replaces_nothing_unless_asked(tmp_path: Path):
         write_still(rendering(), tmp_path / "view.jpg")
 
 
-def test_colours_are_rounded_to_8_bits_not_cut():
+def test_colours_are_rounded_to_8_bits_and_must_be_finite():
     colour = torch.tensor([[[0.0, 1.0, 0.5], [1.7, -0.3, 0.4999 / 255]]])
-    assert to_8bit(colour).tolist() == [[[0, 255, 128], [255, 0, 0]]]
+    view = Rendering(colour, torch.ones(1, 2), torch.ones(1, 2))
+    assert colour_picture(view).tolist() == [[[0, 255, 128], [255, 0, 0]]]
+    with pytest.raises(AssertionError, match="not finite"):
+        colour_picture(replace(view, colour=colour * torch.nan))

@@ -50,8 +50,8 @@ def render(options: Render, console: Console) -> None:
     """Run `tidefield render`."""
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
+    from tidefield.render.camera_paths import make_trajectory
     from tidefield.render.stills import write_still
-    from tidefield.render.trajectory import make_trajectory
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
     suffix = ".mp4" if camera is None else ".png"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tidefield.data.scene import Scene
-    from tidefield.evaluation.curves import Curve
+    from tidefield.evaluation.curves import QualityCurve
     from tidefield.train.checkpoint import Run, TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -110,7 +110,13 @@ def report_end(progress: TrainingProgress, finished: bool, folder: Path, console
 
 
 def _train_nerfstudio(
-    run: Run, scene: Scene, folder: Path, budget: Budget, device: torch.device, curve: Curve | None, console: Console
+    run: Run,
+    scene: Scene,
+    folder: Path,
+    budget: Budget,
+    device: torch.device,
+    curve: QualityCurve | None,
+    console: Console,
 ) -> TrainingProgress:
     """Train one of nerfstudio's methods, with progress."""
     from tidefield.baselines.nerfstudio import driver

@@ -1,11 +1,11 @@
-"""Quality against time: a few held-out views, rendered small while a method trains."""
+"""Measure quality against training time: a few held-out views, rendered small while a method trains."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -14,21 +14,21 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.scene import Scene
-from tidefield.files import completed_file
+from tidefield.evaluation.metrics import psnr
+from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering, to_8_bit
 
 SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Of the budget, when the views are rendered."""
+"""Shares of the training budget after which the views are rendered."""
 SMALLER = 4
-"""Enough to see how a method gets on; at full size, some render for minutes."""
+"""Factor by which the views are smaller than the photographs; at full size, some methods render for minutes."""
 CURVE_FILE = "curve.json"
-_VIEWS = 2
 
 
 @runtime_checkable
-class InTraining(Protocol):
-    """What a curve needs to know of a `tidefield.train.loop.Trainer`; `progress.seconds` is the time spent so far."""
+class TrainerLike(Protocol):
+    """What a curve needs of a `tidefield.train.loop.Trainer`; `progress.seconds` is the training time so far."""
 
     progress: Any
 
@@ -36,13 +36,13 @@ class InTraining(Protocol):
 
 
 @dataclass
-class Curve:
-    """What is rendered, and what came out.
+class QualityCurve:
+    """Views to render while a method trains, and their PSNR so far.
 
     Attributes:
-        cameras: of the first held-out photograph and of the middle one, some times as small.
-        truths: the photographs, averaged over the pixels' squares.
-        points: (seconds of training, mean PSNR).
+        cameras: of the first held-out photograph and of the middle one, at a smaller size.
+        truths: the photographs, as means over the pixels' areas.
+        points: (seconds of training, mean PSNR in dB).
     """
 
     cameras: tuple[Cameras, ...]
@@ -50,42 +50,40 @@ class Curve:
     points: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, seconds: float, renderings: Sequence[Rendering]) -> None:
-        """Judge one round of renderings."""
-        errors = [
-            (to_8_bit(rendering.colour).float() - truth.float()).square().mean() / 255**2
-            for rendering, truth in zip(renderings, self.truths, strict=True)
-        ]
-        values = [-10 * torch.log10(error.clamp(min=1e-10)).item() for error in errors]
-        self.points.append((seconds, sum(values) / len(values)))
+        """Add the point of one round of renderings."""
+        views = zip(renderings, self.truths, strict=True)
+        self.points.append((seconds, fmean(psnr(to_8_bit(view.colour), truth) for view, truth in views)))
 
-    def watch(self, folder: Path, used: float) -> Callable[[InTraining, float], None]:
-        """Renders and writes when a share of `SHARES` is used, of those above the one that is used already."""
+    def watch(self, folder: Path, used: float) -> Callable[[TrainerLike, float], None]:
+        """Return a callback of (trainer, share of the budget) that adds and writes a point at each of `SHARES`.
+
+        Args:
+            folder: of the run.
+            used: share of the budget that an earlier part of the training has used; its points are not repeated.
+        """
         due = [share for share in SHARES if share > used]
 
-        def look(learner: InTraining, share: float) -> None:
+        def add_if_due(trainer: TrainerLike, share: float) -> None:
             if due and share >= due[0]:
                 due[:] = [later for later in due if later > share]
-                self.add(learner.progress.seconds, learner.views(self.cameras))
+                self.add(trainer.progress.seconds, trainer.views(self.cameras))
                 self.write(folder)
 
-        return look
+        return add_if_due
 
     def write(self, folder: Path) -> None:
-        """RUN/curve.json."""
-        with completed_file(folder / CURVE_FILE, overwrite=True) as partial:
-            partial.write_text(json.dumps(self.points), encoding="utf-8")
+        """Write RUN/curve.json."""
+        write_json(folder / CURVE_FILE, self.points)
 
 
-def make_curve(scene: Scene, smaller: int = SMALLER) -> Curve:
-    """For a scene that holds photographs out; views are `smaller` times as small as these."""
-    test = scene.test
-    chosen = sorted({test[0], test[len(test) // 2]})[:_VIEWS]
+def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
+    """Make the curve of a scene that holds photographs out, with views `smaller` times as small as these."""
     cameras, truths = [], []
-    for index in chosen:
+    for index in sorted({scene.test[0], scene.test[len(scene.test) // 2]}):
         camera = scene.cameras[index]
         small = camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
-        whole = scene.photographs[index].permute(2, 0, 1)[None].float()
-        mean = F.interpolate(whole, size=(small.height, small.width), mode="area")
+        photograph = scene.photographs[index].permute(2, 0, 1)[None].float()
+        mean = F.interpolate(photograph, size=(small.height, small.width), mode="area")
         cameras.append(small)
         truths.append(mean[0].permute(1, 2, 0).round().to(torch.uint8))
-    return Curve(tuple(cameras), tuple(truths))
+    return QualityCurve(tuple(cameras), tuple(truths))

@@ -1,11 +1,10 @@
-"""Judge a method on the held-out photographs: numbers, a table and pictures.
+"""Evaluate a method on the held-out photographs: metrics, a table and pictures.
 
-Knows a method only as `render(camera) -> Rendering`, so every method is judged alike.
+A method is only a function `render(camera) -> Rendering` here, so every method is evaluated alike.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -26,7 +25,7 @@ from tidefield.errors import RunError
 from tidefield.evaluation.lpips import Lpips, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
-from tidefield.files import completed_file
+from tidefield.files import completed_file, refuse_existing, write_json
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar
 
@@ -37,7 +36,7 @@ _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came out.
+    """Result of an evaluation.
 
     Attributes:
         path: the evaluation.json.
@@ -49,7 +48,7 @@ class Evaluation:
 
     @property
     def mean(self) -> dict[str, Any]:
-        """Means over the photographs, by metric."""
+        """Return the means over the photographs, by metric."""
         return self.report["mean"]
 
 
@@ -62,37 +61,37 @@ def evaluate(
     overwrite: bool = False,
     console: Console | None = None,
 ) -> Evaluation:
-    """Render every held-out photograph's camera, compare, and print a table.
+    """Render every held-out photograph's camera, measure the metrics, and print a table.
 
     Writes `out/renderings/NAME.png`, `out/pictures/NAME.png` (ground truth | rendering | error | depth) and, last and
-    whole, `out/evaluation.json`.
+    complete, `out/evaluation.json`.
 
     Args:
         render: the method.
-        scene: its test photographs are the truth; its sparse points say which pixels are doubly seen.
+        scene: its test photographs are the truth; its sparse points determine which pixels are doubly seen.
         out: the folder to write to, made if needed.
-        configuration: what made this method, for the record; must be JSON.
-        overwrite: replace an evaluation that is there.
+        configuration: of the method, for the record; must be JSON.
+        overwrite: replace an existing evaluation.
         console: where to print; standard output if None.
 
     Raises:
-        RunError: when there is an evaluation already, nothing is held out, a rendering is not finite, or `out` cannot
-            be written.
+        RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
+            is not finite.
     """
     path, console = out / "evaluation.json", console or Console()
-    if path.exists() and not overwrite:
-        raise RunError(f"{path} is there already: expected a folder without one; choose another, or add --overwrite")
+    if not overwrite:
+        refuse_existing(path)
     if not scene.test:
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
     files = picture_names([scene.names[i] for i in scene.test])
     photographs: dict[str, dict[str, Any]] = {}
     memory: dict[str, int | None] = {}
     networks: dict[str, Lpips | str] = {}
-    with ProgressBar(console, "Evaluating") as meter:
+    with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
-            rendering, seconds = _rendered(render, scene, index)
+            rendering, seconds = _timed(render, scene, index)
             if not memory:
-                # Here, so that the metrics' own networks do not count as the method's.
+                # Measured before LPIPS's networks are loaded, which are no part of the method.
                 memory, networks = _peak_memory(), load_lpips()
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
             seen = doubly_seen(scene, scene.cameras[index])
@@ -103,12 +102,14 @@ def evaluate(
                 "seen_share": float(seen.float().mean()),
                 "seconds": seconds,
             }
-            _save_pictures(out, file, image, truth, rendering)
-            meter(len(photographs), len(scene.test))
+            _write_pictures(out, file, image, truth, rendering)
+            bar(len(photographs), len(scene.test))
+    seconds_in_all = sum(row["seconds"] for row in photographs.values())
     report = {
         "per_photograph": photographs,
         "mean": _mean(list(photographs.values())),
-        **_speed(scene, photographs),
+        "rays_per_second": int(scene.cameras.size_px[list(scene.test)].prod(1).sum()) / seconds_in_all,
+        "seconds_per_frame": seconds_in_all / len(photographs),
         **memory,
         "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
         "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
@@ -116,16 +117,15 @@ def evaluate(
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
     }
-    with completed_file(path, overwrite=True) as partial:
-        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(path, report)
     console.print(_table(scene, report))
     for remark in _remarks(report, out):
         console.print(remark, soft_wrap=True, highlight=False, markup=False)
     return Evaluation(path, report)
 
 
-def _rendered(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
-    """The view of one photograph's camera, and how many seconds it took."""
+def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
+    """Render the view of one photograph's camera, and measure the seconds."""
     camera = scene.cameras[index]
     start = time.perf_counter()
     with torch.no_grad():
@@ -138,13 +138,13 @@ def _rendered(render: Render, scene: Scene, index: int) -> tuple[Rendering, floa
     if not (rendering.colour.isfinite().all() and rendering.depth.isfinite().all()):
         raise RunError(
             f"the rendering of {scene.names[index]} holds NaN or infinity: expected finite colours and depths; the "
-            "training has probably diverged, so take an earlier checkpoint or train again"
+            "training has probably diverged: take an earlier checkpoint or train again"
         )
     return rendering, seconds
 
 
 def _peak_memory() -> dict[str, int | None]:
-    """The most memory that this process has held so far, and the most that it has held on a GPU."""
+    """Return this process's peak memory so far, in main memory and on a GPU."""
     peak = None
     if sys.platform != "win32":
         import resource
@@ -155,31 +155,23 @@ def _peak_memory() -> dict[str, int | None]:
     return {"peak_memory_bytes": peak, "peak_cuda_memory_bytes": cuda}
 
 
-def _speed(scene: Scene, photographs: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    seconds = sum(photograph["seconds"] for photograph in photographs.values())
-    rays = int(scene.cameras.size_px[list(scene.test)].prod(1).sum())
-    return {"rays_per_second": rays / seconds, "seconds_per_frame": seconds / len(photographs)}
-
-
 def _mean(photographs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the photographs that have a value; None, and the reason, where none has."""
-    mean: dict[str, Any] = {}
-    reasons: dict[str, str] = {}
-    for name in NAMES:
-        values = [photograph[name] for photograph in photographs if photograph[name] is not None]
-        mean[name] = fmean(values) if values else None
-        if not values:
-            reasons[name] = photographs[0]["reasons"][name]
-    return {**mean, "reasons": reasons, "seen_share": fmean(photograph["seen_share"] for photograph in photographs)}
+    """Return the means over the photographs that have a value; None, and the reason, where none has."""
+    values = {name: [row[name] for row in photographs if row[name] is not None] for name in NAMES}
+    return {
+        **{name: fmean(found) if found else None for name, found in values.items()},
+        "reasons": {name: photographs[0]["reasons"][name] for name, found in values.items() if not found},
+        "seen_share": fmean(row["seen_share"] for row in photographs),
+    }
 
 
 def picture_names(names: Sequence[str]) -> list[Path]:
-    """File names for pictures of photographs: NAME.png, or NAME.JPG.png where two differ only in their suffix."""
+    """Return file names for pictures of photographs: NAME.png, or NAME.JPG.png if two differ in their suffix only."""
     stems = [PurePosixPath(name).with_suffix("") for name in names]
     return [Path(f"{stem if stems.count(stem) == 1 else name}.png") for stem, name in zip(stems, names, strict=True)]
 
 
-def _save_pictures(out: Path, file: Path, image: Image8, truth: Image8, rendering: Rendering) -> None:
+def _write_pictures(out: Path, file: Path, image: Image8, truth: Image8, rendering: Rendering) -> None:
     error = Scale("magma", 0.0, 1.0)
     panels = [
         Panel("ground truth", truth),
@@ -194,6 +186,7 @@ def _save_pictures(out: Path, file: Path, image: Image8, truth: Image8, renderin
 
 
 def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
+    """Return the table of means: a row per metric, a column per set of pixels."""
     table = Table(title=f"{scene.root.name}, {len(scene.test)} held-out photographs, {report['width']} px")
     table.add_column("mean")
     for column in _COLUMNS.values():
@@ -206,7 +199,7 @@ def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
 
 
 def _remarks(report: Mapping[str, Any], out: Path) -> list[str]:
-    """What the table cannot say: why values are missing, speed, and where the pictures lie."""
+    """Return the lines below the table: why values are missing, speed, and the folder of the pictures."""
     missing: dict[str, list[str]] = {}
     for name, reason in report["mean"]["reasons"].items():
         missing.setdefault(reason, []).append(name)

@@ -1,13 +1,12 @@
-"""LPIPS (Zhang et al., 2018) with AlexNet and VGG backbones, when its weights are on this machine.
+"""Compute LPIPS (Zhang et al., 2018) with AlexNet and VGG backbones if their published weights are on this machine.
 
-torchmetrics brings the method and its small linear layers; the backbones' architectures come from torchvision (an
-optional extra), their weights from two files in torch hub's folder. Nothing is ever downloaded unless
-`download_lpips_weights` is called.
+torchmetrics has the method and its small linear layers; the backbones' architectures come from torchvision (an
+optional extra), their weights from two files in torch hub's folder. Nothing is downloaded unless
+`download_lpips_weights` is called, and only the published files are used.
 """
 
 from __future__ import annotations
 
-import pickle
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -34,97 +33,120 @@ SMALLEST_PX = 32  # AlexNet's poolings leave nothing of a smaller image
 
 
 class Lpips:
-    """One backbone, ready for use; on CPU.
+    """LPIPS with one backbone, on CPU.
 
     Attributes:
         sha256: of the file of its weights.
     """
 
-    def __init__(self, backbone: Literal["alex", "vgg"], weights: Path) -> None:
+    def __init__(self, backbone: Literal["alex", "vgg"], weights: Path, sha256: str) -> None:
         from torchmetrics.functional.image.lpips import _LPIPS
 
-        # The backbone is built with random weights, which must not disturb a training that goes on afterwards; they
-        # are replaced here rather than by torchvision, whose loader would download what is missing.
+        # The backbone is built with random weights, which must not disturb a training that continues afterwards; they
+        # are replaced here and not by torchvision, whose loader would download a missing file.
         with torch.random.fork_rng(devices=[]):
             self._network = _LPIPS(net=backbone, pnet_rand=True)
         loaded = torch.load(weights, map_location="cpu", weights_only=True)
-        self.sha256 = file_sha256(weights)
+        self.sha256 = sha256
         features = self._network.net
         # torchmetrics cuts torchvision's `features` into slices: slice3.6.weight is features.6.weight.
         features.load_state_dict({name: loaded["features." + name.split(".", 1)[1]] for name in features.state_dict()})
         self._truth: Tensor | None = None
-        self._expected: list[Tensor] = []
+        self._truth_features: list[Tensor] = []
 
     @torch.no_grad()
     def __call__(
         self, image: UInt8[Tensor, "H W 3"], truth: UInt8[Tensor, "H W 3"], masks: Sequence[Bool[Tensor, "H W"]]
     ) -> list[float]:
-        """The distance between two images over each mask: of a full mask, LPIPS as it is usually given.
+        """Return the distance between two images over each mask; over a full mask it is LPIPS as usually reported.
 
-        In every layer the mean over its cells is weighted with the share of the mask in each cell.
+        In each layer the mean over its cells is weighted with the share of the mask in each cell.
         """
         if truth is not self._truth:  # several images are compared with each
-            self._truth, self._expected = truth, self._features(truth)
-        layers = zip(self._network.lins, self._features(image), self._expected, strict=True)
+            self._truth, self._truth_features = truth, self._features(truth)
+        layers = zip(self._network.lins, self._features(image), self._truth_features, strict=True)
         maps = [lin((found - expected).square())[0, 0] for lin, found, expected in layers]
         return [sum(_weighted_mean(layer, mask) for layer in maps) for mask in masks]
 
     def _features(self, image: UInt8[Tensor, "H W 3"]) -> list[Tensor]:
-        """Of each layer, every cell's of unit length."""
-        scaled = self._network.scaling_layer(2 * _batch(image) - 1)
+        """Return each layer's features, of unit length in every cell."""
+        batch = image.permute(2, 0, 1)[None] / 255
+        scaled = self._network.scaling_layer(2 * batch - 1)
         return [x / torch.sqrt(1e-8 + x.square().sum(1, keepdim=True)) for x in self._network.net(scaled)]
 
 
+def _weighted_mean(layer: Float[Tensor, "h w"], mask: Bool[Tensor, "H W"]) -> float:
+    share = F.adaptive_avg_pool2d(mask[None].float(), (layer.shape[0], layer.shape[1]))[0]
+    return float((layer * share).sum() / share.sum())
+
+
 def load_lpips() -> dict[str, Lpips | str]:
-    """By metric the network, or the reason why there is none and how to get it. Never downloads, never raises."""
-    networks: dict[str, Lpips | str] = {}
-    missing = prepare_torchvision()
-    for metric, (backbone, file) in BACKBONES.items():
-        path = weights_folder() / file
-        if missing is not None:
-            networks[metric] = missing
-        elif not path.is_file():
-            networks[metric] = f"the backbone's weights are not on this machine; {_how_to_get(path)}"
-        else:
-            try:
-                networks[metric] = Lpips(backbone, path)
-            except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, ValueError, KeyError) as error:
-                what = str(error).splitlines()[0] if str(error) else type(error).__name__
-                networks[metric] = f"{path.name} does not hold the backbone's weights ({what}); {_how_to_get(path)}"
-    return networks
+    """Load each metric's network, or give the reason why there is none and how to get it; never downloads or raises."""
+    unusable = prepare_torchvision()
+    if unusable is not None:
+        return dict.fromkeys(BACKBONES, unusable)
+    return {metric: _load(backbone, weights_folder() / file) for metric, (backbone, file) in BACKBONES.items()}
+
+
+def _load(backbone: Literal["alex", "vgg"], path: Path) -> Lpips | str:
+    # Results are kept and passed on, and should not contain the name of a home folder.
+    home = Path.home()
+    shown = f"$HOME/{path.relative_to(home).as_posix()}" if path.is_relative_to(home) else path
+    how_to_get = (
+        "run `tidefield evaluate` once with --download-lpips, or: "
+        f'curl --create-dirs --output "{shown}" {WEIGHTS_URL}{path.name}'
+    )
+    if not path.is_file():
+        return f"the backbone's weights are not on this machine; {how_to_get}"
+    try:
+        sha256 = file_sha256(path)
+    except OSError as error:
+        return f"{path.name} cannot be read ({error.strerror}); {how_to_get}"
+    if not _is_published(path.name, sha256):
+        return f"{path.name} is not the published file (its SHA-256 starts with {sha256[:8]}); {how_to_get}"
+    return Lpips(backbone, path, sha256)
 
 
 def weights_folder() -> Path:
-    """Where torch hub keeps weights on this machine."""
+    """Return torch hub's folder of weights on this machine."""
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
 def download_lpips_weights() -> list[Path]:
-    """Fetch the backbones' weights (233 MB and 528 MB) that are not there yet, and check their hashes.
+    """Download the backbones' weights (233 MB and 528 MB) unless the published files are there; check their hashes.
 
     Raises:
-        RunError: without a connection, or when what came is not what was asked for.
+        RunError: without a connection, or when another file than the published one arrives.
     """
     paths = [weights_folder() / file for _, file in BACKBONES.values()]
     for path in paths:
-        if path.is_file():
+        if path.is_file() and _is_published(path.name, file_sha256(path)):
             continue
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.hub.download_url_to_file(WEIGHTS_URL + path.name, str(path), hash_prefix=path.stem.rsplit("-", 1)[1])
+            torch.hub.download_url_to_file(WEIGHTS_URL + path.name, str(path), _hash_prefix(path.name))
         except (OSError, URLError, RuntimeError) as error:
             raise RunError(
-                f"{WEIGHTS_URL}{path.name} could not be fetched ({error}): expected a connection and room in "
-                f"{path.parent}; try again, or bring the file there from another machine"
+                f"{WEIGHTS_URL}{path.name} could not be downloaded ({error}): expected a connection and room in "
+                f"{path.parent}; try again, or copy the file there from another machine"
             ) from error
     return paths
 
 
-def prepare_torchvision() -> str | None:
-    """Import torchvision so that torchmetrics can; None, or the reason why it cannot be had.
+def _hash_prefix(file: str) -> str:
+    """Return the start of a published file's SHA-256, which PyTorch puts into its name: NAME-HASH.pth."""
+    return Path(file).stem.rsplit("-", 1)[1]
 
-    torchvision's compiled half does not load beside a PyTorch built for other hardware (a CPU build and the usual
-    torchvision wheel), and its import then fails where it registers two of that half's operators. LPIPS uses neither:
+
+def _is_published(file: str, sha256: str) -> bool:
+    return sha256.startswith(_hash_prefix(file))
+
+
+def prepare_torchvision() -> str | None:
+    """Import torchvision so that torchmetrics can; return None, or the reason why it cannot be imported.
+
+    torchvision's compiled half does not load with a PyTorch built for other hardware (a CPU build and the usual
+    torchvision wheel), and its import then fails where it registers two operators of that half. LPIPS uses neither:
     declaring them is enough. Without this even torchmetrics could not be imported, since it imports torchvision
     wherever it is installed.
     """
@@ -143,22 +165,3 @@ def prepare_torchvision() -> str | None:
             )
         import_module("torchvision")
     return None
-
-
-def _how_to_get(path: Path) -> str:
-    # Results are kept and handed on: whose home folder it was is nobody's business.
-    home = Path.home()
-    told = f"$HOME/{path.relative_to(home).as_posix()}" if path.is_relative_to(home) else path
-    return (
-        "run `tidefield evaluate` once with --download-lpips, or: "
-        f'curl --create-dirs --output "{told}" {WEIGHTS_URL}{path.name}'
-    )
-
-
-def _batch(image: UInt8[Tensor, "H W 3"]) -> Float[Tensor, "1 3 H W"]:
-    return image.permute(2, 0, 1)[None] / 255
-
-
-def _weighted_mean(layer: Float[Tensor, "h w"], mask: Bool[Tensor, "H W"]) -> float:
-    share = F.adaptive_avg_pool2d(mask[None].float(), (layer.shape[0], layer.shape[1]))[0]
-    return float((layer * share).sum() / share.sum())

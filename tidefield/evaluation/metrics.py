@@ -1,8 +1,8 @@
-"""How close a rendering is to its photograph: PSNR, SSIM, LPIPS and FLIP on 8-bit images.
+"""Measure how close a rendering is to its photograph: PSNR, SSIM, LPIPS and FLIP of 8-bit images.
 
-Every metric is taken over all pixels and over a mask. SSIM, LPIPS and FLIP look at windows, so a masked value is the
-mean of the metric's map over the mask; at its border the windows see a little beyond it, for every method alike.
-Libraries are imported where they are used: torchmetrics alone takes seconds.
+Every metric is taken over all pixels and over a mask. SSIM, LPIPS and FLIP use windows, so a masked value is the mean
+of the metric's map over the mask; at its border the windows reach a little beyond it, for every method alike. Equation
+numbers are those of the paper. Libraries are imported where they are used: torchmetrics alone takes seconds.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Scores:
     """Metrics of one photograph, by name with suffix.
 
     Attributes:
-        values: None where a metric could not be had.
+        values: None where a metric could not be measured.
         reasons: why, for exactly the names whose value is None.
     """
 
@@ -41,19 +41,19 @@ class Scores:
 
 
 def score(rendering: Image8, truth: Image8, seen: Bool[Tensor, "H W"], networks: Mapping[str, Lpips | str]) -> Scores:
-    """All metrics with all suffixes.
+    """Measure all metrics with all suffixes.
 
     Args:
         rendering: 8-bit colours.
         truth: the photograph.
         seen: the doubly seen pixels.
-        networks: what `load_lpips` gave.
+        networks: the result of `load_lpips`.
     """
     everywhere = torch.ones_like(seen)
     scores = Scores()
     _score_image(scores, rendering, truth, {"": everywhere, "_seen": seen}, networks)
     for suffix, mask in {"_cc": everywhere, "_seen_cc": seen}.items():
-        _score_image(scores, colour_fitted(rendering, truth, mask), truth, {suffix: mask}, networks)
+        _score_image(scores, fit_colours(rendering, truth, mask), truth, {suffix: mask}, networks)
     return scores
 
 
@@ -65,35 +65,42 @@ def _score_image(
     networks: Mapping[str, Lpips | str],
 ) -> None:
     """Add one image's metrics over each mask, under the mask's suffix."""
+
+    def add_missing(metric: str, suffix: str, reason: str) -> None:
+        scores.values[metric + suffix], scores.reasons[metric + suffix] = None, reason
+
     for suffix in [suffix for suffix, mask in masks.items() if not mask.any()]:
         del masks[suffix]
         for metric in METRICS:
-            scores.values[metric + suffix] = None
-            scores.reasons[metric + suffix] = "two training photographs see none of this photograph's pixels"
+            add_missing(metric, suffix, "two training photographs see none of this photograph's pixels")
     if not masks:
         return
-    alike, difference = ssim_map(image, truth), flip_map(image, truth)
+    ssim, flip = ssim_map(image, truth), flip_map(image, truth)
     for suffix, mask in masks.items():
         scores.values["psnr" + suffix] = psnr(image, truth, mask)
-        scores.values["ssim" + suffix] = float(alike[mask].mean())
-        scores.values["flip" + suffix] = float(difference[mask].mean())
+        scores.values["ssim" + suffix] = float(ssim[mask].mean())
+        scores.values["flip" + suffix] = float(flip[mask].mean())
     for metric in BACKBONES:
         network = networks[metric]
         if min(image.shape[:2]) < SMALLEST_PX:
             network = f"LPIPS needs images of at least {SMALLEST_PX} pixels each way; evaluate at a larger width"
         if isinstance(network, str):
-            scores.values.update({metric + suffix: None for suffix in masks})
-            scores.reasons.update({metric + suffix: network for suffix in masks})
+            for suffix in masks:
+                add_missing(metric, suffix, network)
         else:
             values = network(image, truth, list(masks.values()))
             scores.values.update({metric + suffix: value for suffix, value in zip(masks, values, strict=True)})
 
 
-def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> float:
-    """Eqs. 11-12 over the masked pixels, dB, at most `PSNR_LIMIT_DB`."""
-    error = image[mask].double() - truth[mask].double()
-    mean_square = float(error.square().mean())
-    return min(10 * math.log10(255**2 / mean_square), PSNR_LIMIT_DB) if mean_square > 0 else PSNR_LIMIT_DB
+def psnr_from_mse(mse: float, peak: float = 1.0) -> float:
+    """Return the PSNR of a mean squared error of values up to `peak` (eq. 12), dB, at most `PSNR_LIMIT_DB`."""
+    return PSNR_LIMIT_DB if mse <= 0 else min(10 * math.log10(peak**2 / mse), PSNR_LIMIT_DB)
+
+
+def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"] | None = None) -> float:
+    """Return the PSNR over the masked pixels, or over all (eqs. 11-12), dB, at most `PSNR_LIMIT_DB`."""
+    error = image.double() - truth.double()
+    return psnr_from_mse(float((error if mask is None else error[mask]).square().mean()), peak=255.0)
 
 
 def psnr_from_mse(mean_square: float) -> float:
@@ -102,13 +109,17 @@ def psnr_from_mse(mean_square: float) -> float:
 
 
 def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
-    """Eq. 13 around each pixel, mean over the channels."""
+    """Return the SSIM (eq. 13) around each pixel, mean over the channels; for its borders see `similarity`."""
     first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))
     return similarity(first, second)[0].mean(0).float()
 
 
 def similarity(first: Float[Tensor, "T C H W"], second: Float[Tensor, "T C H W"]) -> Float[Tensor, "T C H W"]:
-    """Eq. 13 around each value: 11x11 Gaussian, sigma 1.5, data range 1, reflected borders; differentiable."""
+    """Return the SSIM (eq. 13) around each value, differentiable: 11x11 Gaussian, sigma 1.5, data range 1.
+
+    Borders are reflected, as torchmetrics does, so that every pixel has a value. scikit-image leaves 5 pixels out at
+    each border instead: inside these both maps are equal to 3e-8, but their means differ by about 0.002.
+    """
     prepare_torchvision()
     from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -120,20 +131,20 @@ def similarity(first: Float[Tensor, "T C H W"], second: Float[Tensor, "T C H W"]
 
 
 def flip_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
-    """LDR-FLIP (Andersson et al., 2020) of each pixel, 0 to 1, at its default viewing distance (67 pixels/degree)."""
+    """Return each pixel's LDR-FLIP (Andersson et al., 2020), 0 to 1, at its default distance (67 pixels/degree)."""
     import flip_evaluator
 
-    first, second = (np.ascontiguousarray(x.numpy(), dtype=np.float32) / 255 for x in (truth, image))
+    reference, test = (np.ascontiguousarray(x.numpy(), dtype=np.float32) / 255 for x in (truth, image))
     result, _, _ = flip_evaluator.evaluate(
-        first, second, "LDR", applyMagma=False, computeMeanError=False, parameters={}
+        reference, test, "LDR", applyMagma=False, computeMeanError=False, parameters={}
     )
     return torch.from_numpy(np.array(result[..., 0]))
 
 
-def colour_fitted(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> Image8:
-    """The image after the affine map of its colours (3x4) that brings it closest to the truth over the mask.
+def fit_colours(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> Image8:
+    """Apply the affine map of colours (3x4) that brings an image closest to the truth over the mask.
 
-    Least squares on the 8-bit values, so it can be repeated from the pictures on disk; of least norm where the masked
+    Least squares on the 8-bit values, so it can be repeated from the pictures on disk; of least norm if the masked
     colours do not determine it. Unchanged for an empty mask.
     """
     if not mask.any():

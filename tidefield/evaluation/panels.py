@@ -1,4 +1,4 @@
-"""Pictures for people: colour maps, and labelled panels side by side."""
+"""Draw labelled panels side by side, with colour maps and their scales."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 WIDEST_PANEL_PX = 800
-STRIP_PX = 26  # height of the label above each panel, and of the scale below
+STRIP_PX = 26  # height of the label above each panel, and of the scale below it
 GAP_PX = 4
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 COLOUR_MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "magma": cv2.COLORMAP_MAGMA}
-"""Perceptually uniform ones: equal steps of a value look equally large."""
+"""Perceptually uniform: equal steps of a value look equally large."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What a panel's colours mean.
+    """Meaning of a panel's colours.
 
     Attributes:
         colour_map: one of `COLOUR_MAPS`.
         low: value at the start of the map.
         high: value at its end.
-        unit: written behind the values.
+        unit: written after the values.
     """
 
     colour_map: str
@@ -47,7 +47,7 @@ class Panel:
 
 
 def colours(values: Float[Tensor, "H W"], scale: Scale) -> UInt8[Tensor, "H W 3"]:
-    """Values as colours of a scale's map, clipped to its ends."""
+    """Return values as colours of a scale's map, clipped to its ends."""
     # The floor on the range gives a constant image the map's first colour.
     share = (values.cpu() - scale.low) / max(scale.high - scale.low, 1e-12)
     grey = (share.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -55,14 +55,14 @@ def colours(values: Float[Tensor, "H W"], scale: Scale) -> UInt8[Tensor, "H W 3"
 
 
 def depth_panel(label: str, depth: Float[Tensor, "H W"], unit: str = "") -> Panel:
-    """Depths as a panel, from their 1st to their 99th percentile."""
+    """Return depths as a panel, coloured from their 1st to their 99th percentile."""
     low, high = np.percentile(depth.cpu().numpy(), [1, 99]).tolist()
     scale = Scale("viridis", low, high, unit)
     return Panel(label, colours(depth, scale), scale)
 
 
 def side_by_side(panels: Sequence[Panel]) -> Image.Image:
-    """Panels in a row, each under its label; wide ones are made smaller, all to the height of the first."""
+    """Draw panels in a row, each below its label, at the height of the first, which is shrunk if it is wide."""
     images = [Image.fromarray(panel.image.cpu().numpy()) for panel in panels]
     height = round(images[0].height * min(1, WIDEST_PANEL_PX / images[0].width))
     images = [image.resize((round(image.width * height / image.height), height)) for image in images]
@@ -80,7 +80,7 @@ def side_by_side(panels: Sequence[Panel]) -> Image.Image:
 
 
 def strip(width: int, left: str, right: str = "") -> Image.Image:
-    """A strip of paper with text at its ends."""
+    """Draw a strip of paper with text at its ends."""
     band = Image.new("RGB", (width, STRIP_PX), PAPER)
     draw = ImageDraw.Draw(band)
     font = ImageFont.load_default(14)
@@ -90,7 +90,7 @@ def strip(width: int, left: str, right: str = "") -> Image.Image:
 
 
 def _scale_bar(width: int, scale: Scale) -> Image.Image:
-    """The colour map between its two values."""
+    """Draw the colour map between its two values."""
     low, high = (f"{value:.3g}{scale.unit}" for value in (scale.low, scale.high))
     band = strip(width, low, high)
     text = max(int(ImageFont.load_default(14).getlength(word)) for word in (low, high)) + 14

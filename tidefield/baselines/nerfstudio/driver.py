@@ -21,7 +21,7 @@ from tidefield.baselines.nerfstudio.export import camera_to_json, export
 from tidefield.config import Budget
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.evaluation.curves import SHARES, Curve
+from tidefield.evaluation.curves import SHARES, QualityCurve
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
@@ -42,7 +42,7 @@ def train(
     budget: Budget,
     seed: int,
     device: torch.device,
-    curve: Curve | None,
+    curve: QualityCurve | None,
     progress: Callable[[int, float], object],
 ) -> TrainingProgress:
     """Train with nerfstudio's defaults, but for the camera optimiser and the appearance embedding, which are off.

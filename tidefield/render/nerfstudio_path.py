@@ -1,0 +1,158 @@
+"""Read camera paths that nerfstudio's viewer exports ("Generate Command" writes camera_paths/NAME.json).
+
+The file holds render_width, render_height, fps, seconds, camera_type and camera_path: per frame a camera_to_world of 16
+numbers, row by row, with OpenGL's axes (+x right, +y up, -z forward), and fov, the vertical field of view in degrees.
+(nerfstudio/viewer/render_panel.py writes it, nerfstudio/cameras/camera_paths.py get_path_from_json reads it.)
+
+nerfstudio rotates, shifts and scales a scene before training: p_viewer = scale * (transform [p; 1]). It writes both to
+dataparser_transforms.json in the run's output folder; a copy of that file next to the path takes the path back into the
+scene's coordinates. Without it the path is taken to be in the scene's own coordinates, as they are on disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from tidefield.data.readers.transforms import read_json
+from tidefield.errors import TidefieldError
+
+NORMALISATION_FILE = "dataparser_transforms.json"
+LARGEST_SIDE = 16384  # the largest that x264 encodes
+
+
+@dataclass(frozen=True)
+class NerfstudioPath:
+    """Frames of a video in a scene's coordinates as they are on disk (its origin is not subtracted yet).
+
+    Attributes:
+        position: camera centres.
+        rotation: camera-to-world with OpenCV's axes (columns: right, down, forward).
+        focal_px: per frame, for square pixels.
+        width: of the video; height likewise.
+        frames_per_second: None if the file does not state it.
+    """
+
+    position: Float64[np.ndarray, "F 3"]
+    rotation: Float64[np.ndarray, "F 3 3"]
+    focal_px: Float64[np.ndarray, " F"]
+    width: int
+    height: int
+    frames_per_second: float | None
+
+
+def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
+    """Read a camera path.
+
+    Args:
+        file: the JSON; a `dataparser_transforms.json` next to it is used.
+        scene_root: the scene's folder; if the scene comes from a transforms.json of nerfstudio's, its
+            applied_transform decides which coordinates "the scene's own" are.
+
+    Raises:
+        TidefieldError: the file is missing, damaged, of another camera type, or holds invalid poses.
+    """
+    top = read_json(file)
+    kind = top.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise TidefieldError(f"{file} is for a camera of type {kind!r}: expected perspective; export it as that")
+    frames = top.get("camera_path")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise TidefieldError(f"{file} has no list camera_path of frames: expected nerfstudio's export of a camera path")
+    width, height = (
+        _number(top, key, str(file), lambda x: x == round(x) and 1 <= x <= LARGEST_SIDE, f"1 to {LARGEST_SIDE} pixels")
+        for key in ("render_width", "render_height")
+    )
+    places = [f"{file}, frame {i}" for i in range(len(frames))]
+    degrees = [
+        _number(frame, "fov", place, lambda x: 0 < x < 180, "0 to 180 degrees")
+        for frame, place in zip(frames, places, strict=True)
+    ]
+    pose = np.stack([_pose(frame, place) for frame, place in zip(frames, places, strict=True)])
+    pose = _undo_normalisation(pose, file.with_name(NORMALISATION_FILE), scene_root)
+    speed = None
+    for key, to_speed in (("fps", lambda x: x), ("seconds", lambda x: len(frames) / x)):
+        if speed is None and top.get(key) is not None:
+            speed = to_speed(_number(top, key, str(file), lambda x: x > 0, "a positive number"))
+    return NerfstudioPath(
+        position=pose[:, :3, 3],
+        rotation=pose[:, :3, :3] * (1.0, -1.0, -1.0),  # from OpenGL's to OpenCV's y and z
+        focal_px=height / 2 / np.tan(np.radians(degrees) / 2),
+        width=round(width),
+        height=round(height),
+        frames_per_second=speed,
+    )
+
+
+def _pose(frame: Mapping[str, Any], place: str) -> Float64[np.ndarray, "4 4"]:
+    matrix = _array(frame, "camera_to_world", place, (16,)).reshape(4, 4)
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    if not np.allclose(matrix[3], last) and np.allclose(matrix[:, 3], last):
+        matrix = matrix.T  # three.js itself stores matrices column by column
+    if not np.allclose(matrix[3], last, atol=1e-6) or not _is_rotation(matrix[:3, :3]):
+        raise TidefieldError(
+            f"{place}: camera_to_world is no rotation and position in a 4 x 4 matrix; export the path again"
+        )
+    u, _, vt = np.linalg.svd(matrix[:3, :3])  # orthogonal to the last digit
+    matrix[:3, :3] = u @ vt
+    return matrix
+
+
+def _undo_normalisation(pose: Float64[np.ndarray, "F 4 4"], file: Path, root: Path) -> Float64[np.ndarray, "F 4 4"]:
+    """Take poses from nerfstudio's normalised coordinates to the scene's, if `file` describes them."""
+    if not file.is_file():
+        return pose
+    top, transform = read_json(file), np.eye(4)
+    transform[:3] = _array(top, "transform", str(file), (3, 4))
+    scale = float(_array(top, "scale", str(file), ()))
+    transforms = root / "transforms.json"
+    if transforms.is_file() and not (root / "sparse").is_dir():
+        # The normalisation starts from the coordinates before applied_transform and applied_scale; such a scene's own
+        # coordinates are those after them.
+        meta, applied = {"applied_scale": 1.0, **read_json(transforms)}, np.eye(4)
+        if "applied_transform" in meta:
+            applied[:3] = _array(meta, "applied_transform", str(transforms), (3, 4))
+        transform = transform @ np.linalg.inv(applied)
+        scale /= float(_array(meta, "applied_scale", str(transforms), ()))
+    rotation = transform[:3, :3]
+    if scale <= 0 or not _is_rotation(rotation, mirrored=True):
+        raise TidefieldError(
+            f"{file} has scale {scale} and a transform of determinant {np.linalg.det(rotation):.3g}: expected a "
+            "positive scale and a rotation with a shift; copy the file again from nerfstudio's output folder"
+        )
+    scene = pose.copy()
+    scene[:, :3, :3] = rotation.T @ pose[:, :3, :3]
+    scene[:, :3, 3] = (pose[:, :3, 3] / scale - transform[:3, 3]) @ rotation
+    return scene
+
+
+def _is_rotation(matrix: Float64[np.ndarray, "3 3"], mirrored: bool = False) -> bool:
+    """Return whether a matrix is orthogonal to 1e-3 and, unless it may be mirrored, of positive determinant."""
+    orthogonal = np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3)
+    return orthogonal and (mirrored or bool(np.linalg.det(matrix) > 0))
+
+
+def _number(top: Mapping[str, Any], key: str, place: str, valid: Callable[[float], bool], expected: str) -> float:
+    """Return a finite number that is valid, or raise one clear error."""
+    value = float(_array(top, key, place, ()))
+    if not valid(value):
+        raise TidefieldError(f"{place}: {key} is {value:g}: expected {expected}; correct it")
+    return value
+
+
+def _array(top: Mapping[str, Any], key: str, place: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return finite numbers of a shape, or raise one clear error."""
+    value = top.get(key)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != shape or not np.isfinite(array).all() or isinstance(value, bool | str):
+        wanted = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+        raise TidefieldError(f"{place}: {key} is missing or malformed: expected {wanted}; export the path again")
+    return array
