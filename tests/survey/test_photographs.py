@@ -67,7 +67,7 @@ def test_a_folder_that_is_none_or_has_no_photographs_is_an_error(tmp_path):
     with pytest.raises(SurveyError, match="has no photographs"):
         read_survey(tmp_path)
     (tmp_path / "a.HEIC").write_bytes(b"")
-    with pytest.raises(SurveyError, match=r"pictures of other kinds \(a.HEIC\)"):
+    with pytest.raises(SurveyError, match=r"images of other formats \(a.HEIC\)"):
         read_survey(tmp_path)
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from tidefield.errors import SurveyError
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.io.pictures import upright
+from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.quality.measures import sharpness
 from tidefield.survey.quality.off_survey import off_survey
 from tidefield.survey.quality.verdicts import Verdict, judge, keep

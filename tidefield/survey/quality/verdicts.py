@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from tidefield.errors import SurveyError
 from tidefield.machine import cores
 from tidefield.survey.io.photographs import FEWEST
-from tidefield.survey.io.pictures import thumbnail
+from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.io.positions import metres_around
 from tidefield.survey.quality.duplicates import duplicates
 from tidefield.survey.quality.measures import SIDE_PX, Measures, measure

@@ -11,9 +11,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
 from tidefield.errors import SurveyError
-from tidefield.survey.io import pictures
+from tidefield.survey.io import image_decoding
+from tidefield.survey.io.image_decoding import thumbnail, upright, upright_size, upright_uv
 from tidefield.survey.io.photographs import _read
-from tidefield.survey.io.pictures import thumbnail, upright, upright_size, upright_uv
 from tidefield.survey.survey import Photograph
 
 
@@ -130,5 +130,5 @@ def test_a_small_file_that_claims_billions_of_pixels_is_refused_before_it_is_dec
 
 
 def test_a_photograph_of_a_hundred_megapixels_is_none_of_that(tmp_path):
-    with pictures.opened(png_header(tmp_path / "large.png", 11_648, 8_736)) as picture:
+    with image_decoding.open_image(png_header(tmp_path / "large.png", 11_648, 8_736)) as picture:
         assert picture.size == (11_648, 8_736)

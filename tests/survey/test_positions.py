@@ -9,11 +9,11 @@ from camera_files import BRIGHTON, exif, named, photograph, survey_folder
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError
-from tidefield.survey.io.gps_files import read_gps_file
-from tidefield.survey.io.names import Names
 from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.io.positions import read_gps_file
+from tidefield.survey.io.text_files import PhotographNames
 
-NAMES = Names(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
+NAMES = PhotographNames(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
 
 
 def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
@@ -62,7 +62,7 @@ def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
         ("", "begins with 'nothing': expected a header such as image_name,lat,lon,gps_height"),
         ("DJI_0001,54.5,-2.75\n", "begins with 'DJI_0001,54.5,-2.75': expected a header"),
         ("name,lat,lon\nDJI_0001,54.5,west\n", "line 2 has 'west': expected a number"),
-        ("name,lat,lon\nDJI_0001,512875.75,351139.75\n", "line 2 says .* metres belong under the EPSG code"),
+        ("name,lat,lon\nDJI_0001,512875.75,351139.75\n", "line 2 gives .* metres belong under the EPSG code"),
         ("name,lat,lon\nDJI_0001,54.5,2\nDJI_0001,54.6,2\n", "line 3 gives DJI_0001.JPG a second position"),
         ("name,lat,lon\nIMG_1,54.5,2\n", "names none of the photographs"),
     ],
@@ -81,7 +81,7 @@ def test_a_table_in_another_encoding_is_an_error(tmp_path):
 
 
 def test_a_short_name_of_two_photographs_is_an_error(tmp_path):
-    names = Names(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG"])
+    names = PhotographNames(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG"])
     path = written(tmp_path, "name,lat,lon\nDJI_0001.JPG,54.5,2\n")
     with pytest.raises(SurveyError, match=r"DJI_0001.JPG names 2 photographs .*write its folder, too"):
         read_gps_file(path, names)
@@ -129,7 +129,7 @@ def test_angles_and_accuracies_of_a_geo_txt_are_read(tmp_path):
         ("DJI_0001.JPG -2.75 54.5\n", "is 'DJI_0001.JPG -2.75 54.5': expected a projected or geographic"),
         ("EPSG:4978\nDJI_0001.JPG 1 2 3\n", "is 'EPSG:4978': expected a projected or geographic"),
         ("EPSG:4326\nDJI_0001.JPG here there\n", "line 2 is 'DJI_0001.JPG here there': expected image_name x y"),
-        ("EPSG:27700\nDJI_0001.JPG 1e12 1e12 3\n", "line 2 says .*: expected coordinates in 'EPSG:27700'"),
+        ("EPSG:27700\nDJI_0001.JPG 1e12 1e12 3\n", "line 2 gives .*: expected coordinates in 'EPSG:27700'"),
         ("EPSG:4326\nIMG_1.JPG 1 2 3\n", "names none of the photographs"),
     ],
 )
@@ -175,7 +175,7 @@ def moved(folder: Path, **places: tuple[float, float]) -> Path:
     [
         ((0.0, 0.0), "it is zero: the receiver had no fix"),
         ((-91.9946, 46.8426), "its latitude is beyond the poles: latitude and longitude are swapped"),
-        ((46.8426, -300.0), "it is no place on the Earth"),
+        ((46.8426, -300.0), "it is outside of the range of coordinates"),
         ((47.74, -91.9946), "it is 100 km from the others"),
     ],
 )
@@ -209,7 +209,7 @@ def test_two_places_keep_their_positions_and_are_pointed_out(tmp_path):
     survey = read_survey(moved(tmp_path, **elsewhere))
     assert all(photograph.position for photograph in survey.photographs)
     assert "4 of the 10 positions lie 100 km and more from the others (x0.jpg" in survey.remarks[0]
-    assert "two places" in survey.remarks[0]
+    assert "two sites" in survey.remarks[0]
 
 
 def test_a_survey_on_the_date_line_is_one_place(tmp_path):
