@@ -1,4 +1,4 @@
-"""Ground control of ODM's gcp_list.txt, and what is wrong with it."""
+"""Ground control is read from ODM's gcp_list.txt; errors, and control of another site, are refused."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def line(point: int, uv: tuple[float, float], rest: str, separator: str = " ") -
     return separator.join([*map(str, POINTS[point]), *map(str, uv), rest]) + "\n"
 
 
-def test_the_control_of_swindale_is_found_by_itself():
+def test_the_control_file_of_swindale_is_found():
     survey = read_survey(real_survey("swindale"))
     assert survey.control is not None
     assert survey.control.crs == "EPSG:27700"
@@ -61,7 +61,7 @@ def test_a_list_is_read_with_any_header_and_separator(tmp_path, header, separato
     )
 
 
-def test_points_without_names_are_told_apart_by_their_places(tmp_path):
+def test_points_without_names_are_distinguished_by_position(tmp_path):
     lines = line(0, (1, 2), "DJI_0000.JPG") + line(1, (3, 4), "DJI_0000.JPG") + line(0, (5, 6), "DJI_0001.JPG")
     found, _ = control(survey_folder(tmp_path), UTM + "\n" + lines)
     assert found.points == {"point 1": POINTS[0], "point 2": POINTS[1]}
@@ -83,14 +83,14 @@ def test_names_with_spaces_are_those_of_photographs(tmp_path):
 @pytest.mark.parametrize(
     ("orientation", "upright"), [(1, (10.0, 20.0)), (3, (54.0, 28.0)), (6, (28.0, 10.0)), (8, (20.0, 54.0))]
 )
-def test_marks_are_for_the_picture_as_it_is_stored(tmp_path, orientation, upright):
+def test_marks_refer_to_the_stored_image(tmp_path, orientation, upright):
     survey_folder(tmp_path, place=None)
     photograph(tmp_path / "turned.jpg", (64, 48), exif({Base.Orientation: orientation}))
     found, _ = control(tmp_path, UTM + "\n" + line(0, (10, 20), "turned.jpg A"))
     assert found.marks == (Mark("A", "turned.jpg", upright),)
 
 
-def test_marks_in_photographs_that_are_not_there_are_left_out_and_named(tmp_path):
+def test_marks_in_missing_photographs_are_left_out_and_reported(tmp_path):
     lines = line(0, (1, 2), "DJI_0000.JPG A") + line(1, (3, 4), "IMG 7.JPG B") + line(0, (5, 6), "gone.JPG A")
     found, remarks = control(survey_folder(tmp_path), UTM + "\n" + lines)
     assert list(found.points) == ["A"]
@@ -98,7 +98,7 @@ def test_marks_in_photographs_that_are_not_there_are_left_out_and_named(tmp_path
     assert remarks == ["gcp_list.txt marks points in photographs that do not exist (left out): IMG 7.JPG, gone.JPG."]
 
 
-def test_marks_outside_their_photograph_are_left_out_and_named(tmp_path):
+def test_marks_outside_their_photograph_are_left_out_and_reported(tmp_path):
     lines = (line(0, uv, f"DJI_000{index}.JPG A") for index, uv in enumerate(((1, 2), (3, 4), (70, 4))))
     found, remarks = control(survey_folder(tmp_path), UTM + "\n" + "".join(lines))
     assert len(found.marks) == 2
@@ -154,7 +154,7 @@ def test_another_encoding_and_a_missing_file_are_errors(tmp_path):
         read_survey(tmp_path, control=tmp_path / "none.txt")
 
 
-def test_the_last_digit_of_a_printed_coordinate_makes_no_second_place(tmp_path):
+def test_rounding_of_a_printed_coordinate_is_tolerated(tmp_path):
     again = line(0, (3, 4), "DJI_0001.JPG A").replace("183.1", "183.1004")
     found, _ = control(survey_folder(tmp_path), UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + again)
     assert found.points == {"A": POINTS[0]}
@@ -172,7 +172,7 @@ def refusal(crs: str, x: float, y: float, here: tuple[float, float] = HERE) -> s
     return str(caught.value)
 
 
-def test_control_of_the_same_place_passes():
+def test_control_of_the_same_site_is_accepted():
     refuse_elsewhere(Control("EPSG:27700", {"G1": (351139.0, 512875.0, 264.0)}, ()), *HERE)
 
 
@@ -193,5 +193,5 @@ def test_the_system_that_fits_is_named(crs, x, y, expected):
     assert " km from the photographs" in message or "nowhere near" in message
 
 
-def test_coordinates_that_a_system_cannot_hold_are_refused_too():
+def test_coordinates_outside_of_the_domain_of_a_system_are_refused():
     assert "nowhere near the photographs" in refusal("EPSG:27700", 1e12, 1e12)

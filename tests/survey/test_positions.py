@@ -1,4 +1,4 @@
-"""Positions from files beside photographs: tables of many makes, ODM's geo.txt, and which of two sources counts."""
+"""Positions are read from tables of several programs and from geo.txt; the priority of two sources holds."""
 
 import math
 import re
@@ -32,7 +32,7 @@ def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
         '# made by a receiver\nName,Latitude,Longitude,Elevation,Note\n"DJI_0001.DNG", 54.5, -2.75, 344.17, "a, b"\n\n',
     ],
 )
-def test_tables_of_many_makes_say_the_same(tmp_path, text):
+def test_tables_of_several_programs_give_the_same_positions(tmp_path, text):
     found = read_gps_file(written(tmp_path, text), NAMES)
     assert list(found) == ["DJI_0001.JPG"]
     position = found["DJI_0001.JPG"].position
@@ -138,7 +138,7 @@ def test_a_geo_txt_that_cannot_be_understood_is_an_error(tmp_path, text, message
         read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
 
 
-def test_a_file_beside_the_photographs_fills_in_what_exif_lacks(tmp_path):
+def test_a_file_in_the_folder_gives_positions_that_exif_lacks(tmp_path):
     survey_folder(tmp_path, count=3)
     photograph(tmp_path / "x.jpg")
     written(tmp_path, f"name,lat,lon\nDJI_0000,46.9,-91.9\nx,{BRIGHTON[0]},{BRIGHTON[1]}\n", "GPS.CSV")
@@ -148,7 +148,7 @@ def test_a_file_beside_the_photographs_fills_in_what_exif_lacks(tmp_path):
     assert survey.remarks == ()
 
 
-def test_a_file_that_is_given_counts_more_than_exif(tmp_path):
+def test_a_file_that_is_given_has_priority_over_exif(tmp_path):
     survey_folder(tmp_path / "photographs", count=4)
     path = written(tmp_path, "EPSG:4326\nDJI_0000.JPG -91.99 46.84 200 10 0 0\n", "better.txt")
     survey = read_survey(tmp_path / "photographs", gps=path)
@@ -179,7 +179,7 @@ def moved(folder: Path, **places: tuple[float, float]) -> Path:
         ((47.74, -91.9946), "it is 100 km from the others"),
     ],
 )
-def test_a_position_that_cannot_be_right_is_left_out_and_the_photograph_named(tmp_path, place, reason):
+def test_an_impossible_position_is_left_out_and_reported(tmp_path, place, reason):
     survey = read_survey(moved(tmp_path, odd=place))
     assert named(survey, "odd.jpg").position is None
     assert sum(photograph.position is not None for photograph in survey.photographs) == 6
@@ -188,7 +188,7 @@ def test_a_position_that_cannot_be_right_is_left_out_and_the_photograph_named(tm
     assert any(remark.startswith("1 of 7 photographs have no position: odd.jpg") for remark in survey.remarks)
 
 
-def test_latitude_and_longitude_that_are_swapped_are_told_by_the_others(tmp_path):
+def test_swapped_latitude_and_longitude_are_found_by_the_other_positions(tmp_path):
     for index in range(5):
         photograph(tmp_path / f"{index}.jpg", table=exif(place=(45.03, 7.62 + 1e-4 * index)))
     photograph(tmp_path / "odd.jpg", table=exif(place=(7.62, 45.03)))
@@ -204,7 +204,7 @@ def test_a_file_helps_where_exif_is_impossible(tmp_path):
     assert odd.position.source == "gps.csv"
 
 
-def test_two_places_keep_their_positions_and_are_pointed_out(tmp_path):
+def test_two_sites_keep_their_positions_and_are_reported(tmp_path):
     elsewhere = {f"x{index}": (47.74, -91.99 + 1e-4 * index) for index in range(4)}
     survey = read_survey(moved(tmp_path, **elsewhere))
     assert all(photograph.position for photograph in survey.photographs)
@@ -212,7 +212,7 @@ def test_two_places_keep_their_positions_and_are_pointed_out(tmp_path):
     assert "two sites" in survey.remarks[0]
 
 
-def test_a_survey_on_the_date_line_is_one_place(tmp_path):
+def test_a_survey_on_the_date_line_is_one_site(tmp_path):
     for index, longitude in enumerate((179.9995, 179.9998, -179.9999, -179.9996)):
         photograph(tmp_path / f"{index}.jpg", table=exif(place=(-16.5, longitude)))
     survey = read_survey(tmp_path)

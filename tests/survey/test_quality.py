@@ -1,4 +1,4 @@
-"""Bad photographs are told from good ones by stated measures, on a made survey and on real ones."""
+"""Photographs of low quality are found by stated limits, on synthetic and real surveys."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ GROUND = texture((1800, 900), seed=7)
 
 
 def view(left: int, top: int = 100) -> np.ndarray:
-    """What a camera sees from one place over the made ground."""
+    """The image of the synthetic ground from one position."""
     return GROUND[top : top + SIZE[1], left : left + SIZE[0]]
 
 
@@ -74,18 +74,18 @@ def left_out(survey: Survey) -> dict[str, str]:
     return {decision.name: decision.left_out for decision in assess_quality(survey) if decision.left_out}
 
 
-def test_a_good_flight_is_kept_whole_and_progress_is_told(tmp_path):
+def test_all_photographs_of_a_good_flight_are_kept_and_progress_is_reported(tmp_path):
     survey = flight(tmp_path)
-    told = []
-    decisions = assess_quality(survey, lambda done, of: told.append((done, of)))
+    reported = []
+    decisions = assess_quality(survey, lambda done, of: reported.append((done, of)))
     assert [decision.name for decision in decisions] == [photograph.name for photograph in survey.photographs]
     assert all(decision.left_out is None and decision.measures for decision in decisions)
-    assert told == [(index, 10) for index in range(1, 11)]
+    assert reported == [(index, 10) for index in range(1, 11)]
     assert select_photographs(survey, decisions) == survey
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 45, 90, 120])
-def test_a_photograph_blurred_by_movement_is_found_whatever_the_direction(tmp_path, angle_deg):
+def test_a_photograph_blurred_by_motion_in_any_direction_is_found(tmp_path, angle_deg):
     found = left_out(flight(tmp_path, blurred=moved(view(500, 300), 6, math.radians(angle_deg))))
     assert list(found) == ["blurred.jpg"]
     assert found["blurred.jpg"].startswith("blurred: its sharpness is 0.")
@@ -109,7 +109,7 @@ def test_smooth_mud_is_not_blurred(tmp_path):
     assert decisions["mud.jpg"].left_out is None
     bare_measures = decisions["bare.jpg"].measures
     assert bare_measures is not None
-    assert math.isnan(bare_measures.sharpness)  # nothing to judge by: it is flat, not blurred
+    assert math.isnan(bare_measures.sharpness)  # too little texture: it is flat, not blurred
     assert (decisions["bare.jpg"].left_out or "").startswith("flat")
 
 
@@ -148,7 +148,7 @@ def test_of_a_hovering_drone_the_sharpest_photograph_is_kept(tmp_path):
     assert found["f07.jpg"].startswith("duplicate: it has the view of copy.jpg, shifted by 0.0%")
 
 
-def test_a_blurred_duplicate_does_not_put_out_the_sharp_one(tmp_path):
+def test_of_a_blurred_duplicate_the_sharp_one_is_kept(tmp_path):
     found = left_out(flight(tmp_path, blurred=moved(view(130 * 4), 8, 0.3)))
     assert list(found) == ["blurred.jpg"]
     assert found["blurred.jpg"].startswith("blurred")
@@ -162,14 +162,14 @@ def sky(share: float) -> np.ndarray:
     return pixels
 
 
-def test_a_photograph_of_the_sky_is_found_by_its_looks(tmp_path):
+def test_a_photograph_of_the_sky_is_found_without_metadata(tmp_path):
     found = left_out(flight(tmp_path, sky=sky(0.5), strip=sky(0.2)))
     assert list(found) == ["sky.jpg"]
     assert found["sky.jpg"].startswith("horizon: 5") or found["sky.jpg"].startswith("horizon: 4")
 
 
 @pytest.mark.parametrize(("pitch_deg", "share", "out"), [("-5", 0.45, True), ("-90", 0.45, False), ("-5", 0.0, False)])
-def test_a_gimbal_is_believed_where_the_picture_bears_it_out(tmp_path, pitch_deg, share, out):
+def test_gimbal_pitch_counts_where_the_image_confirms_it(tmp_path, pitch_deg, share, out):
     angles = {"GimbalYawDegree": "10", "GimbalPitchDegree": pitch_deg, "GimbalRollDegree": "0"}
     flight(tmp_path)
     photograph(tmp_path / "g.jpg", packet=xmp(angles), pixels=sky(share))
@@ -229,7 +229,7 @@ def test_a_flat_set_is_one_clear_error(tmp_path):
     assert select_photographs(survey, decisions, keep_all=True) == survey
 
 
-def test_what_cannot_be_decoded_is_left_out_even_when_all_are_to_be_kept(tmp_path):
+def test_undecodable_photographs_are_left_out_even_with_keep_all(tmp_path):
     survey = flight(tmp_path, odd=view(500, 300))
     data = bytearray((tmp_path / "odd.jpg").read_bytes())
     (tmp_path / "odd.jpg").write_bytes(data[:3000])  # after the survey was read
@@ -250,7 +250,7 @@ def test_what_cannot_be_decoded_is_left_out_even_when_all_are_to_be_kept(tmp_pat
     assert [mark.photograph for mark in kept.control.marks] == ["f01.jpg"]
 
 
-def test_tiny_photographs_are_judged_by_what_they_have(tmp_path):
+def test_tiny_photographs_are_assessed(tmp_path):
     assert all(
         isinstance(decision, QualityDecision) for decision in assess_quality(read_survey(survey_folder(tmp_path)))
     )

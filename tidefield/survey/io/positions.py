@@ -131,7 +131,7 @@ def _columns(header: str) -> tuple[dict[str, int], str]:
     separator = max(",;\t", key=header.count)
     found: dict[str, int] = {}
     for index, title in enumerate(header.split(separator)):
-        # Metashape has "X/Longitude"; units stand in brackets.
+        # Metashape has "X/Longitude"; units are in brackets.
         parts = re.sub(r"[\[(].*?[\])]", "", title.casefold()).split("/")
         plain = [re.sub(r"[^a-z]", "", part) for part in parts]
         meaning = next((key for key, titles in _COLUMNS.items() if any(part in titles for part in plain)), None)

@@ -212,7 +212,7 @@ def _flat(measures: Measures) -> str | None:
     if measures.contrast >= FLAT_CONTRAST:
         return None
     return (
-        f"flat: 98% of the picture lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
+        f"flat: 98% of the image lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
         f"{FLAT_CONTRAST:.0f} or more."
     )
 
