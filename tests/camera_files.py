@@ -1,4 +1,4 @@
-"""Photographs as cameras write them, small: pictures with EXIF and XMP, for tests of reading and of quality."""
+"""Write small photographs with EXIF and XMP as cameras do, for tests of reading and of quality."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def real_survey(name: str) -> Path:
 
 
 def texture(size: tuple[int, int], seed: int = 0) -> np.ndarray:
-    """A picture of something: every scale has its share, as on natural ground."""
+    """A random texture with the spectrum of natural ground."""
     width, height = size
     generator = np.random.default_rng(seed)
     spectrum = np.fft.rfft2(generator.normal(size=(height, width)))
@@ -104,7 +104,7 @@ def survey_folder(folder: Path, count: int = 4, place: tuple[float, float] | Non
 
 
 def one(folder: Path, **given) -> Photograph:
-    """The photograph that is written so, out of a survey of three."""
+    """Write a photograph and read it as one of a survey of three."""
     survey_folder(folder, count=2, place=None)
     photograph(folder / "this.jpg", **given)
     return named(read_survey(folder), "this.jpg")

@@ -4,12 +4,13 @@ import math
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pytest
 import torch
 from shared_data import SHARED
 from torch import Tensor
 
-from tidefield.data.exif import Metadata, read_metadata
+from tidefield.data.exif import Exposures, read_exposures
 from tidefield.data.exposure import disagreement, estimate_gains
 from tidefield.data.images import Photographs
 from tidefield.data.scene import SparsePoints, every_eighth
@@ -154,7 +155,7 @@ def test_the_exposure_of_a_held_out_photograph_counts():
     log_exposure[::2] = 0.6
     truth = torch.exp(0.5 * log_exposure)[:, None].float().expand(COUNT, 3)
     photographs, cameras, points = survey(truth)
-    metadata = Metadata(log_exposure, torch.full((COUNT,), math.nan, dtype=torch.float64))
+    metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
     error = (estimate_gains(photographs, cameras, points, TRAIN, metadata) / relative(truth)).log().abs()
     without = (estimate_gains(photographs, cameras, points, TRAIN) / relative(truth)).log().abs()
     assert error.max() < 0.02
@@ -164,7 +165,7 @@ def test_the_exposure_of_a_held_out_photograph_counts():
 def test_exposures_that_the_photographs_contradict_are_left_aside():
     log_exposure = torch.linspace(-1, 1, COUNT, dtype=torch.float64).flip(0)[torch.arange(COUNT) * 5 % COUNT]
     photographs, cameras, points = survey(torch.ones(COUNT, 3))
-    metadata = Metadata(log_exposure, torch.full((COUNT,), math.nan, dtype=torch.float64))
+    metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
     found = estimate_gains(photographs, cameras, points, TRAIN, metadata)
     assert found.log().abs().max() < 0.02
 
@@ -172,12 +173,12 @@ def test_exposures_that_the_photographs_contradict_are_left_aside():
 def test_without_sparse_points_the_exposures_decide_and_else_gains_are_one():
     photographs, cameras, _ = survey(planted())
     log_exposure = torch.linspace(0, 1, COUNT, dtype=torch.float64)
-    nothing = torch.full((COUNT,), math.nan, dtype=torch.float64)
-    found = estimate_gains(photographs, cameras, None, TRAIN, Metadata(log_exposure, nothing))
+    nothing = np.full(COUNT, math.nan)
+    found = estimate_gains(photographs, cameras, None, TRAIN, Exposures(log_exposure.numpy(), nothing))
     assert torch.allclose(found[-1].log() - found[0].log(), torch.full((3,), 0.45), atol=1e-5)
     assert torch.equal(estimate_gains(photographs, cameras, None, TRAIN), torch.ones(COUNT, 3))
     assert torch.equal(
-        estimate_gains(photographs, cameras, None, TRAIN, Metadata(nothing, nothing)), torch.ones(COUNT, 3)
+        estimate_gains(photographs, cameras, None, TRAIN, Exposures(nothing, nothing)), torch.ones(COUNT, 3)
     )
 
 
@@ -186,14 +187,14 @@ SWINDALE = SHARED / "scenes" / "swindale" / "images"
 
 @pytest.mark.skipif(not SWINDALE.is_dir(), reason="the swindale photographs are not on this machine")
 def test_exposures_and_times_of_a_real_survey_are_read():
-    metadata = read_metadata([SWINDALE / f"IMG_{n}.jpg" for n in (1481, 1483, 1484)])
+    metadata = read_exposures([SWINDALE / f"IMG_{n}.jpg" for n in (1481, 1483, 1484)])
     first, second, third = metadata.log_exposure.tolist()
     assert first - second == pytest.approx(math.log(2))
     assert second == third
-    assert metadata.time_s.diff().tolist() == [341.0, 6.0]
+    assert np.diff(metadata.time_s).tolist() == [341.0, 6.0]
 
 
-def test_pictures_without_exif_say_nothing(tmp_path: Path):
+def test_photographs_without_exif_have_no_exposure_or_time(tmp_path: Path):
     from PIL import Image
 
     Image.new("RGB", (8, 8)).save(tmp_path / "plain.png")
@@ -202,6 +203,44 @@ def test_pictures_without_exif_say_nothing(tmp_path: Path):
     exif.get_ifd(0x8769)[0x829A] = 0.0
     exif.get_ifd(0x8769)[0x9003] = "yesterday"
     broken.save(tmp_path / "odd.jpg", exif=exif)
-    metadata = read_metadata([tmp_path / "plain.png", tmp_path / "odd.jpg"])
-    assert metadata.log_exposure.isnan().all()
-    assert metadata.time_s.isnan().all()
+    metadata = read_exposures([tmp_path / "plain.png", tmp_path / "odd.jpg"])
+    assert np.isnan(metadata.log_exposure).all()
+    assert np.isnan(metadata.time_s).all()
+
+
+def exif_of(**tags: object) -> bytes:
+    """EXIF with tags of the Exif block, by name."""
+    from PIL import ExifTags, Image
+
+    table = Image.Exif()
+    table[ExifTags.IFD.Exif] = {ExifTags.Base[name]: value for name, value in tags.items()}
+    return table.tobytes()
+
+
+def test_a_factor_that_one_photograph_lacks_is_left_out_for_all(tmp_path: Path):
+    from PIL import Image
+
+    picture = Image.new("RGB", (8, 8))
+    picture.save(tmp_path / "a.jpg", exif=exif_of(ExposureTime=1 / 100, ISOSpeedRatings=200, FNumber=4.0))
+    picture.save(
+        tmp_path / "b.jpg", exif=exif_of(ExposureTime=1 / 400, FNumber=2.0, DateTimeDigitized="2024:05:06 07:08:09")
+    )
+    found = read_exposures([tmp_path / "a.jpg", tmp_path / "b.jpg"])
+    assert found.log_exposure == pytest.approx([-math.log(100 * 16), -math.log(400 * 4)])
+    assert math.isnan(found.time_s[0])
+    assert found.time_s[1] == 1714979289.0
+
+
+def test_exif_of_a_png_is_read_without_decoding_it_and_damaged_exif_counts_as_absent(tmp_path: Path):
+    from PIL import Image
+
+    picture = Image.new("RGB", (8, 8))
+    whole = exif_of(ExposureTime=1 / 100)
+    for name, exif in (("a.png", whole), ("b.png", None), ("c.jpg", b"Exif\0\0nothing of EXIF")):
+        picture.save(tmp_path / name, **({} if exif is None else {"exif": exif}))
+    for name in ("a.png", "b.png"):  # without their pixels: decoding fails
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: data.index(b"IDAT") + 6])
+    assert read_exposures([tmp_path / "a.png"]).log_exposure == pytest.approx([-math.log(100)])
+    assert np.isnan(read_exposures([tmp_path / "b.png", tmp_path / "c.jpg"]).log_exposure).all()
+    assert len(read_exposures([]).time_s) == 0

@@ -11,8 +11,8 @@ from PIL.ExifTags import Base
 
 from tidefield.survey.colour import Evening
 from tidefield.survey.copy_images import place_photographs, tangent_map
+from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.io.pictures import upright
 from tidefield.survey.survey import Photograph
 
 SIZE = (64, 48)

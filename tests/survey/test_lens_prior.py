@@ -1,4 +1,4 @@
-"""What files say of their lenses comes out in pixels of the upright photograph."""
+"""Lens priors of metadata are in pixels of the upright photograph."""
 
 import math
 from pathlib import Path
@@ -11,7 +11,7 @@ from PIL.ExifTags import Base
 from tidefield.survey.io.photographs import read_survey
 
 
-def test_a_phantom_3_says_where_it_was_and_how_long_its_lens_is():
+def test_position_and_focal_length_of_a_phantom_3():
     first = read_survey(real_survey("brighton_beach")).photographs[0]
     assert (first.camera, first.width, first.height, first.orientation) == ("DJI FC300S", 1600, 900, 1)
     assert first.position is not None
@@ -25,7 +25,7 @@ def test_a_phantom_3_says_where_it_was_and_how_long_its_lens_is():
     assert not first.lens.trusted
 
 
-def test_a_phantom_4_multispectral_says_what_its_maker_calibrated():
+def test_the_calibration_of_a_phantom_4_multispectral():
     first = read_survey(real_survey("turin_lot")).photographs[0]
     assert first.lens is not None
     assert (first.lens.source, first.lens.trusted) == ("DJI dewarp data", True)
@@ -38,7 +38,7 @@ def test_a_phantom_4_multispectral_says_what_its_maker_calibrated():
     assert first.serial == "7d2ed18fec733f57faa2ea5415a75c9f"
 
 
-def test_the_lens_of_a_turned_photograph_turns_with_it(tmp_path):
+def test_a_lens_prior_follows_the_orientation(tmp_path):
     numbers = "2024-01-01;800,800,30,-20,-0.1,0.02,0.001,-0.002,0.003"
     packet = xmp(
         {"DewarpData": numbers, "CalibratedOpticalCenterX": "500", "CalibratedOpticalCenterY": "400", "DewarpFlag": "0"}

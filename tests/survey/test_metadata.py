@@ -1,4 +1,4 @@
-"""What cameras and drones write beside the pixels is read as it was meant."""
+"""The metadata of cameras and drones is read with its units and signs."""
 
 import math
 
@@ -9,7 +9,7 @@ from PIL.ExifTags import GPS, Base
 from tidefield.survey.io.photographs import read_survey
 
 
-def test_a_canon_without_gps_takes_its_positions_from_the_table_beside():
+def test_a_canon_without_gps_takes_its_positions_from_the_table_in_its_folder():
     first = read_survey(real_survey("swindale")).photographs[0]
     assert first.position is not None
     assert (first.position.latitude_deg, first.position.longitude_deg) == (54.5096294, -2.7570267)
@@ -40,7 +40,7 @@ def test_exposure_time_and_body_are_read(tmp_path):
     assert read.time_s == pytest.approx(1714979289.25)
 
 
-def test_a_photograph_that_says_nothing_is_a_photograph(tmp_path):
+def test_a_photograph_without_metadata_is_read(tmp_path):
     read = one(tmp_path)
     assert (read.camera, read.serial, read.lens, read.position, read.gimbal_deg) == ("", "", None, None, None)
     assert all(map(math.isnan, (read.focal_mm, read.time_s, read.log_exposure, read.relative_altitude_m)))
@@ -73,7 +73,7 @@ def test_positions_in_the_south_and_west_under_the_sea_have_their_signs(tmp_path
         (7, b"0300", 5.0, "unknown"),
     ],
 )
-def test_what_a_height_counts_from_depends_on_the_version_of_exif(tmp_path, reference, version, height_m, datum):
+def test_the_vertical_datum_depends_on_the_version_of_exif(tmp_path, reference, version, height_m, datum):
     table = exif({Base.ExifVersion: version}, {GPS.GPSAltitude: 5.0, GPS.GPSAltitudeRef: bytes([reference])}, BRIGHTON)
     read = one(tmp_path, table=table).position
     assert read is not None
@@ -103,7 +103,7 @@ def test_an_rtk_drone_under_the_ellipsoid_keeps_its_sign(tmp_path):
     assert read.gimbal_deg == (-179.9, -90.0, 0.0)
 
 
-def test_deviations_without_a_position_fix_are_not_believed(tmp_path):
+def test_deviations_without_a_position_fix_are_ignored(tmp_path):
     packet = xmp({"RtkFlag": "0", "RtkStdLon": "0.01", "RtkStdLat": "0.01", "RtkStdHgt": "0.01"})
     read = one(tmp_path, table=exif(place=BRIGHTON), packet=packet).position
     assert read is not None
@@ -158,7 +158,7 @@ def test_three_zero_angles_are_no_angles(tmp_path):
         b"<x/>" + b" " * 0 + b"<!--" + b"a" * 60000,
     ],
 )
-def test_xmp_that_is_damaged_or_malicious_is_not_read_and_named(tmp_path, packet):
+def test_damaged_or_malicious_xmp_is_not_read_and_is_reported(tmp_path, packet):
     survey_folder(tmp_path, count=2)
     photograph(tmp_path / "odd.jpg", packet=packet)
     survey = read_survey(tmp_path)

@@ -1,4 +1,4 @@
-"""Folders of photographs become surveys, and what is wrong with them is said."""
+"""Folders of photographs are read as surveys; errors are reported."""
 
 import math
 import os
@@ -23,7 +23,7 @@ def test_three_real_surveys_are_read_whole_and_without_remarks():
         assert all(math.isfinite(photograph.time_s + photograph.log_exposure) for photograph in survey.photographs)
 
 
-def test_photographs_are_found_in_sub_folders_whatever_their_suffix_and_name(tmp_path):
+def test_photographs_are_found_in_sub_folders_with_any_suffix_and_name(tmp_path):
     names = ["100MEDIA/DJI 0001.JPG", "101MEDIA/DJI 0001.JPG", "Watt, Süd/Priel №3.jpeg", "b.TIFF", "潮汐.png"]
     for name in names:
         photograph(tmp_path / name)
@@ -37,7 +37,7 @@ def test_photographs_are_found_in_sub_folders_whatever_their_suffix_and_name(tmp
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_photograph_has_the_size_at_which_it_stands_upright(tmp_path, orientation):
+def test_a_photograph_has_its_upright_size(tmp_path, orientation):
     turned = one(tmp_path, size=(64, 48), table=exif({Base.Orientation: orientation}))
     assert turned.orientation == orientation
     assert (turned.width, turned.height) == ((64, 48) if orientation < 5 else (48, 64))
@@ -51,14 +51,14 @@ def test_raw_files_alone_are_to_be_developed_first(tmp_path):
         read_survey(tmp_path)
 
 
-def test_raw_files_beside_photographs_are_named(tmp_path):
+def test_raw_files_next_to_photographs_are_reported(tmp_path):
     (survey_folder(tmp_path) / "DJI_0001.DNG").write_bytes(b"II*\0")
     survey = read_survey(tmp_path)
     assert len(survey.photographs) == 4
     assert any("DJI_0001.DNG" in remark and "develop" in remark for remark in survey.remarks)
 
 
-def test_a_folder_that_is_none_or_has_no_photographs_is_an_error(tmp_path):
+def test_a_folder_that_does_not_exist_or_has_no_photographs_is_an_error(tmp_path):
     with pytest.raises(SurveyError, match="is nothing: expected a folder"):
         read_survey(tmp_path / "gone")
     (tmp_path / "file").write_text("")
@@ -67,7 +67,7 @@ def test_a_folder_that_is_none_or_has_no_photographs_is_an_error(tmp_path):
     with pytest.raises(SurveyError, match="has no photographs"):
         read_survey(tmp_path)
     (tmp_path / "a.HEIC").write_bytes(b"")
-    with pytest.raises(SurveyError, match=r"pictures of other kinds \(a.HEIC\)"):
+    with pytest.raises(SurveyError, match=r"images of other formats \(a.HEIC\)"):
         read_survey(tmp_path)
 
 
@@ -105,7 +105,7 @@ def test_too_few_files_that_can_be_read_is_an_error_that_names_the_others(tmp_pa
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_a_file_of_somebody_else_is_left_out(tmp_path):
+def test_a_file_without_read_permission_is_left_out(tmp_path):
     (survey_folder(tmp_path) / "DJI_0000.JPG").chmod(0)
     assert any("DJI_0000.JPG cannot be read (Permission denied)" in r for r in read_survey(tmp_path).remarks)
 

@@ -1,4 +1,4 @@
-"""Bad photographs are told from good ones by stated measures, on a made survey and on real ones."""
+"""Photographs of low quality are found by stated limits, on synthetic and real surveys."""
 
 import math
 from dataclasses import replace
@@ -11,11 +11,15 @@ from camera_files import BRIGHTON, exif, photograph, real_survey, survey_folder,
 from PIL import Image
 
 from tidefield.errors import SurveyError
+from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.io.pictures import upright
+from tidefield.survey.quality.assessment import (
+    QualityDecision,
+    assess_quality,
+    find_off_survey,
+    select_photographs,
+)
 from tidefield.survey.quality.measures import sharpness
-from tidefield.survey.quality.off_survey import off_survey
-from tidefield.survey.quality.verdicts import Verdict, judge, keep
 from tidefield.survey.survey import Control, Mark, Survey
 
 SIZE = (400, 300)
@@ -23,7 +27,7 @@ GROUND = texture((1800, 900), seed=7)
 
 
 def view(left: int, top: int = 100) -> np.ndarray:
-    """What a camera sees from one place over the made ground."""
+    """The image of the synthetic ground from one position."""
     return GROUND[top : top + SIZE[1], left : left + SIZE[0]]
 
 
@@ -67,21 +71,21 @@ def flight(folder: Path, count: int = 10, **others: np.ndarray) -> Survey:
 
 
 def left_out(survey: Survey) -> dict[str, str]:
-    return {verdict.name: verdict.left_out for verdict in judge(survey) if verdict.left_out}
+    return {decision.name: decision.left_out for decision in assess_quality(survey) if decision.left_out}
 
 
-def test_a_good_flight_is_kept_whole_and_progress_is_told(tmp_path):
+def test_all_photographs_of_a_good_flight_are_kept_and_progress_is_reported(tmp_path):
     survey = flight(tmp_path)
-    told = []
-    verdicts = judge(survey, lambda done, of: told.append((done, of)))
-    assert [verdict.name for verdict in verdicts] == [photograph.name for photograph in survey.photographs]
-    assert all(verdict.left_out is None and verdict.measures for verdict in verdicts)
-    assert told == [(index, 10) for index in range(1, 11)]
-    assert keep(survey, verdicts) == survey
+    reported = []
+    decisions = assess_quality(survey, lambda done, of: reported.append((done, of)))
+    assert [decision.name for decision in decisions] == [photograph.name for photograph in survey.photographs]
+    assert all(decision.left_out is None and decision.measures for decision in decisions)
+    assert reported == [(index, 10) for index in range(1, 11)]
+    assert select_photographs(survey, decisions) == survey
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 45, 90, 120])
-def test_a_photograph_blurred_by_movement_is_found_whatever_the_direction(tmp_path, angle_deg):
+def test_a_photograph_blurred_by_motion_in_any_direction_is_found(tmp_path, angle_deg):
     found = left_out(flight(tmp_path, blurred=moved(view(500, 300), 6, math.radians(angle_deg))))
     assert list(found) == ["blurred.jpg"]
     assert found["blurred.jpg"].startswith("blurred: its sharpness is 0.")
@@ -101,12 +105,12 @@ def test_smooth_mud_is_not_blurred(tmp_path):
     noise = np.random.default_rng(3).normal(0, 1.5, mud.shape)
     bare = np.full_like(mud, 120) + noise
     survey = flight(tmp_path, mud=np.clip(mud + noise, 0, 255).astype(np.uint8), bare=bare.astype(np.uint8))
-    verdicts = {verdict.name: verdict for verdict in judge(survey)}
-    assert verdicts["mud.jpg"].left_out is None
-    bare_measures = verdicts["bare.jpg"].measures
+    decisions = {decision.name: decision for decision in assess_quality(survey)}
+    assert decisions["mud.jpg"].left_out is None
+    bare_measures = decisions["bare.jpg"].measures
     assert bare_measures is not None
-    assert math.isnan(bare_measures.sharpness)  # nothing to judge by: it is flat, not blurred
-    assert (verdicts["bare.jpg"].left_out or "").startswith("flat")
+    assert math.isnan(bare_measures.sharpness)  # too little texture: it is flat, not blurred
+    assert (decisions["bare.jpg"].left_out or "").startswith("flat")
 
 
 def test_noise_and_contrast_do_not_change_sharpness():
@@ -140,11 +144,11 @@ def test_of_a_hovering_drone_the_sharpest_photograph_is_kept(tmp_path):
     found = left_out(flight(tmp_path, later=later, softer=cv2.GaussianBlur(later, (0, 0), 0.5), copy=view(130 * 7)))
     assert sorted(found) == ["f07.jpg", "later.jpg", "softer.jpg"]
     for name in ("later.jpg", "softer.jpg"):
-        assert found[name].startswith("duplicate: it shows what f04.jpg shows, shifted by 0.")
-    assert found["f07.jpg"].startswith("duplicate: it shows what copy.jpg shows, shifted by 0.0%")
+        assert found[name].startswith("duplicate: it has the view of f04.jpg, shifted by 0.")
+    assert found["f07.jpg"].startswith("duplicate: it has the view of copy.jpg, shifted by 0.0%")
 
 
-def test_a_blurred_duplicate_does_not_put_out_the_sharp_one(tmp_path):
+def test_of_a_blurred_duplicate_the_sharp_one_is_kept(tmp_path):
     found = left_out(flight(tmp_path, blurred=moved(view(130 * 4), 8, 0.3)))
     assert list(found) == ["blurred.jpg"]
     assert found["blurred.jpg"].startswith("blurred")
@@ -158,14 +162,14 @@ def sky(share: float) -> np.ndarray:
     return pixels
 
 
-def test_a_photograph_of_the_sky_is_found_by_its_looks(tmp_path):
+def test_a_photograph_of_the_sky_is_found_without_metadata(tmp_path):
     found = left_out(flight(tmp_path, sky=sky(0.5), strip=sky(0.2)))
     assert list(found) == ["sky.jpg"]
     assert found["sky.jpg"].startswith("horizon: 5") or found["sky.jpg"].startswith("horizon: 4")
 
 
 @pytest.mark.parametrize(("pitch_deg", "share", "out"), [("-5", 0.45, True), ("-90", 0.45, False), ("-5", 0.0, False)])
-def test_a_gimbal_is_believed_where_the_picture_bears_it_out(tmp_path, pitch_deg, share, out):
+def test_gimbal_pitch_counts_where_the_image_confirms_it(tmp_path, pitch_deg, share, out):
     angles = {"GimbalYawDegree": "10", "GimbalPitchDegree": pitch_deg, "GimbalRollDegree": "0"}
     flight(tmp_path)
     photograph(tmp_path / "g.jpg", packet=xmp(angles), pixels=sky(share))
@@ -186,7 +190,7 @@ def test_photographs_away_from_the_survey_are_found(tmp_path):
     found = left_out(replace(survey, photographs=tuple(photographs)))
     assert sorted(found) == ["away.jpg", "low.jpg"]
     assert found["away.jpg"].startswith("off the survey: it was taken 76")
-    assert "2 m above the place of take-off, the others at 40 m" in found["low.jpg"]
+    assert "2 m above the take-off point, the others at 40 m" in found["low.jpg"]
 
 
 def test_a_second_field_and_a_low_flight_are_parts_of_the_survey(tmp_path):
@@ -212,20 +216,20 @@ def test_a_survey_of_many_fields_is_one_survey(tmp_path):
             assert taken.position is not None
             east = replace(taken.position, longitude_deg=taken.position.longitude_deg + 0.01 * field)
             fields.append(replace(taken, name=f"{field:02d}/{taken.name}", position=east))
-    assert off_survey(fields) == {}
+    assert find_off_survey(fields) == {}
 
 
 def test_a_flat_set_is_one_clear_error(tmp_path):
     for index in range(5):
         photograph(tmp_path / f"{index}.jpg", pixels=np.full((*SIZE[::-1], 3), 128, np.uint8))
     survey = read_survey(tmp_path)
-    verdicts = judge(survey)
+    decisions = assess_quality(survey)
     with pytest.raises(SurveyError, match=r"0 of the 5 photographs .*\(5 flat; such as 0.jpg, flat: .*--keep-all"):
-        keep(survey, verdicts)
-    assert keep(survey, verdicts, keep_all=True) == survey
+        select_photographs(survey, decisions)
+    assert select_photographs(survey, decisions, keep_all=True) == survey
 
 
-def test_what_cannot_be_decoded_is_left_out_even_when_all_are_to_be_kept(tmp_path):
+def test_undecodable_photographs_are_left_out_even_with_keep_all(tmp_path):
     survey = flight(tmp_path, odd=view(500, 300))
     data = bytearray((tmp_path / "odd.jpg").read_bytes())
     (tmp_path / "odd.jpg").write_bytes(data[:3000])  # after the survey was read
@@ -235,25 +239,27 @@ def test_what_cannot_be_decoded_is_left_out_even_when_all_are_to_be_kept(tmp_pat
         (Mark("A", "odd.jpg", (1.0, 2.0)), Mark("B", "odd.jpg", (1.0, 2.0)), Mark("B", "f01.jpg", (3.0, 4.0))),
     )
     survey = replace(survey, control=control)
-    verdicts = judge(survey)
-    odd = next(verdict for verdict in verdicts if verdict.name == "odd.jpg")
+    decisions = assess_quality(survey)
+    odd = next(decision for decision in decisions if decision.name == "odd.jpg")
     assert odd.measures is None
     assert (odd.left_out or "").startswith("undecodable: ")
-    kept = keep(survey, verdicts, keep_all=True)
+    kept = select_photographs(survey, decisions, keep_all=True)
     assert len(kept.photographs) == 10
     assert kept.control is not None
     assert list(kept.control.points) == ["B"]
     assert [mark.photograph for mark in kept.control.marks] == ["f01.jpg"]
 
 
-def test_tiny_photographs_are_judged_by_what_they_have(tmp_path):
-    assert all(isinstance(verdict, Verdict) for verdict in judge(read_survey(survey_folder(tmp_path))))
+def test_tiny_photographs_are_assessed(tmp_path):
+    assert all(
+        isinstance(decision, QualityDecision) for decision in assess_quality(read_survey(survey_folder(tmp_path)))
+    )
 
 
 @pytest.mark.parametrize(("name", "count"), [("brighton_beach", 18), ("turin_lot", 32), ("swindale", 79)])
 def test_every_photograph_of_the_real_surveys_is_kept(name, count):
     survey = read_survey(real_survey(name))
-    kept = keep(survey, judge(survey))
+    kept = select_photographs(survey, assess_quality(survey))
     assert len(kept.photographs) == count
     assert kept == survey
 
@@ -284,4 +290,4 @@ def test_defects_made_of_real_photographs_are_found(name, tmp_path):
     assert found.keys() == {photograph.name for photograph in kinds} | {"later.png"}
     for taken, kind in kinds.items():
         assert found[taken.name].startswith(kind)
-    assert found["later.png"].startswith(f"duplicate: it shows what {chosen[9].name} shows")
+    assert found["later.png"].startswith(f"duplicate: it has the view of {chosen[9].name}, ")

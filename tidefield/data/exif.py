@@ -1,80 +1,128 @@
-"""What photograph files say about themselves without their pixels: exposure and time, from EXIF."""
+"""Read EXIF: numbers, texts, exposure and capture time, without decoding pixels. The one home of EXIF parsing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from PIL import ExifTags, Image
-from torch import Tensor
+import numpy as np
+from jaxtyping import Float64
+from PIL import ExifTags, Image, PngImagePlugin
 
-EXPOSURE_TAGS = {
+EXPOSURE_POWERS = {
     ExifTags.Base.ExposureTime: 1,
     ExifTags.Base.ISOSpeedRatings: 1,
     ExifTags.Base.FNumber: -2,
 }
-"""The tags that exposure is made of, with their powers in the light that reaches the picture."""
+"""The tags that determine the exposure, with the power that each has in the light that is recorded."""
+
+_TIMES = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized, ExifTags.Base.DateTime)
 
 
 @dataclass(frozen=True)
-class Metadata:
-    """What the files of V photographs say; NaN where they say nothing.
+class Exif:
+    """The EXIF of one file.
+
+    Attributes:
+        tags: the tags of the image and those of its Exif block, in one table.
+        gps: the GPS block.
+        damaged: whether a part of the EXIF could not be read; it counts as absent.
+    """
+
+    tags: Mapping[int, object]
+    gps: Mapping[int, object]
+    damaged: bool = False
+
+    def number(self, tag: int) -> float:
+        """A positive number; NaN where the tag is absent, zero or not a number."""
+        value = as_number(self.tags.get(tag))
+        return value if value > 0 else math.nan
+
+    def text(self, tag: int) -> str:
+        """A text; empty where the tag is absent."""
+        value = self.tags.get(tag, "")
+        text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
+        return text.partition("\0")[0].strip()
+
+    @property
+    def log_exposure_terms(self) -> tuple[float, ...]:
+        """Natural logs of exposure time, ISO and f-number, times their powers: they add up to the log exposure."""
+        return tuple(power * math.log(self.number(tag)) for tag, power in EXPOSURE_POWERS.items())
+
+    @property
+    def time_s(self) -> float:
+        """Capture time, in seconds since 1970 by the camera's clock, with EXIF's fraction; NaN if unknown."""
+        for tag in _TIMES:
+            try:
+                moment = datetime.strptime(self.text(tag), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+            except ValueError:  # absent, or zeros from a clock that was never set
+                continue
+            fraction = self.text(ExifTags.Base.SubsecTimeOriginal)
+            return moment.timestamp() + (float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0)
+        return math.nan
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """Exposures and capture times of V photographs; NaN where unknown.
 
     Attributes:
         log_exposure: natural log of exposure time x ISO / f-number^2, up to a constant.
-        time_s: when each was taken, in seconds since any common moment.
+        time_s: capture time, in seconds since any common moment.
     """
 
-    log_exposure: Float[Tensor, " V"]
-    time_s: Float[Tensor, " V"]
+    log_exposure: Float64[np.ndarray, " V"]
+    time_s: Float64[np.ndarray, " V"]
 
 
-def read_metadata(paths: Sequence[Path]) -> Metadata:
-    """Exposure and time of photographs from their EXIF; decodes no pixels.
-
-    A tag of the exposure that some of the photographs lack is left out for all, because it could not be compared.
-
-    Raises:
-        OSError: a file is not there or is no picture.
-    """
-    tables = [_exif(path) for path in paths]
-    exposure = torch.zeros(len(paths), dtype=torch.float64)
-    known = False
-    for tag, power in EXPOSURE_TAGS.items():
-        term = torch.tensor([_log(table.get(tag)) for table in tables], dtype=torch.float64)
-        if term.isfinite().all():
-            exposure, known = exposure + power * term, True
-    time = torch.tensor([_seconds(table) for table in tables], dtype=torch.float64)
-    return Metadata(exposure if known else torch.full_like(exposure, math.nan), time)
-
-
-def _exif(path: Path) -> dict:
-    with Image.open(path) as image:
-        return dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
-
-
-def _log(value: object) -> float:
-    """Log of a positive EXIF number; NaN for anything else (absent, zero, 0/0, several values)."""
+def as_number(value: object) -> float:
+    """A number of EXIF or XMP ("+39.8", "527/100", the first of several); NaN for anything else."""
     if isinstance(value, tuple):
         value = value[0] if value else None
+    if isinstance(value, str) and value.count("/") == 1:
+        above, below = (as_number(part) for part in value.split("/"))
+        return above / below if below else math.nan
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return math.nan
-    return math.log(number) if 0 < number < math.inf else math.nan
+    return number if math.isfinite(number) else math.nan
 
 
-def _seconds(table: dict) -> float:
-    """DateTimeOriginal with its fraction, in seconds; NaN where it is absent or malformed."""
+def read_exif(image: Image.Image) -> Exif:
+    """Read the EXIF of an opened image, without decoding its pixels; empty where there is none."""
+    tags: dict[int, object] = {}
+    gps: dict[int, object] = {}
+    # Pillow decodes the pixels of a PNG without EXIF in its header, to look for EXIF behind them.
+    if isinstance(image, PngImagePlugin.PngImageFile) and "exif" not in image.info:
+        return Exif(tags, gps)
     try:
-        text = str(table[ExifTags.Base.DateTimeOriginal]).strip("\0 ")
-        moment = datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-    except (KeyError, ValueError):
-        return math.nan
-    fraction = str(table.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
-    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+        table = image.getexif()
+        tags = {**table, **table.get_ifd(ExifTags.IFD.Exif)}
+        gps = dict(table.get_ifd(ExifTags.IFD.GPSInfo))
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, struct.error):
+        return Exif(tags, gps, damaged=True)
+    return Exif(tags, gps)
+
+
+def read_exposures(paths: Sequence[Path]) -> Exposures:
+    """Read exposures and capture times from the EXIF of photographs, without decoding pixels.
+
+    A factor of the exposure that some of the photographs lack is left out for all, because it cannot be compared.
+    Damaged EXIF counts as absent.
+
+    Raises:
+        OSError: a file does not exist or is not an image.
+    """
+    found = []
+    for path in paths:
+        with Image.open(path) as image:
+            found.append(read_exif(image))
+    terms = np.array([exif.log_exposure_terms for exif in found], dtype=np.float64).reshape(-1, len(EXPOSURE_POWERS))
+    known = np.isfinite(terms).all(axis=0)
+    log_exposure = terms[:, known].sum(axis=1) if known.any() else np.full(len(found), math.nan)
+    return Exposures(log_exposure, np.array([exif.time_s for exif in found], dtype=np.float64))

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from tidefield.data.exif import Metadata
+from tidefield.data.exif import Exposures
 from tidefield.data.images import Photographs
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras
@@ -59,7 +59,7 @@ def estimate_gains(
     cameras: Cameras,
     points: SparsePoints | None,
     train: Sequence[int],
-    metadata: Metadata | None = None,
+    metadata: Exposures | None = None,
 ) -> Float[Tensor, "V 3"]:
     """Gain of every photograph and channel; its geometric mean over the training photographs is 1 in each channel.
 
@@ -69,7 +69,7 @@ def estimate_gains(
         points: which photograph sees which point; without points the gains are what the EXIF exposures say,
             and 1 where these say nothing.
         train: indices of the training photographs; all others are held out.
-        metadata: what the files say (`exif.read_metadata`); None means nothing.
+        metadata: what the files say (`exif.read_exposures`); None means nothing.
     """
     count, learned = len(cameras), np.asarray(train, dtype=np.int64)
     exposure, clock = _exposure_and_clock(metadata, count)
@@ -243,15 +243,15 @@ def _exposure_slope(gain_change: Array, exposure_change: Array, apart: Array) ->
     return float(np.clip(slope, 0.0, 1.0))
 
 
-def _exposure_and_clock(metadata: Metadata | None, count: int) -> tuple[Array, Array]:
+def _exposure_and_clock(metadata: Exposures | None, count: int) -> tuple[Array, Array]:
     """Centred log exposures (0 where unknown), and a clock: seconds, or the photographs' order where times lack."""
     order = np.arange(count, dtype=np.float64)
     if metadata is None:
         return np.zeros(count), order
-    exposure = metadata.log_exposure.double().cpu().numpy()
+    exposure = metadata.log_exposure
     known = np.isfinite(exposure)
     centred = np.where(known, exposure - exposure[known].mean() if known.any() else 0.0, 0.0)
-    time = metadata.time_s.double().cpu().numpy()
+    time = metadata.time_s
     # EXIF counts whole seconds: the order breaks ties. Equal times everywhere tell nothing.
     usable = np.isfinite(time).all() and np.unique(time).size > count / 2
     return centred, time - time.min() + 1e-3 * order if usable else order

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from tidefield.data.exif import read_metadata
+from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
@@ -73,7 +73,7 @@ def load_scene(
     alphas = (photographs.alpha(i) for i in range(len(photographs)))
     see_through = any(alpha is not None and bool((alpha < 255).any()) for alpha in alphas)
     train, test = _split(posed)
-    gain = estimate_gains(photographs, cameras, points, train, read_metadata(posed.paths))
+    gain = estimate_gains(photographs, cameras, points, train, read_exposures(posed.paths))
     return Scene(
         root=root,
         names=posed.names,

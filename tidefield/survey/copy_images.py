@@ -19,7 +19,7 @@ from PIL import ExifTags, Image
 from tidefield.files import completed_file
 from tidefield.machine import cores
 from tidefield.survey.colour import Evening, evened
-from tidefield.survey.io.pictures import upright
+from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import Photograph
 
 STEP_PX = 8

@@ -17,7 +17,7 @@ from tidefield.data.georeference import Georeference
 from tidefield.survey import report
 from tidefield.survey.colour import Evening
 from tidefield.survey.georeference.alignment import camera_centres
-from tidefield.survey.io.pictures import thumbnail
+from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.report.page import MOST_THUMBNAILS
 from tidefield.survey.sfm.features import opened, real_name

@@ -24,8 +24,8 @@ from tidefield.survey.colour import Evening, estimate_evening
 from tidefield.survey.copy_images import place_photographs
 from tidefield.survey.export import write_transforms
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
 from tidefield.survey.quality.measures import Measures
-from tidefield.survey.quality.verdicts import Verdict, judge, keep
 from tidefield.survey.sfm.features import FeatureOptions, extract, opened, real_name
 from tidefield.survey.sfm.lens_choice import Choice, Heights, Trial, choose_lens
 from tidefield.survey.sfm.mapping import reconstruct, registered_names
@@ -73,7 +73,7 @@ class Prepared:
     """
 
     survey: Survey
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[QualityDecision, ...]
     used: frozenset[str]
     models: list[list[str]]
     lens: Choice
@@ -94,7 +94,7 @@ def prepare(
     _refuse_foreign(scene, survey)
     making = _Making(survey, scene, options, device, console)
     verdicts = making.quality()
-    good = keep(survey, verdicts, options.keep_all)
+    good = select_photographs(survey, verdicts, options.keep_all)
     making.features(good.photographs)
     making.matches(making.pairs(good.photographs))
     models, lens = making.poses()
@@ -117,12 +117,12 @@ class _Making:
         self.stages = Stages(self.work, _fingerprint(survey), options.redo)
         self.database, self.model, self.located = self.work / "database.db", self.work / "model", scene / "sparse" / "0"
 
-    def quality(self) -> tuple[Verdict, ...]:
-        """Judge the photographs."""
+    def quality(self) -> tuple[QualityDecision, ...]:
+        """Assess the quality of the photographs."""
 
         def job(resume: bool) -> Facts:
             with ProgressBar(self.console, "Judging photographs") as meter:
-                return {"verdicts": [_verdict_to_json(verdict) for verdict in judge(self.survey, meter)]}
+                return {"verdicts": [_verdict_to_json(verdict) for verdict in assess_quality(self.survey, meter)]}
 
         return tuple(map(_verdict_from_json, self.stages.run("quality", {}, [], job)["verdicts"]))
 
@@ -260,16 +260,16 @@ def _fingerprint(survey: Survey) -> list:
     return own
 
 
-def _verdict_to_json(verdict: Verdict) -> Facts:
+def _verdict_to_json(verdict: QualityDecision) -> Facts:
     measures = None if verdict.measures is None else asdict(verdict.measures)
     finite = measures and {name: value if math.isfinite(value) else None for name, value in measures.items()}
     return {"name": verdict.name, "measures": finite, "left_out": verdict.left_out}
 
 
-def _verdict_from_json(values: Facts) -> Verdict:
+def _verdict_from_json(values: Facts) -> QualityDecision:
     finite = values["measures"]
     measures = finite and Measures(**{name: math.nan if value is None else value for name, value in finite.items()})
-    return Verdict(values["name"], measures, values["left_out"])
+    return QualityDecision(values["name"], measures, values["left_out"])
 
 
 def _evening_to_json(evening: Evening) -> Facts:

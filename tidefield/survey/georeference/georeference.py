@@ -19,7 +19,7 @@ from tidefield.survey.georeference.gps import GivenPositions, given_positions
 from tidefield.survey.georeference.ground_control import fit_control
 from tidefield.survey.georeference.marks import place_marks
 from tidefield.survey.georeference.position_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
-from tidefield.survey.io.which_crs import refuse_elsewhere
+from tidefield.survey.io.gcp_file import refuse_elsewhere
 from tidefield.survey.survey import Control, Photograph, Survey
 
 

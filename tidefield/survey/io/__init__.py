@@ -1,1 +1,1 @@
-"""What a surveyor brings, read: photographs with EXIF and XMP, positions, ground control."""
+"""Read the inputs of a survey: photographs with EXIF and XMP, positions, ground control."""

@@ -1,181 +1,187 @@
-"""What a photograph's file says beside its pixels: EXIF and XMP as numbers with units."""
+"""Read the metadata of a photograph file: EXIF, and the XMP in which drone makers write gimbal, receiver and lens."""
 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Literal
+from xml.etree.ElementTree import Element, ParseError
 
-from PIL import ExifTags, Image, PngImagePlugin
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+from PIL import ExifTags, Image
 
-from tidefield.survey.io.xmp import read_xmp
+from tidefield.data.exif import Exif, as_number, read_exif
 from tidefield.survey.survey import Position
 
 _XMP_TAG = 700
 # https://www.easymanua.ls/dji/mavic-3m/manual?p=89: 0 no position, 16 single point, 32 to 49 float, 50 fixed.
 _RTK_SINGLE, _RTK_FLOAT, _RTK_FIXED = 16, 32, 50
 # Pix4D's namespace counts a camera's pitch from straight down, the others from the horizon (as opendm/photo.py of
-# OpenDroneMap has it, too). Some makers may not keep to it, so nothing is left out for a pitch alone.
+# OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its pitch alone.
 _NADIR_FROM_HORIZON_DEG = -90.0
+
+_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+_PIX4D = "http://pix4d.com/camera/1.0"
+# Packets of cameras have some kB and two levels; more is not metadata of a camera.
+_MAX_XMP_BYTES = 1_000_000
+_MAX_XMP_LEVELS = 4
 
 
 @dataclass(frozen=True)
-class Metadata:
-    """The tags of one file.
+class PhotographMetadata:
+    """The metadata of one file.
 
     Attributes:
-        exif: EXIF's tags, those of the picture and those of its Exif block together.
-        gps: EXIF's GPS block.
-        xmp: properties, named as `read_xmp` has it.
-        damaged: which of the blocks ("EXIF", "XMP") are there but cannot be read.
+        exif: the EXIF tags.
+        xmp: properties, named as `read_xmp` returns them.
+        damaged: which of the blocks ("EXIF", "XMP") are present but cannot be read.
     """
 
-    exif: Mapping[int, object]
-    gps: Mapping[int, object]
+    exif: Exif
     xmp: Mapping[str, str]
     damaged: tuple[str, ...] = ()
 
-    def number(self, tag: int) -> float:
-        """A positive number of EXIF; NaN where it is absent or none."""
-        value = as_number(self.exif.get(tag))
-        return value if value > 0 else math.nan
-
     def xmp_number(self, *names: str) -> float:
-        """The first of these properties that is there, as a number; NaN where none is."""
+        """The first of these properties that is present, as a number; NaN where none is."""
         return next((as_number(self.xmp[name]) for name in names if name in self.xmp), math.nan)
 
     def xmp_numbers(self, name: str) -> tuple[float, ...]:
-        """A property that lists numbers with commas or spaces between; empty where it is absent."""
+        """A property that lists numbers, separated by commas or spaces; empty where it is absent."""
         return tuple(as_number(part) for part in self.xmp.get(name, "").replace(",", " ").split())
 
     def text(self, tag: int, *names: str) -> str:
         """A text of EXIF, or else the first of these XMP properties; empty where there is none."""
-        value = self.exif.get(tag, "")
-        text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
-        text = text.partition("\0")[0].strip()
-        return text or next((self.xmp[name] for name in names if name in self.xmp), "")
+        return self.exif.text(tag) or next((self.xmp[name] for name in names if name in self.xmp), "")
+
+    @property
+    def camera(self) -> str:
+        """Make and model, such as "DJI FC6360"; empty if unknown."""
+        make = self.text(ExifTags.Base.Make, "Make")
+        model = self.text(ExifTags.Base.Model, "Model")
+        return model if model.casefold().startswith(make.casefold()) else f"{make} {model}".strip()
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the camera's body, or else of the drone that carries it; empty if unknown."""
+        return self.text(ExifTags.Base.BodySerialNumber, "CameraSerialNumber", "SerialNumber", "DroneSerialNumber")
+
+    @property
+    def orientation(self) -> int:
+        """EXIF orientation; 1 where it is absent or none of the eight."""
+        value = self.exif.number(ExifTags.Base.Orientation)
+        return int(value) if value in range(1, 9) else 1
+
+    @property
+    def log_exposure(self) -> float:
+        """Natural log of exposure time x ISO / f-number squared; NaN unless all three are known."""
+        return sum(self.exif.log_exposure_terms)
+
+    @property
+    def gimbal_deg(self) -> tuple[float, float, float] | None:
+        """Yaw (clockwise from north), pitch (-90 looks straight down) and roll of the camera, or None."""
+        for prefix, suffix in (("Gimbal", "Degree"), ("CameraOrientationNED/", "")):
+            yaw, pitch, roll = (self.xmp_number(f"{prefix}{name}{suffix}") for name in ("Yaw", "Pitch", "Roll"))
+            # Drones without a gimbal write three zeros.
+            if math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll)):
+                return yaw, pitch, roll
+        yaw, pitch, roll = (self.xmp_number(f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
+        return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
+
+    @property
+    def relative_altitude_m(self) -> float:
+        """Height above the take-off point; NaN if unknown."""
+        return self.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude")
+
+    @property
+    def position(self) -> Position | None:
+        """Position of the camera by its receiver, or None.
+
+        The standard deviations are those of the maker (of the two horizontal ones of DJI's RTK, the larger; Pix4D's),
+        or EXIF's positioning error.
+        """
+        latitude, longitude = _degrees(self.exif.gps, 1, "S"), _degrees(self.exif.gps, 3, "W")
+        source = "EXIF"
+        if not math.isfinite(latitude + longitude):
+            latitude = self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude")
+            # DJI's early firmware misspells the longitude.
+            longitude = self.xmp_number("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
+            source = "XMP"
+        if not math.isfinite(latitude + longitude):
+            return None
+        rtk = self.xmp_number("RtkFlag")
+        if rtk >= _RTK_FLOAT:
+            source += ", RTK fixed" if rtk == _RTK_FIXED else ", RTK float"
+        horizontal_m, vertical_m = _accuracy_m(self, rtk)
+        return Position(latitude, longitude, _height_m(self), horizontal_m, vertical_m, _datum(self, rtk), source)
 
 
-def as_number(value: object) -> float:
-    """A number of EXIF or XMP ("+39.8", "527/100", the first of several); NaN for anything else."""
-    if isinstance(value, tuple):
-        value = value[0] if value else None
-    if isinstance(value, str) and value.count("/") == 1:
-        above, below = (as_number(part) for part in value.split("/"))
-        return above / below if below else math.nan
-    try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
-
-
-def read_metadata(picture: Image.Image) -> Metadata:
-    """EXIF and XMP of an opened photograph; a damaged block counts as absent and is named."""
-    damaged = []
-    exif: dict[int, object] = {}
-    gps: dict[int, object] = {}
-    # Of a PNG without EXIF before its pixels, Pillow would decode the pixels to look behind them.
-    if not isinstance(picture, PngImagePlugin.PngImageFile) or "exif" in picture.info:
-        try:
-            table = picture.getexif()
-            exif = {**table, **table.get_ifd(ExifTags.IFD.Exif)}
-            gps = dict(table.get_ifd(ExifTags.IFD.GPSInfo))
-        except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, struct.error):
-            damaged.append("EXIF")
-    xmp = {}
-    packet = picture.info.get("xmp") or exif.get(_XMP_TAG)
+def read_metadata(image: Image.Image) -> PhotographMetadata:
+    """Read EXIF and XMP of an opened photograph; a damaged block counts as absent and is reported as damaged."""
+    exif, xmp = read_exif(image), {}
+    damaged = ["EXIF"] if exif.damaged else []
+    packet = image.info.get("xmp") or exif.tags.get(_XMP_TAG)
     if isinstance(packet, bytes | str):
         try:
             xmp = read_xmp(packet)
         except ValueError:
             damaged.append("XMP")
-    return Metadata(exif, gps, xmp, tuple(damaged))
+    return PhotographMetadata(exif, xmp, tuple(damaged))
 
 
-def camera(metadata: Metadata) -> str:
-    """Make and model, such as "DJI FC6360"; empty if unknown."""
-    make = metadata.text(ExifTags.Base.Make, "Make")
-    model = metadata.text(ExifTags.Base.Model, "Model")
-    return model if model.casefold().startswith(make.casefold()) else f"{make} {model}".strip()
+def read_xmp(packet: bytes | str) -> dict[str, str]:
+    """Read the properties of an XMP packet (ISO 16684-1).
 
+    Names come without their namespace, because every maker has its own and uses the same names ("GimbalYawDegree").
+    Only those of Pix4D's namespace, which are common words, are marked: "Camera:Yaw"; for this reason Pillow's
+    `getxmp`, which drops all namespaces, does not serve. The parts of a structure come as "CameraOrientationNED/Yaw",
+    the items of a list joined by commas.
 
-def serial(metadata: Metadata) -> str:
-    """Serial number of the camera's body, or else of the drone that carries it; empty if unknown."""
-    return metadata.text(ExifTags.Base.BodySerialNumber, "CameraSerialNumber", "SerialNumber", "DroneSerialNumber")
-
-
-def orientation(metadata: Metadata) -> int:
-    """EXIF's orientation; 1 where it is absent or none of the eight."""
-    value = metadata.number(ExifTags.Base.Orientation)
-    return int(value) if value in range(1, 9) else 1
-
-
-def time_s(metadata: Metadata) -> float:
-    """When it was taken, in seconds since 1970 by the camera's clock, with EXIF's fraction; NaN if unknown."""
-    for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized, ExifTags.Base.DateTime):
-        try:
-            moment = datetime.strptime(metadata.text(tag), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-        except ValueError:  # absent, or zeros from a clock that was never set
-            continue
-        fraction = metadata.text(ExifTags.Base.SubsecTimeOriginal)
-        return moment.timestamp() + (float(f"0.{fraction}") if fraction.isascii() and fraction.isdigit() else 0.0)
-    return math.nan
-
-
-def log_exposure(metadata: Metadata) -> float:
-    """Natural log of exposure time x ISO / f-number squared; NaN unless all three are known."""
-    seconds = metadata.number(ExifTags.Base.ExposureTime)
-    speed = metadata.number(ExifTags.Base.ISOSpeedRatings)
-    return math.log(seconds * speed / metadata.number(ExifTags.Base.FNumber) ** 2)
-
-
-def gimbal_deg(metadata: Metadata) -> tuple[float, float, float] | None:
-    """Yaw (clockwise from north), pitch (-90 looks straight down) and roll of the camera, or None."""
-    for names in (
-        ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
-        ("CameraOrientationNED/Yaw", "CameraOrientationNED/Pitch", "CameraOrientationNED/Roll"),
-    ):
-        yaw, pitch, roll = (metadata.xmp_number(name) for name in names)
-        # All three exactly zero is what drones without a gimbal write.
-        if math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll)):
-            return yaw, pitch, roll
-    yaw, pitch, roll = (metadata.xmp_number(f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
-    return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
-
-
-def relative_altitude_m(metadata: Metadata) -> float:
-    """Height above the place of take-off; NaN if unknown."""
-    return metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude")
-
-
-def position(metadata: Metadata) -> Position | None:
-    """Where the receiver says that the camera was, or None.
-
-    The standard deviations are the maker's (DJI's RTK, of whose two horizontal ones the larger is taken; Pix4D's), or
-    EXIF's positioning error.
+    Raises:
+        ValueError: the packet is not XML, has entities, or is too large to be trusted.
     """
-    latitude, longitude = _degrees(metadata.gps, 1, "S"), _degrees(metadata.gps, 3, "W")
-    source = "EXIF"
-    if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        latitude = metadata.xmp_number("GpsLatitude", "GPSLatitude", "Latitude")
-        # DJI's early firmware has the longitude misspelt.
-        longitude = metadata.xmp_number("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
-        source = "XMP"
-    if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        return None
-    rtk = metadata.xmp_number("RtkFlag")
-    horizontal_m, vertical_m = _accuracy_m(metadata, rtk)
-    if rtk >= _RTK_FLOAT:
-        source += ", RTK fixed" if rtk == _RTK_FIXED else ", RTK float"
-    return Position(latitude, longitude, _height_m(metadata), horizontal_m, vertical_m, _datum(metadata, rtk), source)
+    data = packet.encode() if isinstance(packet, str) else packet
+    if len(data) > _MAX_XMP_BYTES:
+        raise ValueError(f"it has {len(data)} bytes")
+    data = data.strip(b"\0 \t\r\n")
+    if not data:
+        return {}
+    try:
+        root = fromstring(data)
+    except (ParseError, DefusedXmlException, UnicodeError, LookupError) as error:
+        raise ValueError(str(error)) from error
+    found: dict[str, str] = {}
+    for description in root.iter(f"{_RDF}Description"):
+        _collect(description, "", _MAX_XMP_LEVELS, found)
+    return found
+
+
+def _collect(element: Element, prefix: str, levels: int, found: dict[str, str]) -> None:
+    """Add the properties of an element, written as attributes or as children; the first of a name counts."""
+    for tag, value in element.attrib.items():
+        if not tag.startswith(_RDF):
+            found.setdefault(prefix + _name(tag), value.strip())
+    for child in element:
+        if child.tag.startswith(_RDF):
+            continue
+        name = prefix + _name(child.tag)
+        items = [item.text or "" for item in child.iter(f"{_RDF}li")]
+        text = ",".join(items) if items else (child.text or "")
+        if text.strip():
+            found.setdefault(name, text.strip())
+        if levels > 0:
+            for structure in (child, *child.findall(f"{_RDF}Description")):
+                _collect(structure, f"{name}/", levels - 1, found)
+
+
+def _name(tag: str) -> str:
+    namespace, _, name = tag.rpartition("}")
+    return f"Camera:{name}" if namespace.lstrip("{").rstrip("/") == _PIX4D else name
 
 
 def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> float:
-    """A latitude or longitude of EXIF's GPS block, whose value follows its reference."""
+    """A latitude or longitude of EXIF's GPS block; the tag of the value follows that of its reference (N, S, E, W)."""
     value = gps.get(reference_tag + 1)
     parts = value if isinstance(value, tuple) else (value,)
     degrees = sum(as_number(part) / 60**power for power, part in enumerate(parts[:3]))
@@ -184,27 +190,27 @@ def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> fl
     return -degrees if reference.strip("\0 ").upper().startswith(negative) else degrees
 
 
-def _height_m(metadata: Metadata) -> float:
-    # DJI's EXIF repeats it, but in an unsigned number, which a height under zero turns to millions of metres.
+def _height_m(metadata: PhotographMetadata) -> float:
+    # DJI's EXIF repeats it as an unsigned number, which turns a height below zero into millions of metres.
     height = metadata.xmp_number("AbsoluteAltitude")
     if math.isfinite(height):
         return height
-    height = as_number(metadata.gps.get(ExifTags.GPS.GPSAltitude))
+    height = as_number(metadata.exif.gps.get(ExifTags.GPS.GPSAltitude))
     return -height if _altitude_reference(metadata) in (1, 3) else height
 
 
-def _altitude_reference(metadata: Metadata) -> int | None:
-    value = metadata.gps.get(ExifTags.GPS.GPSAltitudeRef)
+def _altitude_reference(metadata: PhotographMetadata) -> int | None:
+    value = metadata.exif.gps.get(ExifTags.GPS.GPSAltitudeRef)
     if isinstance(value, bytes):
         return value[0] if value else None
     return value if isinstance(value, int) else None
 
 
-def _datum(metadata: Metadata, rtk: float) -> Literal["mean sea level", "ellipsoid", "unknown"]:
-    """What the height counts from.
+def _datum(metadata: PhotographMetadata, rtk: float) -> Literal["mean sea level", "ellipsoid", "unknown"]:
+    """Vertical datum of the height.
 
-    DJI's RTK drones and those that say "RtkAlt" write ellipsoidal heights whatever EXIF says; its others write a
-    barometer's, at a standard atmosphere. EXIF up to 2.32 knows sea level only (0 above, 1 below); EXIF 3.0 gave these
+    DJI's RTK drones and those with "RtkAlt" write ellipsoidal heights whatever EXIF states; its others write that of a
+    barometer in a standard atmosphere. EXIF up to 2.32 has sea level only (0 above, 1 below); EXIF 3.0 gave these
     numbers to the ellipsoid, and 2 and 3 to the sea level.
     """
     if rtk >= _RTK_FLOAT or "rtk" in metadata.xmp.get("AltitudeType", "").casefold():
@@ -216,16 +222,16 @@ def _datum(metadata: Metadata, rtk: float) -> Literal["mean sea level", "ellipso
     return "ellipsoid" if reference in (0, 1) and version >= "0300" else "mean sea level"
 
 
-def _accuracy_m(metadata: Metadata, rtk: float) -> tuple[float, float]:
+def _accuracy_m(metadata: PhotographMetadata, rtk: float) -> tuple[float, float]:
     """Horizontal and vertical standard deviation; NaN where none is stated."""
-    stated = [math.nan, math.nan]
-    if rtk >= _RTK_SINGLE:
-        sides = [metadata.xmp_number("RtkStdLon"), metadata.xmp_number("RtkStdLat")]
-        stated = [max(sides), metadata.xmp_number("RtkStdHgt")]
-    others = (
+    candidates = [
         (metadata.xmp_number("Camera:GPSXYAccuracy"), metadata.xmp_number("Camera:GPSZAccuracy")),
-        (as_number(metadata.gps.get(ExifTags.GPS.GPSHPositioningError)), math.nan),
+        (as_number(metadata.exif.gps.get(ExifTags.GPS.GPSHPositioningError)), math.nan),
+    ]
+    if rtk >= _RTK_SINGLE:
+        sides = metadata.xmp_number("RtkStdLon"), metadata.xmp_number("RtkStdLat")
+        candidates.insert(0, (max(sides), metadata.xmp_number("RtkStdHgt")))
+    horizontal, vertical = (
+        next((value for value in values if value > 0), math.nan) for values in zip(*candidates, strict=True)
     )
-    for pair in others:
-        stated = [a if a > 0 else b for a, b in zip(stated, pair, strict=True)]
-    return tuple(a if a > 0 else math.nan for a in stated)  # pyright: ignore[reportReturnType]
+    return horizontal, vertical

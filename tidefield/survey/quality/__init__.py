@@ -1,1 +1,1 @@
-"""Which photographs do a survey more harm than good."""
+"""Assess the quality of photographs before reconstruction."""

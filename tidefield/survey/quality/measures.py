@@ -1,10 +1,10 @@
-"""What can be measured of one photograph's quality, by itself, on a reduced picture.
+"""Measure the quality of one photograph, on a reduced image.
 
 Sharpness comes from the structure function S(k), the mean squared difference of brightness between pixels k apart. On
-natural ground it grows slowly, as k^0.5 to k^1; over less than the width of a blur it grows as k^2. So S(1) / S(8)
-falls from about 0.3 to under 0.1 with a blur of six pixels, whatever the contrast. The noise adds the same to both and
-is taken off. A movement blurs along one direction only, so the softest of four counts; smooth mud has few sharp places
-but some, a blurred photograph none, so the sharpest tenth of the places counts.
+natural ground it grows as k^0.5 to k^1; below the width of a blur it grows as k^2. So S(1) / S(8) falls from about 0.3
+to under 0.1 with a blur of six pixels, at any contrast. Noise adds the same to both and is subtracted. Motion blurs
+along one direction only, so the minimum of four directions counts. Smooth mud has few sharp blocks but some, a blurred
+photograph none, so the sharpest tenth of the blocks counts.
 """
 
 from __future__ import annotations
@@ -14,40 +14,41 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8, UInt8
+from jaxtyping import Float32, UInt8
 
 SIDE_PX = 1600
-"""Longer side of the picture that is measured: finer blur than this shows is no loss to a scene."""
+"""Longer side of the image that is measured; blur that is invisible at this size does not harm a scene."""
+THUMBNAIL_PX = 160
+"""Longer side of the thumbnail by which photographs are compared."""
 
-_NEAR, _FAR = 1, 8
+_NEAR, _FAR = 1, 8  # the two distances k
 _BLOCK = 48
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-_TEXTURED = 4.0  # mean squared difference (levels squared) from which on a block has texture to judge by
-_ABOVE_NOISE = 20.0  # or as many times the noise's variance
-_TEXTURED_AT_LEAST = 0.02
-_SHARPEST = 90
-# Immerkaer, Fast Noise Variance Estimation, 1996: blind to planes and straight edges.
+_TEXTURED = 4.0  # least S(8) of a block with texture, in levels squared
+_ABOVE_NOISE = 20.0  # and in variances of the noise
+_MIN_TEXTURED = 0.02  # least share of such blocks; with fewer, sharpness is unknown
+_SHARPEST = 90  # percentile over blocks
+# Immerkaer, Fast Noise Variance Estimation, 1996: zero on planes and straight edges.
 _NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _CLIPPED = 253
-_OUTLINE_PX = 160
-_SKY_LEVELS = 3.5  # local standard deviation under which sky is smooth
-_SKY_COLUMNS = 0.9
-_SKY_RAGGED = 0.1
+_SKY_LEVELS = 3.5  # largest local standard deviation of sky
+_SKY_COLUMNS = 0.9  # least share of the columns that begin with sky
+_SKY_RAGGED = 0.1  # largest deviation of its lower edge from a line, in heights
 
 
 @dataclass(frozen=True)
 class Measures:
-    """One photograph's, in 8-bit levels where nothing else is said.
+    """Quality measures of one photograph, in 8-bit levels unless stated otherwise.
 
     Attributes:
-        sharpness: S(1) / S(8), see above; NaN where there is too little texture to judge.
+        sharpness: S(1) / S(8), see above; NaN where there is too little texture.
         brightness: median.
         highlights: 95th percentile of brightness.
-        light: median of the linear light, 1 is white.
-        clipped: share of pixels with at least one of the three colours at its upper end.
-        white: share of pixels with at least two of them there, which leave no detail.
-        contrast: between the 1st and the 99th percentile, of the picture reduced to where noise averages out.
-        sky: share of the picture that is a smooth bright region along the whole upper edge.
+        light: median in linear light, 1 is white.
+        clipped: share of pixels with at least one channel at its maximum.
+        white: share of pixels with at least two channels at their maximum, which have no detail.
+        contrast: between the 1st and the 99th percentile of the thumbnail, in which noise averages out.
+        sky: share of the image that is a smooth bright region along the whole upper edge.
     """
 
     sharpness: float
@@ -60,13 +61,13 @@ class Measures:
     sky: float
 
 
-def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Int8[np.ndarray, "h w"]]:
-    """The measures of an upright picture of at most `SIDE_PX`, and its outline."""
+def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Float32[np.ndarray, "h w"]]:
+    """Measure an upright image of at most `SIDE_PX`; returns also its grey thumbnail of at most `THUMBNAIL_PX`."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, _OUTLINE_PX / max(grey.shape))
+    scale = min(1.0, THUMBNAIL_PX / max(grey.shape))
     size = max(16, round(grey.shape[1] * scale)), max(16, round(grey.shape[0] * scale))
-    small = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(small, (1, 99))
+    thumbnail = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    low, high = np.percentile(thumbnail, (1, 99))
     median, highlights = np.percentile(grey, (50, 95))
     clipped = (pixels >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
     measures = Measures(
@@ -77,19 +78,19 @@ def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Int8[np.ndarr
         clipped=float(np.mean(clipped >= 1)),
         white=float(np.mean(clipped >= 2)),
         contrast=float(high - low),
-        sky=_sky(small),
+        sky=_sky(thumbnail),
     )
-    return measures, outline(small)
+    return measures, thumbnail
 
 
 def _linear(level: float) -> float:
-    """sRGB's light at a level of 255."""
+    """Linear light of an 8-bit sRGB level (IEC 61966-2-1)."""
     value = level / 255
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
 def sharpness(grey: Float32[np.ndarray, "H W"]) -> float:
-    """S(1) / S(8) without noise, in the direction where it is least, at the sharpest tenth of the textured blocks."""
+    """Measure S(1) / S(8) without noise: minimum over directions, sharpest tenth of the textured blocks."""
     if min(grey.shape) < 2 * _FAR + _BLOCK:
         return math.nan
     noise = _noise_variance(grey)
@@ -98,7 +99,7 @@ def sharpness(grey: Float32[np.ndarray, "H W"]) -> float:
         near = _structure(grey, _NEAR, direction) - 2 * noise
         far = _structure(grey, _FAR, direction) - 2 * noise
         textured = far > max(_TEXTURED, _ABOVE_NOISE * noise)
-        if textured.mean() < _TEXTURED_AT_LEAST:
+        if textured.mean() < _MIN_TEXTURED:
             return math.nan
         least = min(least, float(np.percentile(near[textured] / far[textured], _SHARPEST)))
     return max(least, 0.0)
@@ -107,32 +108,32 @@ def sharpness(grey: Float32[np.ndarray, "H W"]) -> float:
 def _structure(
     grey: Float32[np.ndarray, "H W"], step: int, direction: tuple[int, int]
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Mean squared difference, by block, between pixels that are `step` apart; the same pixels for all steps."""
+    """Mean squared difference per block between pixels `step` apart; the same pixels for all steps."""
     height, width = grey.shape
     down, right = direction[0] * step, direction[1] * step
     inner = grey[_FAR : height - _FAR, _FAR : width - _FAR]
     other = grey[_FAR + down : height - _FAR + down, _FAR + right : width - _FAR + right]
-    return _blocks(np.square(inner - other))
+    return _block_means(np.square(inner - other))
 
 
-def _blocks(values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "rows columns"]:
+def _block_means(values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "rows columns"]:
     rows, columns = values.shape[0] // _BLOCK, values.shape[1] // _BLOCK
     whole = values[: rows * _BLOCK, : columns * _BLOCK]
     return whole.reshape(rows, _BLOCK, columns, _BLOCK).mean(axis=(1, 3))
 
 
 def _noise_variance(grey: Float32[np.ndarray, "H W"]) -> float:
-    """Of the smoothest twentieth of the blocks, where the least of it is texture."""
+    """Noise variance of the smoothest twentieth of the blocks, which have the least texture."""
     response = np.abs(cv2.filter2D(grey, -1, _NOISE_FILTER))[_FAR:-_FAR, _FAR:-_FAR]
-    deviation = np.percentile(_blocks(response), 5) * math.sqrt(math.pi / 2) / 6
+    deviation = np.percentile(_block_means(response), 5) * math.sqrt(math.pi / 2) / 6
     return float(deviation) ** 2
 
 
-def _sky(small: Float32[np.ndarray, "h w"]) -> float:
-    """Share of a smooth region that hangs from the whole upper edge, ends in a straight line, and is the brighter."""
-    height, width = small.shape
-    mean = cv2.blur(small, (5, 5))
-    deviation = np.sqrt(np.maximum(cv2.blur(small * small, (5, 5)) - mean * mean, 0))
+def _sky(thumbnail: Float32[np.ndarray, "h w"]) -> float:
+    """Share of a smooth region along the whole upper edge, with a straight lower edge, brighter than the rest."""
+    height, width = thumbnail.shape
+    mean = cv2.blur(thumbnail, (5, 5))
+    deviation = np.sqrt(np.maximum(cv2.blur(thumbnail * thumbnail, (5, 5)) - mean * mean, 0))
     rough = deviation > _SKY_LEVELS
     depth = np.where(rough.any(axis=0), rough.argmax(axis=0), height)
     share = float(depth.mean()) / height
@@ -141,58 +142,5 @@ def _sky(small: Float32[np.ndarray, "h w"]) -> float:
     columns = np.arange(width)
     ragged = depth - np.polyval(np.polyfit(columns, depth, 1), columns)
     above = np.arange(height)[:, None] < depth
-    brighter = np.median(small[above]) > np.median(small[~above])
+    brighter = np.median(thumbnail[above]) > np.median(thumbnail[~above])
     return share if brighter and np.median(np.abs(ragged)) < _SKY_RAGGED * height else 0.0
-
-
-def outline(small: Float32[np.ndarray, "h w"]) -> Int8[np.ndarray, "h w"]:
-    """What is where, whatever the exposure: a reduced picture's middle frequencies of log brightness, evened out."""
-    bright = np.log(small + 8)
-    middle = cv2.GaussianBlur(bright, (0, 0), 1.5) - cv2.GaussianBlur(bright, (0, 0), 8)
-    even = middle / np.sqrt(cv2.blur(middle * middle, (25, 25)) + 1e-4)  # nothing out of nothing
-    return np.clip(np.round(even * 32), -127, 127).astype(np.int8)
-
-
-def agreement(first: Int8[np.ndarray, "h w"], second: Int8[np.ndarray, "h w"]) -> tuple[float, float]:
-    """How far two pictures are shifted against each other, in longer sides, and how well they agree then.
-
-    The shift is found by phase correlation; the agreement is the median correlation of blocks of 20 pixels, 1 for equal
-    pictures. Roads and shores that happen to run alike agree in some blocks only.
-    """
-    a, b = first.astype(np.float32), second.astype(np.float32)
-    right, down = _shift(a, b)
-    move = np.array([[1, 0, right], [0, 1, down]], np.float32)
-    moved = cv2.warpAffine(b, move, b.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    margin, block = 1 + math.ceil(max(abs(right), abs(down), 3)), 20
-    away = math.hypot(right, down) / max(a.shape)
-    if min(a.shape) < 2 * margin + block:
-        return away, 0.0
-    cells = []
-    for picture in (a, moved):
-        inner = picture[margin:-margin, margin:-margin]
-        rows, columns = inner.shape[0] // block, inner.shape[1] // block
-        whole = inner[: rows * block, : columns * block].reshape(rows, block, columns, block)
-        cell = whole.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
-        cells.append(cell - cell.mean(axis=1, keepdims=True))
-    energy = np.sqrt((cells[0] ** 2).sum(axis=1) * (cells[1] ** 2).sum(axis=1))
-    return away, float(np.median((cells[0] * cells[1]).sum(axis=1) / (energy + 1.0)))
-
-
-def _shift(a: Float32[np.ndarray, "h w"], b: Float32[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Right and down: b(x + shift) = a(x). (cv2.phaseCorrelate changes its inputs.)"""
-    height, width = a.shape
-    window = np.hanning(height)[:, None] * np.hanning(width)
-    spectrum = np.fft.rfft2(a * window).conj() * np.fft.rfft2(b * window)
-    size = np.abs(spectrum)
-    # Frequencies that neither has would weigh as much as the others.
-    surface = np.fft.irfft2(spectrum / (size + 1e-9 * size.max() + 1e-30), a.shape)
-    surface: Float[np.ndarray, "h w"] = cv2.GaussianBlur(np.fft.fftshift(surface), (0, 0), 0.8)
-    y, x = np.unravel_index(surface.argmax(), surface.shape)
-
-    def between(before: float, peak: float, after: float) -> float:
-        curvature = before - 2 * peak + after
-        return 0.0 if curvature == 0 else float(np.clip((before - after) / (2 * curvature), -0.5, 0.5))
-
-    right = between(surface[y, x - 1], surface[y, x], surface[y, (x + 1) % width])
-    down = between(surface[y - 1, x], surface[y, x], surface[(y + 1) % height, x])
-    return float(x + right - width // 2), float(y + down - height // 2)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tidefield.errors import DeviceError
 from tidefield.machine import cores
-from tidefield.survey.io.pictures import upright
+from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import LensPrior, Photograph
 
 Progress = Callable[[int, int], object]

@@ -11,9 +11,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
 from tidefield.errors import SurveyError
-from tidefield.survey.io import pictures
+from tidefield.survey.io import image_decoding
+from tidefield.survey.io.image_decoding import thumbnail, upright, upright_size, upright_uv
 from tidefield.survey.io.photographs import _read
-from tidefield.survey.io.pictures import thumbnail, upright, upright_size, upright_uv
 from tidefield.survey.survey import Photograph
 
 
@@ -24,14 +24,14 @@ def read(path: Path) -> Photograph:
 
 
 def unread(path: Path) -> Photograph:
-    """A photograph that nothing is known of: reading it would fail."""
+    """A photograph without metadata, for files that cannot be read."""
     nan = float("nan")
     return Photograph(path, path.name, 1, 1, 1, "", "", nan, None, nan, nan, None, nan, None)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_every_orientation_stands_upright(tmp_path, suffix, orientation):
+def test_every_orientation_is_decoded_upright(tmp_path, suffix, orientation):
     path = photograph(tmp_path / f"a.{suffix}", (64, 48), exif({Base.Orientation: orientation}))
     taken = read(path)
     pixels = upright(taken)
@@ -45,7 +45,7 @@ def test_every_orientation_stands_upright(tmp_path, suffix, orientation):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_place_moves_as_the_pixels_do(tmp_path, orientation):
+def test_pixel_positions_follow_the_orientation(tmp_path, orientation):
     stored = np.zeros((48, 64, 3), np.uint8)
     stored[10, 20] = 255
     path = photograph(tmp_path / "a.png", table=exif({Base.Orientation: orientation}), pixels=stored)
@@ -55,7 +55,7 @@ def test_a_place_moves_as_the_pixels_do(tmp_path, orientation):
     assert corner[0] in (0, upright_size(64, 48, orientation)[0])
 
 
-def test_transparency_lies_over_white(tmp_path):
+def test_transparency_is_blended_over_white(tmp_path):
     layer = np.dstack([np.full((8, 8, 3), 100, np.uint8), np.full((8, 8), 51, np.uint8)])
     layer[0, 0, 3] = 0
     layer[1, 1, 3] = 255
@@ -129,6 +129,6 @@ def test_a_small_file_that_claims_billions_of_pixels_is_refused_before_it_is_dec
     assert "more than 300 million" in found
 
 
-def test_a_photograph_of_a_hundred_megapixels_is_none_of_that(tmp_path):
-    with pictures.opened(png_header(tmp_path / "large.png", 11_648, 8_736)) as picture:
+def test_a_photograph_of_a_hundred_megapixels_is_opened(tmp_path):
+    with image_decoding.open_image(png_header(tmp_path / "large.png", 11_648, 8_736)) as picture:
         assert picture.size == (11_648, 8_736)

@@ -1,4 +1,4 @@
-"""Positions from files beside photographs: tables of many makes, ODM's geo.txt, and which of two sources counts."""
+"""Positions are read from tables of several programs and from geo.txt; the priority of two sources holds."""
 
 import math
 import re
@@ -9,11 +9,11 @@ from camera_files import BRIGHTON, exif, named, photograph, survey_folder
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError
-from tidefield.survey.io.gps_files import read_gps_file
-from tidefield.survey.io.names import Names
 from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.io.positions import read_gps_file
+from tidefield.survey.io.text_files import PhotographNames
 
-NAMES = Names(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
+NAMES = PhotographNames(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
 
 
 def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
@@ -32,7 +32,7 @@ def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
         '# made by a receiver\nName,Latitude,Longitude,Elevation,Note\n"DJI_0001.DNG", 54.5, -2.75, 344.17, "a, b"\n\n',
     ],
 )
-def test_tables_of_many_makes_say_the_same(tmp_path, text):
+def test_tables_of_several_programs_give_the_same_positions(tmp_path, text):
     found = read_gps_file(written(tmp_path, text), NAMES)
     assert list(found) == ["DJI_0001.JPG"]
     position = found["DJI_0001.JPG"].position
@@ -62,7 +62,7 @@ def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
         ("", "begins with 'nothing': expected a header such as image_name,lat,lon,gps_height"),
         ("DJI_0001,54.5,-2.75\n", "begins with 'DJI_0001,54.5,-2.75': expected a header"),
         ("name,lat,lon\nDJI_0001,54.5,west\n", "line 2 has 'west': expected a number"),
-        ("name,lat,lon\nDJI_0001,512875.75,351139.75\n", "line 2 says .* metres belong under the EPSG code"),
+        ("name,lat,lon\nDJI_0001,512875.75,351139.75\n", "line 2 gives .* metres belong under the EPSG code"),
         ("name,lat,lon\nDJI_0001,54.5,2\nDJI_0001,54.6,2\n", "line 3 gives DJI_0001.JPG a second position"),
         ("name,lat,lon\nIMG_1,54.5,2\n", "names none of the photographs"),
     ],
@@ -81,7 +81,7 @@ def test_a_table_in_another_encoding_is_an_error(tmp_path):
 
 
 def test_a_short_name_of_two_photographs_is_an_error(tmp_path):
-    names = Names(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG"])
+    names = PhotographNames(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG"])
     path = written(tmp_path, "name,lat,lon\nDJI_0001.JPG,54.5,2\n")
     with pytest.raises(SurveyError, match=r"DJI_0001.JPG names 2 photographs .*write its folder, too"):
         read_gps_file(path, names)
@@ -129,7 +129,7 @@ def test_angles_and_accuracies_of_a_geo_txt_are_read(tmp_path):
         ("DJI_0001.JPG -2.75 54.5\n", "is 'DJI_0001.JPG -2.75 54.5': expected a projected or geographic"),
         ("EPSG:4978\nDJI_0001.JPG 1 2 3\n", "is 'EPSG:4978': expected a projected or geographic"),
         ("EPSG:4326\nDJI_0001.JPG here there\n", "line 2 is 'DJI_0001.JPG here there': expected image_name x y"),
-        ("EPSG:27700\nDJI_0001.JPG 1e12 1e12 3\n", "line 2 says .*: expected coordinates in 'EPSG:27700'"),
+        ("EPSG:27700\nDJI_0001.JPG 1e12 1e12 3\n", "line 2 gives .*: expected coordinates in 'EPSG:27700'"),
         ("EPSG:4326\nIMG_1.JPG 1 2 3\n", "names none of the photographs"),
     ],
 )
@@ -138,7 +138,7 @@ def test_a_geo_txt_that_cannot_be_understood_is_an_error(tmp_path, text, message
         read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
 
 
-def test_a_file_beside_the_photographs_fills_in_what_exif_lacks(tmp_path):
+def test_a_file_in_the_folder_gives_positions_that_exif_lacks(tmp_path):
     survey_folder(tmp_path, count=3)
     photograph(tmp_path / "x.jpg")
     written(tmp_path, f"name,lat,lon\nDJI_0000,46.9,-91.9\nx,{BRIGHTON[0]},{BRIGHTON[1]}\n", "GPS.CSV")
@@ -148,7 +148,7 @@ def test_a_file_beside_the_photographs_fills_in_what_exif_lacks(tmp_path):
     assert survey.remarks == ()
 
 
-def test_a_file_that_is_given_counts_more_than_exif(tmp_path):
+def test_a_file_that_is_given_has_priority_over_exif(tmp_path):
     survey_folder(tmp_path / "photographs", count=4)
     path = written(tmp_path, "EPSG:4326\nDJI_0000.JPG -91.99 46.84 200 10 0 0\n", "better.txt")
     survey = read_survey(tmp_path / "photographs", gps=path)
@@ -175,11 +175,11 @@ def moved(folder: Path, **places: tuple[float, float]) -> Path:
     [
         ((0.0, 0.0), "it is zero: the receiver had no fix"),
         ((-91.9946, 46.8426), "its latitude is beyond the poles: latitude and longitude are swapped"),
-        ((46.8426, -300.0), "it is no place on the Earth"),
+        ((46.8426, -300.0), "it is outside of the range of coordinates"),
         ((47.74, -91.9946), "it is 100 km from the others"),
     ],
 )
-def test_a_position_that_cannot_be_right_is_left_out_and_the_photograph_named(tmp_path, place, reason):
+def test_an_impossible_position_is_left_out_and_reported(tmp_path, place, reason):
     survey = read_survey(moved(tmp_path, odd=place))
     assert named(survey, "odd.jpg").position is None
     assert sum(photograph.position is not None for photograph in survey.photographs) == 6
@@ -188,7 +188,7 @@ def test_a_position_that_cannot_be_right_is_left_out_and_the_photograph_named(tm
     assert any(remark.startswith("1 of 7 photographs have no position: odd.jpg") for remark in survey.remarks)
 
 
-def test_latitude_and_longitude_that_are_swapped_are_told_by_the_others(tmp_path):
+def test_swapped_latitude_and_longitude_are_found_by_the_other_positions(tmp_path):
     for index in range(5):
         photograph(tmp_path / f"{index}.jpg", table=exif(place=(45.03, 7.62 + 1e-4 * index)))
     photograph(tmp_path / "odd.jpg", table=exif(place=(7.62, 45.03)))
@@ -204,15 +204,15 @@ def test_a_file_helps_where_exif_is_impossible(tmp_path):
     assert odd.position.source == "gps.csv"
 
 
-def test_two_places_keep_their_positions_and_are_pointed_out(tmp_path):
+def test_two_sites_keep_their_positions_and_are_reported(tmp_path):
     elsewhere = {f"x{index}": (47.74, -91.99 + 1e-4 * index) for index in range(4)}
     survey = read_survey(moved(tmp_path, **elsewhere))
     assert all(photograph.position for photograph in survey.photographs)
     assert "4 of the 10 positions lie 100 km and more from the others (x0.jpg" in survey.remarks[0]
-    assert "two places" in survey.remarks[0]
+    assert "two sites" in survey.remarks[0]
 
 
-def test_a_survey_on_the_date_line_is_one_place(tmp_path):
+def test_a_survey_on_the_date_line_is_one_site(tmp_path):
     for index, longitude in enumerate((179.9995, 179.9998, -179.9999, -179.9996)):
         photograph(tmp_path / f"{index}.jpg", table=exif(place=(-16.5, longitude)))
     survey = read_survey(tmp_path)

@@ -1,4 +1,4 @@
-"""Ground control of ODM's gcp_list.txt, and what is wrong with it."""
+"""Ground control is read from ODM's gcp_list.txt; errors, and control of another site, are refused."""
 
 from pathlib import Path
 
@@ -8,11 +8,12 @@ from PIL.ExifTags import Base
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError
-from tidefield.survey.io.control import read_control
+from tidefield.survey.io.gcp_file import read_control, refuse_elsewhere
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.survey import Control, Mark
 
 UTM = "EPSG:32615"
+HERE = -2.752, 54.512
 POINTS = [(576640.25, 5188050.5, 183.1), (576650.75, 5188060.25, 184.2)]
 
 
@@ -32,7 +33,7 @@ def line(point: int, uv: tuple[float, float], rest: str, separator: str = " ") -
     return separator.join([*map(str, POINTS[point]), *map(str, uv), rest]) + "\n"
 
 
-def test_the_control_of_swindale_is_found_by_itself():
+def test_the_control_file_of_swindale_is_found():
     survey = read_survey(real_survey("swindale"))
     assert survey.control is not None
     assert survey.control.crs == "EPSG:27700"
@@ -60,7 +61,7 @@ def test_a_list_is_read_with_any_header_and_separator(tmp_path, header, separato
     )
 
 
-def test_points_without_names_are_told_apart_by_their_places(tmp_path):
+def test_points_without_names_are_distinguished_by_position(tmp_path):
     lines = line(0, (1, 2), "DJI_0000.JPG") + line(1, (3, 4), "DJI_0000.JPG") + line(0, (5, 6), "DJI_0001.JPG")
     found, _ = control(survey_folder(tmp_path), UTM + "\n" + lines)
     assert found.points == {"point 1": POINTS[0], "point 2": POINTS[1]}
@@ -82,22 +83,22 @@ def test_names_with_spaces_are_those_of_photographs(tmp_path):
 @pytest.mark.parametrize(
     ("orientation", "upright"), [(1, (10.0, 20.0)), (3, (54.0, 28.0)), (6, (28.0, 10.0)), (8, (20.0, 54.0))]
 )
-def test_marks_are_for_the_picture_as_it_is_stored(tmp_path, orientation, upright):
+def test_marks_refer_to_the_stored_image(tmp_path, orientation, upright):
     survey_folder(tmp_path, place=None)
     photograph(tmp_path / "turned.jpg", (64, 48), exif({Base.Orientation: orientation}))
     found, _ = control(tmp_path, UTM + "\n" + line(0, (10, 20), "turned.jpg A"))
     assert found.marks == (Mark("A", "turned.jpg", upright),)
 
 
-def test_marks_in_photographs_that_are_not_there_are_left_out_and_named(tmp_path):
+def test_marks_in_missing_photographs_are_left_out_and_reported(tmp_path):
     lines = line(0, (1, 2), "DJI_0000.JPG A") + line(1, (3, 4), "IMG 7.JPG B") + line(0, (5, 6), "gone.JPG A")
     found, remarks = control(survey_folder(tmp_path), UTM + "\n" + lines)
     assert list(found.points) == ["A"]
     assert len(found.marks) == 1
-    assert remarks == ["gcp_list.txt marks points in photographs that are not there (left out): IMG 7.JPG, gone.JPG."]
+    assert remarks == ["gcp_list.txt marks points in photographs that do not exist (left out): IMG 7.JPG, gone.JPG."]
 
 
-def test_marks_outside_their_photograph_are_left_out_and_named(tmp_path):
+def test_marks_outside_their_photograph_are_left_out_and_reported(tmp_path):
     lines = (line(0, uv, f"DJI_000{index}.JPG A") for index, uv in enumerate(((1, 2), (3, 4), (70, 4))))
     found, remarks = control(survey_folder(tmp_path), UTM + "\n" + "".join(lines))
     assert len(found.marks) == 2
@@ -122,11 +123,11 @@ def test_the_same_line_twice_is_one_mark(tmp_path):
         (UTM + "\n1 2 3 4 5", "line 2 is '1 2 3 4 5': expected"),
         (
             UTM + "\n" + line(0, (1, 2), "a.JPG A") + line(0, (3, 4), "b 1.JPG A"),
-            r"marks points in 2 photographs \(a.JPG, b 1.JPG\), none of which is there",
+            r"marks points in 2 photographs \(a.JPG, b 1.JPG\), none of which exists",
         ),
         (
             UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + line(1, (3, 4), "DJI_0001.JPG A"),
-            r"line 3 puts the point A at \(576650.75, .*line 2 at \(576640.25.*expected one place per point",
+            r"line 3 puts the point A at \(576650.75, .*line 2 at \(576640.25.*expected one position per point",
         ),
         (
             UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + line(0, (3, 4), "DJI_0000.JPG A"),
@@ -134,7 +135,7 @@ def test_the_same_line_twice_is_one_mark(tmp_path):
         ),
         (
             UTM + "\n" + line(0, (1205, 768), "DJI_0000.JPG A"),
-            r"1 of 1 marks are outside .*\(64 x 48 pixels\).*reduced since, divide the marks",
+            r"1 of 1 marks are outside .*\(64 x 48 pixels\).*resized, scale the marks",
         ),
         ("EPSG:27700\n" + line(0, (1, 2), "DJI_0000.JPG A"), "from the photographs|nowhere near the photographs"),
     ],
@@ -153,7 +154,7 @@ def test_another_encoding_and_a_missing_file_are_errors(tmp_path):
         read_survey(tmp_path, control=tmp_path / "none.txt")
 
 
-def test_the_last_digit_of_a_printed_coordinate_makes_no_second_place(tmp_path):
+def test_rounding_of_a_printed_coordinate_is_tolerated(tmp_path):
     again = line(0, (3, 4), "DJI_0001.JPG A").replace("183.1", "183.1004")
     found, _ = control(survey_folder(tmp_path), UTM + "\n" + line(0, (1, 2), "DJI_0000.JPG A") + again)
     assert found.points == {"A": POINTS[0]}
@@ -163,3 +164,34 @@ def test_control_in_degrees_is_longitude_before_latitude(tmp_path):
     x, y = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(*POINTS[0][:2])
     found, _ = control(survey_folder(tmp_path), f"EPSG:4326\n{x:.8f} {y:.8f} 183.1 1 2 DJI_0000.JPG A\n")
     assert found.points["A"][0] == pytest.approx(-92, abs=0.1)
+
+
+def refusal(crs: str, x: float, y: float, here: tuple[float, float] = HERE) -> str:
+    with pytest.raises(SurveyError) as caught:
+        refuse_elsewhere(Control(crs, {"G1": (x, y, 260.0), "G2": (x, y, 261.0)}, ()), *here)
+    return str(caught.value)
+
+
+def test_control_of_the_same_site_is_accepted():
+    refuse_elsewhere(Control("EPSG:27700", {"G1": (351139.0, 512875.0, 264.0)}, ()), *HERE)
+
+
+@pytest.mark.parametrize(
+    ("crs", "x", "y", "expected"),
+    [
+        ("EPSG:32630", 351139.0, 512875.0, "EPSG:27700 (OSGB36 / British National Grid)"),
+        ("EPSG:27700", 512875.0, 351139.0, "British National Grid), with the two coordinates swapped"),
+        ("EPSG:32631", 516100.0, 6040500.0, "EPSG:32630 (WGS 84 / UTM zone 30N)"),
+        ("EPSG:27700", -2.752, 54.512, "EPSG:4326 (longitude and latitude)"),
+        ("EPSG:4326", 54.512, -2.752, "with the two coordinates swapped"),
+        ("EPSG:27700", 356139.0, 518875.0, "no system that is used at this site"),
+    ],
+)
+def test_the_system_that_fits_is_named(crs, x, y, expected):
+    message = refusal(crs, x, y)
+    assert expected in message
+    assert " km from the photographs" in message or "nowhere near" in message
+
+
+def test_coordinates_outside_of_the_domain_of_a_system_are_refused():
+    assert "nowhere near the photographs" in refusal("EPSG:27700", 1e12, 1e12)

@@ -1,0 +1,119 @@
+"""Parse what the text files of a survey share: names of photographs, and coordinate reference systems."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from tidefield.errors import SurveyError, list_names
+from tidefield.geometry.geodesy import parse_crs
+
+_MAX_MEGABYTES = 50
+_SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
+_UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
+
+
+class PhotographNames:
+    """Index of the photographs of a survey by full or shortened name.
+
+    A name may be the path in the survey's folder or the file name alone, with or without suffix, in any case.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._by_rule: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
+        for name in names:
+            path = PurePosixPath(normalise_name(name))
+            keys = str(path), path.name, str(path.with_suffix("")), path.stem
+            for found, key in zip(self._by_rule, keys, strict=True):
+                found.setdefault(key, []).append(name)
+
+    def find(self, text: str) -> str | None:
+        """The photograph with this name, or None.
+
+        Raises:
+            SurveyError: several photographs match.
+        """
+        wanted = normalise_name(text.strip().strip('"').replace("\\", "/").removeprefix("./"))
+        path = PurePosixPath(wanted)
+        by_path, by_name, by_bare_path, by_stem = self._by_rule
+        # A path of another machine still ends in the file name; a list of raw files still names their JPEGs.
+        stem = path.stem if _SUFFIX.fullmatch(path.suffix) else path.name
+        rules = (by_path, wanted), (by_name, path.name), (by_bare_path, wanted), (by_stem, path.name), (by_stem, stem)
+        names = next((found[key] for found, key in rules if key in found), [])
+        if len(names) > 1:
+            raise SurveyError(
+                f"{text} names {len(names)} photographs ({list_names(names)}): expected one; write its folder, too"
+            )
+        return names[0] if names else None
+
+    def split(self, line: str) -> tuple[str | None, list[str]]:
+        """Split a line that begins with a photograph's name, which may have spaces, into the name and further cells."""
+        joint = "\t" if "\t" in line else " "
+        cells = line.split("\t") if "\t" in line else line.split()
+        for count in range(len(cells), 0, -1):
+            name = self.find(joint.join(cells[:count]))
+            if name is not None:
+                return name, cells[count:]
+        return None, cells[1:]
+
+
+def normalise_name(name: str) -> str:
+    """Fold case and compose accents, as file systems do that ignore both."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def find_file(folder: Path, names: Sequence[str]) -> Path | None:
+    """Find the first of some files directly in a folder, in any case."""
+    files = {path.name.casefold(): path for path in sorted(folder.iterdir(), reverse=True) if path.is_file()}
+    return next((files[name] for name in names if name in files), None)
+
+
+def read_text(path: Path) -> str:
+    """Read a small text file in UTF-8.
+
+    Raises:
+        SurveyError: it cannot be read, is far too large, or has another encoding.
+    """
+    try:
+        megabytes = path.stat().st_size / 1e6
+        if megabytes > _MAX_MEGABYTES:
+            raise SurveyError(
+                f"{path} has {megabytes:.0f} MB: expected a list of at most {_MAX_MEGABYTES} MB; give the right file"
+            )
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise SurveyError(f"{path} cannot be read ({error.strerror}): expected a text file; give one") from error
+    except UnicodeDecodeError as error:
+        raise SurveyError(
+            f"{path} is not in UTF-8 (byte {error.start} is invalid): expected a text file in UTF-8; save it again in "
+            "that encoding"
+        ) from error
+
+
+def read_crs(header: str, where: str) -> str:
+    """Parse the coordinate reference system of a header line: "EPSG:27700", a proj4 string, WKT, or "WGS84 UTM 32N".
+
+    Args:
+        header: the line.
+        where: name of the file, for the message.
+
+    Returns:
+        A text that pyproj understands.
+
+    Raises:
+        SurveyError: it is not a system, or one that is neither projected nor geographic.
+    """
+    text = header.strip()
+    utm = _UTM.fullmatch(text)
+    if utm:
+        text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
+    try:
+        parse_crs(text)
+    except ValueError as error:
+        raise SurveyError(
+            f"the first line of {where} is {header.strip()[:80]!r}: expected a projected or geographic coordinate "
+            'reference system such as "EPSG:27700", "+proj=utm +zone=32 +datum=WGS84" or "WGS84 UTM 32N"; write one'
+        ) from error
+    return text
