@@ -103,11 +103,6 @@ def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"] | None = None) 
     return psnr_from_mse(float((error if mask is None else error[mask]).square().mean()), peak=255.0)
 
 
-def psnr_from_mse(mean_square: float) -> float:
-    """Decibels of a mean squared error of values in [0, 1] (eq. 12), at most `PSNR_LIMIT_DB`."""
-    return min(-10 * math.log10(mean_square), PSNR_LIMIT_DB) if mean_square > 0 else PSNR_LIMIT_DB
-
-
 def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
     """Return the SSIM (eq. 13) around each pixel, mean over the channels; for its borders see `similarity`."""
     first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))
