@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from tidefield.data.georeference import Georeference, LeftOut, Residuals
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
 from tidefield.survey.report import Findings
-from tidefield.survey.survey import LensPrior, Photograph, Position, Survey
+from tidefield.survey.survey import Control, LensPrior, Photograph, Position, Survey
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 300.0
 ABOVE = 60.0
@@ -78,15 +80,42 @@ def photograph(i: int, place: np.ndarray | None, names: list[str] | None = None)
     )
 
 
+def residuals(kind: str, count: int = 5, seed: int = 0, error_m: np.ndarray | None = None) -> Residuals:
+    """Residuals named after their kind: random ones of centimetres, or the given."""
+    drawn = np.random.default_rng(seed).normal(0, 0.02, (count, 3)) if error_m is None else error_m
+    return Residuals(tuple(f"{kind} {i}" for i in range(len(drawn))), drawn)
+
+
+def surveyed(*compared: Residuals) -> Control:
+    """A control file of all points that are compared, at random places in the survey."""
+    names = [name for item in compared for name in item.names]
+    place = np.c_[np.random.default_rng(9).uniform(0, 60, (len(names), 2)), np.zeros(len(names))]
+    return Control(FRAME.crs, dict(zip(names, map(tuple, FRAME.to_crs(place).tolist()), strict=True)), ())
+
+
+def located(
+    frame: LocalFrame | None = FRAME,
+    gps: Residuals | None = None,
+    control: Residuals | None = None,
+    check: Residuals | None = None,
+    left_out: tuple[LeftOut, ...] = (),
+) -> Georeference:
+    """A georeference with the given residuals."""
+    nothing = Residuals()
+    source = "ground control" if control or check else "GPS" if frame else "none"
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    return Georeference(frame, source, there, gps or nothing, control or nothing, check or nothing, left_out, ())
+
+
 def findings(position: np.ndarray | None = None, names: list[str] | None = None, **more) -> Findings:
-    """What a pipeline would say of such a survey; anything else by name."""
+    """What a pipeline would find in such a survey; anything else by name."""
     position = flight() if position is None else position
     read = tuple(photograph(i, place, names) for i, place in enumerate(position))
     values = {
         "title": "Flat",
         "date": datetime(2026, 5, 4, 12, 30),
         "survey": Survey(Path("survey"), read, None),
-        "frame": FRAME,
+        "georeference": located(),
     }
     if "reconstruction" not in more:
         values["reconstruction"] = reconstruction(position, flat_ground(position), names=names)

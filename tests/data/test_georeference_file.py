@@ -1,4 +1,4 @@
-"""georeference.json: written whole, read back as it was, and refused when damaged."""
+"""georeference.json: a round trip, its statistics, and errors of damaged files."""
 
 import json
 import math
@@ -24,7 +24,7 @@ FOUND = Georeference(
 )
 
 
-def test_it_comes_back_as_it_was(tmp_path):
+def test_a_georeference_reads_back_as_written(tmp_path):
     FOUND.write(tmp_path)
     again = read_georeference(tmp_path)
     assert again is not None
@@ -40,11 +40,12 @@ def test_it_comes_back_as_it_was(tmp_path):
     np.testing.assert_array_equal(again.world_from_model.translation, [1, 2, 3])
 
 
-def test_figures_are_of_what_is_known_and_was_used(tmp_path):
+def test_statistics_use_only_known_and_accepted_residuals(tmp_path):
     assert FOUND.gps_used.names == ("a.jpg", "b.jpg")
     assert FOUND.gps_used.horizontal_rms_m == pytest.approx(math.sqrt(12.5))
     assert FOUND.gps_used.vertical_rms_m == pytest.approx(1)
     assert math.isnan(FOUND.check.horizontal_rms_m)
+    assert FOUND.gps.known.tolist() == [True, False, True]
     np.testing.assert_array_equal(FOUND.gps_used.median_m, [3, 4, 1])
     FOUND.write(tmp_path)
     written = json.loads((tmp_path / FILE_NAME).read_text())
@@ -53,7 +54,7 @@ def test_figures_are_of_what_is_known_and_was_used(tmp_path):
     assert written["frame"]["epsg"] == 27700
 
 
-def test_a_scene_without_one_has_none(tmp_path):
+def test_a_scene_without_the_file_has_no_georeference(tmp_path):
     assert read_georeference(tmp_path) is None
 
 
@@ -68,7 +69,7 @@ def test_a_scene_without_one_has_none(tmp_path):
         lambda text: text.replace('"rotation"', '"turn"'),
     ],
 )
-def test_a_damaged_one_is_refused(tmp_path, change):
+def test_a_damaged_file_is_an_error(tmp_path, change):
     FOUND.write(tmp_path)
     path = tmp_path / FILE_NAME
     path.write_text(change(path.read_text()))

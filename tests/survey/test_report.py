@@ -9,13 +9,27 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from flat_surveys import AHEAD, ASIDE, FRAME, GSD, findings, flat_ground, flight, photograph, reconstruction
+from flat_surveys import (
+    AHEAD,
+    ASIDE,
+    FRAME,
+    GSD,
+    findings,
+    flat_ground,
+    flight,
+    located,
+    photograph,
+    reconstruction,
+    residuals,
+    surveyed,
+)
 
+from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import RunError
-from tidefield.survey.report import Change, ColourEvening, ColourExample, LeftOut, Residuals, write_report
+from tidefield.survey.report import Change, ColourCorrection, ColourExample, UnusedPhotograph, write_report
 from tidefield.survey.report.ground import signed_area
 from tidefield.survey.report.numbers import duration, plain
-from tidefield.survey.survey import Survey
+from tidefield.survey.survey import Control, Survey
 
 NASTY = '<script>alert(1)</script> & "O\'Brien" ümlaut.JPG'
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -28,6 +42,7 @@ class Reader(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.open, self.seen, self.loads, self.values, self.text, self.ids = [], [], [], [], [], []
+        self.titles, self.markers = [], {}
         self.feed(text)
         self.close()
         assert not self.open, f"never closed: {self.open}"
@@ -53,18 +68,14 @@ class Reader(HTMLParser):
 
     def handle_data(self, data):
         self.text.append(data)
+        if self.open[-1:] == ["title"]:
+            self.titles.append(data)
+            shape = next(attrs for tag, attrs in reversed(self.seen) if tag != "title")
+            if "x" in shape:
+                self.markers.setdefault(data, (float(shape["x"]), float(shape["y"])))
 
     def count(self, tag):
         return sum(seen == tag for seen, _ in self.seen)
-
-
-def residuals(kind, count=5, seed=0, **more):
-    generator = np.random.default_rng(seed)
-    names = tuple(f"{kind} {i}" for i in range(count))
-    stated = np.c_[generator.uniform(0, 60, (count, 2)), np.zeros(count)]
-    values = {"kind": kind, "title": f"{kind} positions", "names": names, "used": np.ones(count, bool)}
-    values |= {"east_north_up_m": generator.normal(0, 0.02, (count, 3)), "stated_world": stated}
-    return Residuals(**(values | more))
 
 
 def full():
@@ -76,27 +87,27 @@ def full():
     lost[0] = replace(lost[0], name=NASTY)
     far = replace(lost[2].position, latitude_deg=-lost[2].position.latitude_deg)
     lost[2] = replace(lost[2], position=far)
+    control, check = residuals("control", 4, 1), residuals("check", 3, 2)
+    control.error_m[3] = np.nan
     everyone = tuple(sorted((*survey.photographs, *lost), key=lambda p: p.name))
     return findings(
         position,
         title="Flats <b>& sons</b>",
-        survey=Survey(survey.folder, everyone, None),
-        placed_by="GPS of 18 photographs",
-        residuals=(
-            residuals("gps", 18),
-            residuals(
-                "control", 4, 1, used=np.array([True, True, True, False]), remarks=(f"A mark in {NASTY} moved.",)
-            ),
-            residuals("check", 3, 2),
+        survey=Survey(survey.folder, everyone, surveyed(control, check)),
+        georeference=located(
+            gps=residuals("gps", 18),
+            control=control,
+            check=check,
+            left_out=(LeftOut("mark", NASTY, "it moved"), LeftOut("GPS", "gps 7", "it is wrong")),
         ),
         left_out=(
-            LeftOut(NASTY, "quality", "blurred <i>", {"sharpness": 0.1}, picture),
-            LeftOut(lost[1].name, "poses", "too few matches", {"matches": math.nan}, None),
-            LeftOut(lost[2].name, "reading", "cut short"),
+            UnusedPhotograph(NASTY, "quality", "blurred <i>", {"sharpness": 0.1}, picture),
+            UnusedPhotograph(lost[1].name, "poses", "too few matches", {"matches": math.nan}, None),
+            UnusedPhotograph(lost[2].name, "reading", "cut short"),
         ),
         models=(18, 4),
-        colour=ColourEvening(
-            True, "Evened.", (Change("Difference", 21.0, 6.0, "%"),), (ColourExample(NASTY, picture, picture),)
+        colour=ColourCorrection(
+            True, "Corrected.", (Change("Difference", 21.0, 6.0, "%"),), (ColourExample(NASTY, picture, picture),)
         ),
         seconds={"features": 75.0, "mapping": 3700.0},
         options={"control": NASTY},
@@ -126,9 +137,12 @@ def test_the_page_is_well_formed_and_every_id_is_its_own(html):
 def test_the_page_loads_nothing_and_runs_nothing(html):
     page = Reader(html)
     assert page.count("script") == page.count("link") == page.count("iframe") == 0
-    assert all(load.startswith("data:image/") for load in page.loads)
+    assert all(load.startswith(("data:image/", "#")) for load in page.loads)
     assert "@import" not in html
-    assert all(target == "#frame" for target in re.findall(r"url\(([^)]*)\)", html))
+    inside = {target.removeprefix("#") for target in re.findall(r"url\(([^)]*)\)", html)}
+    inside |= {load.removeprefix("#") for load in page.loads if load.startswith("#")}
+    assert inside
+    assert inside <= set(page.ids)
     assert not any(name.startswith("on") for _, attrs in page.seen for name in attrs)
     assert "http://" not in html
     assert "https://" not in html
@@ -143,6 +157,43 @@ def test_names_are_shown_as_they_are_and_never_run(html):
     assert "Flats <b>& sons</b>" in shown
     assert "blurred <i>" in shown
     assert any(attrs.get("alt") == f"Thumbnail of {NASTY}" for _, attrs in page.seen)
+
+
+def test_the_map_labels_points_as_text_and_names_cameras_in_tooltips(html):
+    page = Reader(html)
+    assert {"control 0", "check 2", "first", "last", "50 m"} <= set(page.text)
+    assert {f"DJI_{i:04d}.JPG" for i in range(18)} <= set(page.titles)
+    assert f"{NASTY}: not in the model" in page.titles
+    assert "gps 7: not used" in page.titles
+    assert "10: 13" in page.titles  # 13 points are seen by 10 photographs
+
+
+def test_control_points_are_drawn_at_their_given_positions(tmp_path):
+    """Two points: the first at the westernmost camera, so that their markers share x."""
+    position = flight(2, 3)
+    check = residuals("check", 2)
+    given = FRAME.to_crs(np.array([[0.0, 0, 0], [2 * AHEAD, ASIDE, 0]]))
+    control = Control(FRAME.crs, dict(zip(check.names, map(tuple, given.tolist()), strict=True)), ())
+    found = findings(position, georeference=located(check=check))
+    page = Reader(
+        write_report(replace(found, survey=replace(found.survey, control=control)), tmp_path).page.read_text("utf-8")
+    )
+    cameras, points = page.markers["DJI_0000.JPG"], page.markers["check 0"]
+    np.testing.assert_allclose(cameras, points, atol=0.05)
+    np.testing.assert_allclose(page.markers["DJI_0003.JPG"], page.markers["check 1"], atol=0.05)
+
+
+def test_the_same_findings_give_the_same_page(written, html, tmp_path):
+    assert write_report(full(), tmp_path).page.read_text(encoding="utf-8") == html
+
+
+@pytest.mark.parametrize("name", ["$x$ $", "点.JPG", "a\x01b"])
+def test_any_name_of_a_point_can_be_drawn(tmp_path, name):
+    check = Residuals((name,), np.array([[0.01, 0.02, 0.03]]))
+    found = findings(georeference=located(check=check))
+    found = replace(found, survey=replace(found.survey, control=surveyed(check)))
+    page = Reader(write_report(found, tmp_path).page.read_text(encoding="utf-8"))
+    assert name.replace("\x01", "\ufffd") in page.text
 
 
 def test_pictures_have_words_and_tables_have_captions_and_heads(html):
@@ -172,13 +223,14 @@ def test_every_number_of_the_page_is_in_the_json(written, html):
     assert set(shown) <= known
 
 
-def test_the_page_says_what_the_survey_was_made_to_be(html):
+def test_the_page_states_the_known_values_of_the_survey(html):
     text = " ".join("".join(Reader(html).text).split()).replace("\u00a0", " ")
     assert "18 of 21 photographs are in the model" in text
     assert f"{100 * GSD:.1f} cm/px" in text
     assert "80% forward and 50% side overlap" in text
     assert "reprojection error is 0.50 px" in text
     assert "Mind the <gap>." in text
+    assert f"{NASTY}: it moved" in text
     assert "2, of 18 and 4 photographs" in text
 
 
@@ -210,26 +262,31 @@ def test_the_json_has_the_names_and_meanings_of_opensfm(written):
 
 def test_errors_count_only_what_was_used(tmp_path):
     errors = np.array([[3.0, 4, 0], [-3, -4, 2], [100, 100, 100]])
-    used = np.array([True, True, False])
-    found = findings(residuals=(residuals("check", 3, east_north_up_m=errors, used=used),))
-    check = write_report(found, tmp_path).numbers["check_errors"]
-    assert check["mean"] == {"x": 0, "y": 0, "z": 1}
-    assert check["error"] == pytest.approx({"x": 3, "y": 4, "z": math.sqrt(2)})
-    assert check["rms_horizontal"] == pytest.approx(5)
-    assert check["largest_vertical"] == 2
-    assert (check["count"], check["not_used"]) == (2, 1)
+    wrong = (LeftOut("GPS", "gps 2", "it is 170 m away"),)
+    found = findings(georeference=located(gps=residuals("gps", error_m=errors), left_out=wrong))
+    table = write_report(found, tmp_path).numbers
+    gps = table["gps_errors"]
+    assert gps["mean"] == {"x": 0, "y": 0, "z": 1}
+    assert gps["error"] == pytest.approx({"x": 3, "y": 4, "z": math.sqrt(2)})
+    assert gps["rms_horizontal"] == pytest.approx(5)
+    assert gps["largest_vertical"] == 2
+    assert (gps["count"], gps["not_used"]) == (2, 1)
+    assert table["tidefield"]["residuals"][0]["remarks"] == ["gps 2: it is 170 m away"]
+    assert table["tidefield"]["georeference"]["placed_by"] == "GPS of 2 photographs"
 
 
-def test_a_point_that_was_not_found_is_listed_and_drawn_nowhere(tmp_path):
+def test_a_point_without_an_estimate_is_listed_but_not_drawn(tmp_path):
     errors = np.array([[0.01, 0.02, 0.03], [np.nan] * 3])
-    found = findings(residuals=(residuals("check", 2, east_north_up_m=errors, used=np.array([True, False])),))
+    check = residuals("check", error_m=errors)
+    found = findings(georeference=located(check=check))
+    found = replace(found, survey=replace(found.survey, control=surveyed(check)))
     html = write_report(found, tmp_path).page.read_text(encoding="utf-8")
     shapes = [value for _, attrs in Reader(html).seen for value in attrs.values() if value]
     assert not any("nan" in value.lower() for value in shapes)
     assert "check 1" in "".join(Reader(html).text)
 
 
-def test_the_map_for_a_gis_keeps_to_rfc_7946_and_lies_where_the_world_does(written):
+def test_the_map_for_a_gis_follows_rfc_7946_and_is_at_the_place_of_the_world(written):
     collection = json.loads(written.map.read_text(encoding="utf-8"))
     assert collection["type"] == "FeatureCollection"
     kinds: dict[str, list] = {}
@@ -259,10 +316,10 @@ def test_the_map_for_a_gis_keeps_to_rfc_7946_and_lies_where_the_world_does(writt
     assert area == pytest.approx((5 * AHEAD + 80) * (2 * ASIDE + 60), rel=0.01)
 
 
-def test_a_model_that_lies_nowhere_has_no_map_and_an_earlier_one_goes(tmp_path):
+def test_without_a_georeference_there_is_no_map_and_an_earlier_one_is_deleted(tmp_path):
     first = write_report(findings(), tmp_path)
     assert first.map is not None
-    second = write_report(findings(frame=None), tmp_path)
+    second = write_report(findings(georeference=located(None)), tmp_path)
     assert second.map is None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
     text = second.page.read_text(encoding="utf-8")
@@ -272,7 +329,7 @@ def test_a_model_that_lies_nowhere_has_no_map_and_an_earlier_one_goes(tmp_path):
     assert second.numbers["odm_processing_statistics"]["average_gsd"] is None
 
 
-def test_a_survey_is_warned_of_thin_overlap_and_of_a_doubtful_focal_length(tmp_path):
+def test_the_report_warns_of_low_overlap_and_of_a_changed_focal_length(tmp_path):
     thin = flight(2, 4) * (3, 1.5, 1)
     found = findings(thin)
     read = found.survey.photographs
@@ -286,18 +343,20 @@ def test_a_survey_is_warned_of_thin_overlap_and_of_a_doubtful_focal_length(tmp_p
     assert "No surveyed points" in said
 
 
-def test_a_good_survey_with_check_points_is_warned_of_nothing(tmp_path):
-    checked = findings(flight(5, 12), residuals=(residuals("control"), residuals("check")))
+def test_the_report_of_a_good_survey_with_check_points_has_no_warnings(tmp_path):
+    control, check = residuals("control"), residuals("check")
+    checked = findings(flight(5, 12), georeference=located(control=control, check=check))
+    checked = replace(checked, survey=replace(checked.survey, control=surveyed(control, check)))
     assert write_report(checked, tmp_path).numbers["tidefield"]["remarks"] == []
 
 
-def test_a_photograph_a_hundred_kilometres_off_does_not_shrink_the_map(tmp_path):
+def test_a_photograph_100_km_away_does_not_shrink_the_map(tmp_path):
     position = flight()
     stray = photograph(200, np.array([100_000.0, 0, 60]))
     found = findings(position)
     survey = replace(found.survey, photographs=(*found.survey.photographs, stray))
     near = write_report(found, tmp_path / "near").page.read_text(encoding="utf-8")
-    left_out = (LeftOut(stray.name, "quality", "its GPS lies 100 km away"),)
+    left_out = (UnusedPhotograph(stray.name, "quality", "its GPS lies 100 km away"),)
     far = write_report(replace(found, survey=survey, left_out=left_out), tmp_path / "far").page.read_text(
         encoding="utf-8"
     )
@@ -313,7 +372,7 @@ def test_a_folder_that_cannot_be_written_to_is_an_error_of_the_run(tmp_path):
 def test_two_thousand_photographs_make_a_page_that_can_be_sent(tmp_path):
     position = flight(40, 50)
     picture = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    lost = tuple(LeftOut(f"lost {i}.JPG", "quality", "blurred", {}, picture) for i in range(500))
+    lost = tuple(UnusedPhotograph(f"lost {i}.JPG", "quality", "blurred", {}, picture) for i in range(500))
     model = reconstruction(position, flat_ground(position, a_photograph=8))
     found = findings(position, left_out=lost, reconstruction=model)
     start = time.process_time()
@@ -323,7 +382,7 @@ def test_two_thousand_photographs_make_a_page_that_can_be_sent(tmp_path):
     assert Reader(report.page.read_text(encoding="utf-8")).count("figure") < 60
 
 
-def test_numbers_become_plain_and_spans_become_words():
+def test_numbers_become_plain_python_and_durations_are_formatted():
     assert plain({"a": np.float64(2), 3: [np.nan, np.int64(1)], "b": np.array([1.0, np.inf]), "c": np.bool_(True)}) == {
         "a": 2.0,
         "3": [None, 1],

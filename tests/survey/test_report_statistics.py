@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+import shapely
 from flat_surveys import (
     ABOVE,
     AHEAD,
@@ -16,6 +17,7 @@ from flat_surveys import (
     findings,
     flat_ground,
     flight,
+    located,
     photograph,
     reconstruction,
 )
@@ -23,7 +25,7 @@ from flat_surveys import (
 from tidefield.errors import SurveyError
 from tidefield.survey.report.block import read_block
 from tidefield.survey.report.coverage import cover
-from tidefield.survey.report.graticule import Sheet, affine, degree_ticks, grid_lines
+from tidefield.survey.report.figures import affine, coordinates, crossings
 from tidefield.survey.report.ground import fit_ground, footprints, signed_area
 from tidefield.survey.report.numbers import numbers
 from tidefield.survey.report.statistics import measure
@@ -38,7 +40,7 @@ def flat():
 
 
 def box(low, high):
-    return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])], dtype=float)
+    return shapely.Polygon([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
 
 
 def test_resolution_height_and_errors_are_those_of_the_construction(flat):
@@ -51,9 +53,10 @@ def test_resolution_height_and_errors_are_those_of_the_construction(flat):
 
 def test_footprints_are_the_frames_on_the_ground_and_run_counter_clockwise(flat):
     for outline, place in zip(flat.footprints, flat.block.position, strict=True):
-        assert signed_area(outline) == pytest.approx(np.prod(FOOTPRINT), rel=1e-5)
-        np.testing.assert_allclose(outline.max(0) - place[:2], np.array(FOOTPRINT) / 2, atol=1e-3)
-        np.testing.assert_allclose(outline.min(0) - place[:2], -np.array(FOOTPRINT) / 2, atol=1e-3)
+        corners = shapely.get_coordinates(outline)
+        assert signed_area(corners) == pytest.approx(np.prod(FOOTPRINT), rel=1e-5)
+        np.testing.assert_allclose(corners.max(0) - place[:2], np.array(FOOTPRINT) / 2, atol=1e-3)
+        np.testing.assert_allclose(corners.min(0) - place[:2], -np.array(FOOTPRINT) / 2, atol=1e-3)
 
 
 def test_neighbours_share_what_their_distance_leaves_of_a_footprint(flat):
@@ -83,7 +86,7 @@ def test_cells_are_counted_when_their_centre_lies_in_the_polygon():
     generator = np.random.default_rng(3)
     angles = np.sort(generator.uniform(0, 2 * np.pi, 11))
     star = np.c_[np.cos(angles), np.sin(angles)] * generator.uniform(20, 100, 11)[:, None]
-    coverage = cover((star, box((-50, -50), (70, 10))))
+    coverage = cover((shapely.Polygon(star), box((-50, -50), (70, 10))))
     rows, columns = coverage.count.shape
     x = coverage.corner[0] + (np.arange(columns) + 0.5) * coverage.cell
     y = coverage.corner[1] + (np.arange(rows) + 0.5) * coverage.cell
@@ -99,7 +102,8 @@ def test_cells_are_counted_when_their_centre_lies_in_the_polygon():
 def test_the_outline_keeps_holes_and_separate_parts():
     ring = (box((0, 0), (100, 30)), box((0, 70), (100, 100)), box((0, 0), (30, 100)), box((70, 0), (100, 100)))
     outline = cover((*ring, box((150, 0), (200, 50)))).outline()
-    areas = sorted([[signed_area(part) for part in polygon] for polygon in outline], key=len)
+    rings = [[part.exterior, *part.interiors] for part in outline.geoms]
+    areas = sorted([[signed_area(np.array(ring.coords)) for ring in rings_of] for rings_of in rings], key=len)
     assert areas[0] == pytest.approx([2500], rel=0.02)
     assert areas[1] == pytest.approx([10000, -1600], rel=0.02)
 
@@ -110,7 +114,7 @@ def test_footprints_end_on_a_slope_where_the_rays_meet_it():
     xy = generator.uniform(-90, 90, (3000, 2))
     ground = fit_ground(np.c_[xy, slope * xy[:, 0] + generator.normal(0, 0.01, 3000)])
     block = read_block(reconstruction(np.array([[0.0, 0, ABOVE]] * 2), np.c_[xy, slope * xy[:, 0]]), level=False)
-    outline = footprints(block, ground)[0]
+    outline = shapely.get_coordinates(footprints(block, ground)[0])
     tangent = WIDTH / 2 / FOCAL
     up, down = ABOVE * tangent / (1 + slope * tangent), -ABOVE * tangent / (1 - slope * tangent)
     assert outline[:, 0].max() == pytest.approx(up, abs=0.2)
@@ -134,7 +138,7 @@ def test_a_view_of_the_horizon_ends_at_twice_the_distance_of_its_far_points():
     found = measure(findings(position, reconstruction=reconstruction(position, points, rotation)))
     for outline, place in zip(found.footprints, position, strict=True):
         seen = np.linalg.norm(found.block.points[:, :2] - place[:2], axis=1)
-        reach = np.linalg.norm(outline - place[:2], axis=1).max()
+        reach = np.linalg.norm(shapely.get_coordinates(outline) - place[:2], axis=1).max()
         assert seen.max() < reach < 2.1 * np.hypot(seen.max(), 40)
 
 
@@ -144,7 +148,7 @@ def test_a_photograph_that_sees_no_ground_has_no_footprint():
     model.add_image_with_trivial_frame(pycolmap.Image("sky.JPG", np.zeros((0, 2)), 1, 500), sky)
     found = measure(findings(reconstruction=model))
     lost = found.block.names.index("sky.JPG")
-    assert len(found.footprints[lost]) == 0
+    assert found.footprints[lost].is_empty
     assert np.isnan(found.gsd[lost])
     assert np.isnan(found.mean_px[lost])
 
@@ -154,7 +158,7 @@ def test_a_model_in_any_frame_and_unit_has_the_same_shares_and_angles(flat):
     axis = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
     axis *= np.linalg.det(axis)
     turned.transform(pycolmap.Sim3d(0.1, pycolmap.Rotation3d(axis), np.array([5.0, -3, 2])))
-    found = measure(findings(reconstruction=turned, frame=None))
+    found = measure(findings(reconstruction=turned, georeference=located(None)))
     np.testing.assert_allclose(found.gsd, 0.1 * GSD, rtol=1e-6)
     np.testing.assert_allclose(found.height, 0.1 * ABOVE, rtol=1e-4)
     np.testing.assert_allclose(found.overlap.forward, flat.overlap.forward, atol=2e-3)
@@ -185,25 +189,21 @@ def test_an_empty_model_is_an_error_of_the_survey():
         measure(findings(reconstruction=pycolmap.Reconstruction()))
 
 
-def test_grid_lines_and_ticks_lie_where_their_labels_say():
-    sheet = Sheet(np.array([-100.0, -80]), np.array([140.0, 120]), 3.0, 26.0, 24.0)
+def test_grid_lines_cross_the_edges_where_the_coordinate_has_their_value():
+    low, high = np.array([-100.0, -80]), np.array([140.0, 120])
     turn = np.radians(2)
     crs = np.array([[np.cos(turn), -np.sin(turn), 512_345], [np.sin(turn), np.cos(turn), 6_040_007]])
-    found = affine(sheet, lambda xyz: np.c_[xyz[:, :2] @ crs[:, :2].T + crs[:, 2], xyz[:, 2]])
+    found = affine(low, high, lambda xyz: np.c_[xyz[:, :2] @ crs[:, :2].T + crs[:, 2], xyz[:, 2]])
     np.testing.assert_allclose(found, crs, rtol=1e-9)
     for axis in (0, 1):
-        lines = grid_lines(sheet, found, axis)
-        assert 4 <= len(lines) <= 8
-        for line in lines:
-            for x, y in ((line.x0, line.y0), (line.x1, line.y1)):
-                world = [sheet.low[0] + (x - 26) / 3, sheet.high[1] - (y - 24) / 3, 1]
-                if line.label:
-                    value = float(line.label.replace("\u202f", ""))
-                    assert crs[axis] @ world == pytest.approx(value, abs=1e-3)
-            if line.label:  # it keeps clear of the corners, where the other side's labels are
-                along, end = (line.x0 - 26, 3 * 240) if axis == 0 else (line.y0 - 24, 3 * 200)
-                assert 30 < along < end - 30
-    geographic = np.array([[1.5e-5, 0, -0.0004], [0, 9e-6, 54.51]])
-    west, *_, east = [tick.label for tick in degree_ticks(sheet, geographic, 0)]
-    assert west.endswith("° W")
-    assert east.endswith("° E")
+        values, digits = coordinates(found, low, high, axis, 6)
+        assert 4 <= len(values) <= 8
+        assert digits == 0
+        assert set(values % np.diff(values)[0]) == {0}
+        for edge in (low[1 - axis], high[1 - axis]):
+            place = np.full((len(values), 3), [edge, edge, 1.0])
+            place[:, axis] = crossings(found, axis, values, edge)
+            np.testing.assert_allclose(place @ crs[axis], values, atol=1e-6)
+    values, digits = coordinates(np.array([[1.5e-5, 0, -0.0004], [0, 9e-6, 54.51]]), low, high, 0, 4)
+    assert digits == 3
+    np.testing.assert_allclose(np.diff(values), 0.001)

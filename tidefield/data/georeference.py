@@ -1,4 +1,4 @@
-"""Where on the Earth a scene is, and how well that is known: `georeference.json` beside the photographs."""
+"""Read and write `georeference.json`: where on the Earth a scene is, and how accurately that is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from tidefield.errors import SceneError
 from tidefield.files import completed_file
@@ -24,15 +24,20 @@ Source = Literal["ground control", "GPS", "project", "none"]
 
 @dataclass(frozen=True)
 class Residuals:
-    """How far the scene's positions lie from those that were given, in metres of the world.
+    """Differences between the scene's positions and those that were given, in metres of the world.
 
     Attributes:
         names: photographs or control points.
-        error_m: the scene's minus the given, east, north and up; NaN where none was given.
+        error_m: the scene's minus the given, east, north and up; NaN where one of them is unknown.
     """
 
     names: tuple[str, ...] = ()
     error_m: Float64[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def known(self) -> Bool[np.ndarray, " N"]:
+        """Whether all of an error's components are finite."""
+        return np.asarray(np.isfinite(self.error_m).all(axis=1))
 
     @property
     def horizontal_rms_m(self) -> float:
@@ -51,14 +56,14 @@ class Residuals:
 
     @property
     def median_m(self) -> Float64[np.ndarray, " 3"]:
-        """What all have in common, such as a shift between datums; NaN if there are none."""
-        known = self.error_m[np.isfinite(self.error_m).all(axis=1)]
+        """The common part, such as a shift between datums; NaN if there are none."""
+        known = self.error_m[self.known]
         return np.median(known, axis=0) if len(known) else np.full(3, math.nan)
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An observation that was not believed.
+    """An observation that was rejected.
 
     Attributes:
         kind: "GPS", "control point" or "mark".
@@ -73,21 +78,19 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Georeference:
-    """How a scene's world lies on the Earth.
+    """Position of a scene's world on the Earth.
 
     Attributes:
-        frame: None if nothing says where the scene is; the world then has its vertical from the photographs, and an
-            origin and a scale of its own.
-        source: what the frame rests on; "project" is what somebody else's project states.
+        frame: None if the position is unknown; the world then has its vertical from the photographs, and an arbitrary
+            origin and scale.
+        source: of the frame; "project" is the file of another program's project.
         world_from_model: the similarity between the model as it was reconstructed and the world. With ground control
             the model was adjusted further, in the world.
-        gps: of the cameras. Those that were left out are in it, for the report; the properties of `gps_used` are
-            without them.
-        control: of the control points, as the adjusted photographs see them, which they have been fitted to.
-        check: of the control points, each as seen by photographs that were adjusted without it. This is the figure
-            to believe.
-        left_out: what was not used.
-        notes: what else a surveyor should know, as sentences.
+        gps: of the cameras, with those that were rejected, which the report lists; `gps_used` is without them.
+        control: of the control points, after the adjustment that they took part in.
+        check: of the control points, each after an adjustment without it. This is the accuracy to rely on.
+        left_out: rejected observations.
+        notes: further sentences for the surveyor.
     """
 
     frame: LocalFrame | None
@@ -101,7 +104,7 @@ class Georeference:
 
     @property
     def gps_used(self) -> Residuals:
-        """Of the cameras whose positions were used."""
+        """Residuals of the cameras whose positions were used."""
         wrong = {item.name for item in self.left_out if item.kind == "GPS"}
         keep = [i for i, name in enumerate(self.gps.names) if name not in wrong]
         return Residuals(tuple(self.gps.names[i] for i in keep), self.gps.error_m[keep])
@@ -116,7 +119,7 @@ class Georeference:
             partial.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     def to_json(self) -> dict[str, Any]:
-        """What `read_georeference` reads, with figures for readers who have only the file."""
+        """Convert to what `read_georeference` reads, with statistics for readers who have only the file."""
         kinds = {"gps": self.gps, "gps_used": self.gps_used, "control": self.control, "check": self.check}
         similarity = self.world_from_model
         return {
@@ -135,7 +138,7 @@ class Georeference:
 
 
 def read_georeference(folder: Path) -> Georeference | None:
-    """`georeference.json` of a scene; None if it has none.
+    """Read `georeference.json` of a scene; None if it has none.
 
     Raises:
         SceneError: the file is damaged, or of a later version.
@@ -150,8 +153,8 @@ def read_georeference(folder: Path) -> Georeference | None:
         return None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SceneError(
-            f"{path} is damaged ({error}): expected what `tidefield prepare` writes; prepare the scene again, or "
-            "remove the file to use the scene in a frame of its own"
+            f"{path} is damaged ({error}): expected a file of `tidefield prepare`; prepare the scene again, or "
+            "remove the file to use the scene without a georeference"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""What a preparation found, as the report tells it."""
+"""Collect the findings of a preparation for its report."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ import numpy as np
 import pycolmap
 
 from tidefield import __version__
-from tidefield.data.georeference import Georeference
 from tidefield.survey import report
 from tidefield.survey.colour import Evening
-from tidefield.survey.georeference.alignment import camera_centres
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.report.page import MOST_THUMBNAILS
@@ -26,21 +24,19 @@ from tidefield.survey.survey import Photograph
 
 THUMBNAIL_PX = 200
 EXAMPLES = 3
-"""Photographs that are shown before and after colour evening."""
+"""Photographs that are shown before and after the colour correction."""
 
 
 def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> report.Findings:
-    """Everything that the report of a prepared scene tells."""
-    model, located = pycolmap.Reconstruction(scene / "sparse" / "0"), prepared.georeference
+    """Collect everything that the report of a prepared scene describes."""
+    located = prepared.georeference
     return report.Findings(
         title=prepared.survey.folder.resolve().name,
         date=datetime.now(UTC),
         survey=prepared.survey,
-        reconstruction=model,
-        frame=located.frame,
-        placed_by=_placed_by(located),
-        residuals=_residuals(model, prepared),
-        left_out=(*_unfit(prepared), *_unplaced(prepared, scene)),
+        reconstruction=pycolmap.Reconstruction(scene / "sparse" / "0"),
+        georeference=located,
+        left_out=(*_rejected(prepared), *_unregistered(prepared, scene)),
         models=tuple(len(names) for names in prepared.models),
         colour=_colour(prepared, scene),
         seconds=prepared.seconds,
@@ -54,92 +50,52 @@ def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> rep
     )
 
 
-def _placed_by(located: Georeference) -> str:
-    gps = f"GPS of {len(located.gps_used.names)} photographs"
-    if located.source == "ground control":
-        return f"{len(located.control.names)} control points" + (f", {gps}" if located.gps_used.names else "")
-    return gps if located.source == "GPS" else ""
-
-
-def _residuals(model: pycolmap.Reconstruction, prepared: Prepared) -> tuple[report.Residuals, ...]:
-    located, centres = prepared.georeference, camera_centres(model)
-    wrong = {item.name for item in located.left_out if item.kind == "GPS"}
-    used = np.array([name not in wrong for name in located.gps.names], dtype=bool)
-    there = np.array([centres[name] for name in located.gps.names]).reshape(-1, 3)
-    reasons = tuple(f"{item.name}: {item.reason}" for item in located.left_out if item.kind == "GPS")
-    found = [
-        report.Residuals(
-            "gps",
-            "GPS of the cameras",
-            located.gps.names,
-            located.gps.error_m,
-            there - located.gps.error_m,
-            used,
-            reasons,
-        )
-    ]
-    control = prepared.survey.control
-    if located.source == "ground control" and control is not None and located.frame is not None:
-        marks = tuple(f"{item.name}: {item.reason}" for item in located.left_out if item.kind != "GPS")
-        kinds: tuple[tuple, ...] = (
-            ("control", "Control points", located.control, marks),
-            ("check", "Control points, each left out in turn", located.check, ()),
-        )
-        for kind, title, errors, told in kinds:
-            stated = located.frame.from_crs(np.array([control.points[n] for n in errors.names]).reshape(-1, 3))
-            known = np.asarray(np.isfinite(errors.error_m).all(axis=1))
-            found.append(report.Residuals(kind, title, errors.names, errors.error_m, stated, known, told))
-    return tuple(item for item in found if item.names)
-
-
-def _unfit(prepared: Prepared) -> list[report.LeftOut]:
+def _rejected(prepared: Prepared) -> list[report.UnusedPhotograph]:
     by_name = {photograph.name: photograph for photograph in prepared.survey.photographs}
-    unfit = [verdict for verdict in prepared.verdicts if verdict.left_out and verdict.name not in prepared.used]
-    told = []
-    for verdict in unfit:
+    rejected = [verdict for verdict in prepared.verdicts if verdict.left_out and verdict.name not in prepared.used]
+    found = []
+    for verdict in rejected:
         measures = {} if verdict.measures is None else vars(verdict.measures)
         finite = {name: value for name, value in measures.items() if math.isfinite(value)}
-        shown = verdict.measures is not None and len(told) < MOST_THUMBNAILS
+        shown = verdict.measures is not None and len(found) < MOST_THUMBNAILS
         picture = thumbnail(by_name[verdict.name], THUMBNAIL_PX) if shown else None
-        told.append(report.LeftOut(verdict.name, "quality", str(verdict.left_out), finite, picture))
-    return told
+        found.append(report.UnusedPhotograph(verdict.name, "quality", str(verdict.left_out), finite, picture))
+    return found
 
 
-def _unplaced(prepared: Prepared, scene: Path) -> list[report.LeftOut]:
-    """Photographs that are not in the model, with the likely reason: how well they match any other."""
-    unplaced = prepared.used - set(prepared.models[0])
-    used = [photograph for photograph in prepared.survey.photographs if photograph.name in unplaced]
+def _unregistered(prepared: Prepared, scene: Path) -> list[report.UnusedPhotograph]:
+    """List photographs that are not in the model, with the likely reason: how well they match any other."""
+    unregistered = prepared.used - set(prepared.models[0])
+    used = [photograph for photograph in prepared.survey.photographs if photograph.name in unregistered]
     if not used:
         return []
     elsewhere = {name: model for model in prepared.models[1:] for name in model}
     features, matches = _counts(scene / "prepare" / "database.db")
-    told = []
+    found = []
     for photograph in used:
         reason = _why(photograph, features[photograph.name], matches.get(photograph.name, []), elsewhere)
-        picture = thumbnail(photograph, THUMBNAIL_PX) if len(told) < MOST_THUMBNAILS else None
-        told.append(report.LeftOut(photograph.name, "poses", reason, {}, picture))
-    return told
+        picture = thumbnail(photograph, THUMBNAIL_PX) if len(found) < MOST_THUMBNAILS else None
+        found.append(report.UnusedPhotograph(photograph.name, "poses", reason, {}, picture))
+    return found
 
 
 def _why(photograph: Photograph, features: int, matches: list[int], elsewhere: dict[str, list[str]]) -> str:
     if photograph.name in elsewhere:
-        place = elsewhere[photograph.name]
-        where = f"{place[0]} to {place[-1]}"
-        return f"fits only {len(place) - 1} others, of a place that nothing connects with the rest ({where})"
+        names = elsewhere[photograph.name]
+        where = f"{names[0]} to {names[-1]}"
+        return f"matches only {len(names) - 1} others, of a place that nothing connects with the rest ({where})"
     if features < 500:
-        return f"only {features} features were found: the ground shows too little, or the photograph is blurred"
+        return f"only {features} features were found: the ground has too little texture, or the photograph is blurred"
     if not matches:
-        return (
-            f"none of its {features} features agree with another photograph: expected overlap with at least two others"
-        )
+        return f"none of its {features} features match another photograph: expected overlap with at least two others"
     return (
-        f"agrees with {len(matches)} other{'s' * (len(matches) > 1)}, by {max(matches)} features at most: too few, or "
-        "too much on one line, to place it; fly with more overlap here"
+        f"matches {len(matches)} other{'s' * (len(matches) > 1)}, by {max(matches)} features at most: too few, or "
+        "too close to one line, to estimate its pose; fly with more overlap here"
     )
 
 
 def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
-    """Features of every photograph, and how many agree with each other photograph that any agree with."""
+    """Count the features of every photograph, and its verified matches with each photograph that it matches."""
     matches: dict[str, list[int]] = {}
     with opened(database) as db:
         names = {image.image_id: real_name(image.name) for image in db.read_all_images()}
@@ -151,27 +107,27 @@ def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
     return features, matches
 
 
-def _colour(prepared: Prepared, scene: Path) -> report.ColourEvening | None:
+def _colour(prepared: Prepared, scene: Path) -> report.ColourCorrection | None:
     evening = prepared.evening
     if evening is None or math.isnan(evening.before):
         return None
     unit = "% of a pixel's value"
     changes = [
         report.Change(
-            "how much photographs disagree about points that took no part in the estimate",
+            "difference between photographs at points that took no part in the estimate",
             100 * evening.before,
             100 * min(evening.gains_alone, evening.after),
             unit,
         )
     ]
-    falloff = " and the lens' falloff towards the corners was removed" if evening.sees_falloff else ""
+    vignetting = " and the vignetting of the lens was removed" if evening.sees_falloff else ""
     verdict = (
-        f"Exposure and white balance were evened out{falloff}; the brightest photograph had "
+        f"Exposure and white balance were corrected{vignetting}; the brightest photograph had "
         f"{evening.gain.max() / evening.gain.min():.1f} times the gain of the darkest."
         if evening.helps
-        else "The photographs agree as well as they are: their colours were left alone."
+        else "The photographs agree as they are: their colours were not changed."
     )
-    return report.ColourEvening(evening.helps, verdict, tuple(changes), _examples(prepared, scene, evening))
+    return report.ColourCorrection(evening.helps, verdict, tuple(changes), _examples(prepared, scene, evening))
 
 
 def _examples(prepared: Prepared, scene: Path, evening: Evening) -> tuple[report.ColourExample, ...]:

@@ -1,4 +1,4 @@
-"""What a survey gave and how good it is: a page to send on, the same numbers as JSON, and a map for a GIS.
+"""Report the results of a survey and their quality: a page to send on, the same numbers as JSON, and a map for a GIS.
 
 The pipeline fills `Findings`; `statistics` measures the model; `numbers` puts both into one table, which report.json
 holds and `page` renders.
@@ -13,11 +13,10 @@ from pathlib import Path
 from tidefield.files import completed_file
 from tidefield.survey.report.findings import (
     Change,
-    ColourEvening,
+    ColourCorrection,
     ColourExample,
     Findings,
-    LeftOut,
-    Residuals,
+    UnusedPhotograph,
 )
 from tidefield.survey.report.geojson import geojson
 from tidefield.survey.report.numbers import Numbers, numbers
@@ -26,25 +25,24 @@ from tidefield.survey.report.statistics import measure
 
 __all__ = [
     "Change",
-    "ColourEvening",
+    "ColourCorrection",
     "ColourExample",
     "Findings",
-    "LeftOut",
     "Report",
-    "Residuals",
+    "UnusedPhotograph",
     "write_report",
 ]
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was written.
+    """Files of a report.
 
     Attributes:
         page: report.html.
         table: report.json.
-        map: survey.geojson, or None if the model lies nowhere on the Earth.
-        numbers: what report.json holds.
+        map: survey.geojson, or None without a georeference.
+        numbers: content of report.json.
     """
 
     page: Path
@@ -54,7 +52,7 @@ class Report:
 
 
 def write_report(findings: Findings, folder: Path) -> Report:
-    """Write report.html, report.json and survey.geojson into a folder, over what an earlier run left there.
+    """Write report.html, report.json and survey.geojson into a folder, over those of an earlier run.
 
     Raises:
         SurveyError: the reconstruction is empty.
@@ -68,7 +66,7 @@ def write_report(findings: Findings, folder: Path) -> Report:
     }
     located = folder / "survey.geojson"
     if findings.frame is None:
-        located.unlink(missing_ok=True)  # of an earlier run, which knew where it was
+        located.unlink(missing_ok=True)  # of an earlier run with a georeference
     else:
         texts[located.name] = json.dumps(geojson(findings, statistics), allow_nan=False)
     for name, text in texts.items():

@@ -1,4 +1,4 @@
-"""A reconstruction as arrays: what the statistics are computed from."""
+"""Read a reconstruction into arrays, which the statistics are computed from."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Block:
         cameras: the lenses.
         lens: index into `cameras` of every photograph.
         position: projection centres.
-        R_world_camera: turn camera directions (OpenCV axes) into world's.
+        R_world_camera: rotate camera directions (OpenCV axes) into the world.
         detected: keypoints of every photograph, observed points or not.
         points: sparse points.
         photograph, point, uv_px: of every observation, those of one photograph together and in the photographs' order.
@@ -47,17 +47,17 @@ class Block:
         return self.cameras[self.lens[i]]
 
     def observations(self) -> Iterator[tuple[int, slice]]:
-        """Every photograph that observes a point, and where its observations are."""
+        """Iterate over photographs that observe a point, with the slice of their observations."""
         ends = np.searchsorted(self.photograph, np.arange(len(self) + 1))
         return ((i, slice(first, last)) for i, (first, last) in enumerate(pairwise(ends.tolist())) if last > first)
 
 
 def read_block(reconstruction: pycolmap.Reconstruction, level: bool) -> Block:
-    """Arrays of all registered photographs and of the points.
+    """Collect all registered photographs and the points.
 
     Args:
-        level: turn the frame so that z is the normal of the points' plane on the cameras' side, and put its origin into
-            the points' middle; for a model that nothing placed on the Earth.
+        level: rotate the frame so that z is the normal of the points' plane on the cameras' side, and move its origin
+            to the points' median; for a model without a georeference.
 
     Raises:
         SurveyError: nothing is registered, or there are no points.
@@ -65,8 +65,8 @@ def read_block(reconstruction: pycolmap.Reconstruction, level: bool) -> Block:
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda image: image.name)
     if not images or not reconstruction.num_points3D():
         raise SurveyError(
-            f"the model has {len(images)} photographs and {reconstruction.num_points3D()} points: expected some of "
-            "both to report on; find the poses again"
+            f"the model has {len(images)} photographs and {reconstruction.num_points3D()} points: expected at least "
+            "one of both; estimate the poses again"
         )
     lenses = sorted({image.camera_id for image in images})
     point_index = {key: i for i, key in enumerate(reconstruction.points3D)}
@@ -95,7 +95,7 @@ def read_block(reconstruction: pycolmap.Reconstruction, level: bool) -> Block:
 def _levelling(
     points: Float64[np.ndarray, "P 3"], position: Float64[np.ndarray, "N 3"]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """A rotation whose third row is the normal of the points' plane, towards the cameras, and the points' middle."""
+    """A rotation whose third row is the normal of the points' plane, towards the cameras, and the points' median."""
     middle = np.median(points, 0)
     offset = points - middle
     distance = np.linalg.norm(offset, axis=1)

@@ -1,4 +1,4 @@
-"""The ground under a survey from its sparse points, and what each photograph covers of it.
+"""Fit the ground under a survey to its sparse points, and find what each photograph covers of it.
 
 The ground is a plane plus a coarse grid of residuals (medians, so that trees and stray points hardly matter).
 """
@@ -9,15 +9,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import pycolmap
 from jaxtyping import Float64
 from scipy.ndimage import distance_transform_edt, map_coordinates, median_filter
+from shapely import Polygon
 
 from tidefield.survey.report.block import Block
 
-POINTS_A_CELL = 16
+POINTS_A_CELL = 16  # on average: enough for a median
 LARGEST_GRID = 256
 BORDER_POINTS = 8  # along each side of a photograph's frame
-FURTHEST = 2.0  # a footprint ends at so many times the distance of the photograph's far points: oblique views see on
+FURTHEST = 2.0  # times the distance of the photograph's far points, where the footprint of an oblique view ends
 STEPS = 32
 TOLERANCE = 0.004  # of a footprint's size: corners that matter less are left out
 
@@ -53,7 +55,7 @@ class Ground:
 
 
 def fit_ground(points: Float64[np.ndarray, "P 3"]) -> Ground:
-    """The ground through sparse points (P >= 1); those far outside the others, in x, y or z, are not heeded."""
+    """Fit the ground to sparse points (P >= 1); those far outside the others, in x, y or z, are ignored."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     slack = 0.1 * (high - low) + 1e-9  # the least: points in one plane have no spread at all
     points = points[((points >= low - slack) & (points <= high + slack)).all(1)]
@@ -83,20 +85,18 @@ def _medians(group: np.ndarray, points: Float64[np.ndarray, "P 3"]) -> Float64[n
     return np.c_[mean, (z[first + (count - 1) // 2] + z[first + count // 2]) / 2]
 
 
-def footprints(block: Block, ground: Ground) -> tuple[Float64[np.ndarray, "_ 2"], ...]:
-    """Outline on the ground of what every photograph covers: x and y, counter-clockwise; empty if it sees no ground."""
+def footprints(block: Block, ground: Ground) -> tuple[Polygon, ...]:
+    """Outline what every photograph covers of the ground: x and y, counter-clockwise; empty if it sees no ground."""
     reach = _reach(block, ground)
     borders = [_border_directions(camera) for camera in block.cameras]
-    outlines = []
-    for i in range(len(block)):
-        directions = borders[block.lens[i]] @ block.R_world_camera[i].T
-        hits = _meet(ground, block.position[i], directions, reach[i])
-        outlines.append(_simplified(hits[:, :2]))
-    return tuple(outlines)
+    return tuple(
+        _simplified(_intersect(ground, block.position[i], borders[lens] @ block.R_world_camera[i].T, reach[i])[:, :2])
+        for i, lens in enumerate(block.lens)
+    )
 
 
 def _reach(block: Block, ground: Ground) -> Float64[np.ndarray, " N"]:
-    """How far from each camera its footprint may go."""
+    """Largest distance of a footprint from each camera."""
     distance = np.linalg.norm(block.points[block.point] - block.position[block.photograph], axis=1)
     far = 2 * np.maximum(ground.above(block.position), 0)
     for i, mine in block.observations():
@@ -104,22 +104,22 @@ def _reach(block: Block, ground: Ground) -> Float64[np.ndarray, " N"]:
     return FURTHEST * far
 
 
-def _border_directions(camera) -> Float64[np.ndarray, "K 3"]:
+def _border_directions(camera: pycolmap.Camera) -> Float64[np.ndarray, "K 3"]:
     """Unit directions, in the camera's frame, along the border of its image."""
     along = np.linspace(0, 1, BORDER_POINTS, endpoint=False)
     zero, one = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
     sides = [(along, zero), (one, along), (1 - along, one), (zero, 1 - along)]
     uv = np.concatenate([np.c_[u, v] for u, v in sides]) * (camera.width, camera.height)
-    xy = camera.cam_from_img(uv)
+    xy = np.asarray(camera.cam_from_img(uv))
     xy = xy[np.isfinite(xy).all(1)]  # a strong distortion need not be invertible at the corners
     directions = np.c_[xy, np.ones(len(xy))]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _meet(
+def _intersect(
     ground: Ground, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "K 3"], reach: float
 ) -> Float64[np.ndarray, "_ 3"]:
-    """Where rays meet the ground first, or where they end; nothing if none of them goes down."""
+    """First intersections of rays with the ground, or their ends; nothing if none of them goes down."""
     fall = directions[:, :2] @ ground.plane[:2] - directions[:, 2]  # towards the plane, per unit of length
     if not (fall > 1e-6).any():
         return np.zeros((0, 3))
@@ -140,20 +140,20 @@ def _meet(
     return origin + hit[:, None] * directions
 
 
-def _simplified(xy: Float64[np.ndarray, "K 2"]) -> Float64[np.ndarray, "k 2"]:
+def _simplified(xy: Float64[np.ndarray, "K 2"]) -> Polygon:
     """The same outline with fewer corners, counter-clockwise; empty if it encloses nothing."""
     if len(xy) < 3:
-        return np.zeros((0, 2))
+        return Polygon()
     middle = xy.mean(0)  # float32 holds a footprint, not a coordinate
     outline = cv2.approxPolyDP((xy - middle).astype(np.float32)[:, None], TOLERANCE * float(np.ptp(xy, 0).max()), True)
     outline = outline[:, 0].astype(np.float64) + middle
     area = signed_area(outline)
     if len(outline) < 3 or area == 0:
-        return np.zeros((0, 2))
-    return outline if area > 0 else outline[::-1]
+        return Polygon()
+    return Polygon(outline if area > 0 else outline[::-1])
 
 
 def signed_area(polygon: Float64[np.ndarray, "K 2"]) -> float:
-    """Area of a polygon: positive if its corners run counter-clockwise."""
+    """Compute the area of a polygon: positive if its corners run counter-clockwise."""
     x, y = (polygon - polygon[:1]).T  # near zero, because far from it the products' difference loses its digits
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

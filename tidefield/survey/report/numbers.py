@@ -1,8 +1,8 @@
-"""report.json: the numbers of the page, under the names of OpenSfM's and ODM's stats.json where they have one.
+"""Collect the numbers of report.json and of the page, named as in OpenSfM's and ODM's stats.json where they are there.
 
 https://github.com/mapillary/OpenSfM (opensfm/stats.py) and https://github.com/OpenDroneMap/ODM (stages/odm_report.py)
-say what their names mean. What they have no name for stands under "tidefield". Lengths are metres (World units where
-nothing placed the model on the Earth), null is unknown.
+define these names. Numbers without one are under "tidefield". Lengths are metres (model units without a georeference),
+null is unknown.
 """
 
 from __future__ import annotations
@@ -12,30 +12,33 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+import pycolmap
 
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
-from tidefield.survey.report.findings import Findings, LeftOut, Residuals
-from tidefield.survey.report.lenses import lenses
+from tidefield.survey.report.findings import Comparison, Findings, UnusedPhotograph
 from tidefield.survey.report.remarks import remarks
 from tidefield.survey.report.statistics import Statistics
+from tidefield.survey.survey import Photograph
 
 Numbers = dict[str, Any]
 
 CLASSES = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 11), (12, 19), (20, None))  # photographs that see a piece of ground
 _OPENSFM_TIME = "%d/%m/%Y at %H:%M:%S"
+_OPENSFM_NAMES = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y", "k": "k1"}
+_IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 _OPENSFM_ERRORS = {"gps": "gps_errors", "control": "gcp_errors", "check": "check_errors"}
 
 
 def numbers(findings: Findings, statistics: Statistics) -> Numbers:
-    """All numbers of a report, ready for JSON: plain Python values, None for what is unknown."""
-    gps = [r for r in findings.residuals if r.kind == "gps"]
+    """Collect all numbers of a report, ready for JSON: plain Python values, None for what is unknown."""
+    comparisons = findings.comparisons()
     table: Numbers = {
         "processing_statistics": _processing(findings, statistics),
         "features_statistics": {
             "detected_features": _spread(statistics.block.detected),
             "reconstructed_features": _spread(statistics.observed),
         },
-        "reconstruction_statistics": _reconstruction(findings, statistics, bool(gps)),
+        "reconstruction_statistics": _reconstruction(findings, statistics),
         "camera_errors": {camera["name"]: camera["opensfm"] for camera in lenses(statistics)},
         "odm_processing_statistics": {
             "total_time": sum(findings.seconds.values(), 0.0),
@@ -46,12 +49,12 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
         "tidefield": _ours(findings, statistics),
     }
     for kind, name in _OPENSFM_ERRORS.items():
-        table[name] = next((_opensfm_errors(r) for r in findings.residuals if r.kind == kind), {})
+        table[name] = next((_opensfm_errors(r) for r in comparisons if r.kind == kind), {})
     return plain(table)
 
 
 def duration(seconds: float) -> str:
-    """A time span in words: 42 s, 3 min 20 s, 2 h 5 min."""
+    """Format a time span: 42 s, 3 min 20 s, 2 h 5 min."""
     if seconds < 60:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
     whole = round(seconds)
@@ -59,7 +62,7 @@ def duration(seconds: float) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The same of Python's own types, with None for every number that is not finite."""
+    """Convert NumPy values to Python's, with None for every number that is not finite."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
@@ -88,15 +91,16 @@ def _capture(findings: Findings) -> tuple[datetime | None, datetime | None]:
     return datetime.fromtimestamp(min(times), UTC), datetime.fromtimestamp(max(times), UTC)  # the camera's own clock
 
 
-def _reconstruction(findings: Findings, statistics: Statistics, has_gps: bool) -> Numbers:
+def _reconstruction(findings: Findings, statistics: Statistics) -> Numbers:
+    kinds = {comparison.kind for comparison in findings.comparisons()}
     lengths, counts = np.unique(statistics.track_length, return_counts=True)
     error = statistics.error_px[np.isfinite(statistics.error_px)]
     histogram, edges = np.histogram(error, 30, (0, max(np.percentile(error, 99.5), 1e-6) if len(error) else 1))
     longer = statistics.track_length[statistics.track_length > 2]
     return {
         "components": max(len(findings.models), 1),
-        "has_gps": has_gps,
-        "has_gcp": any(r.kind == "control" for r in findings.residuals),
+        "has_gps": "gps" in kinds,
+        "has_gcp": "control" in kinds,
         "initial_shots_count": len(findings.survey.photographs),
         "reconstructed_shots_count": len(statistics.block),
         "reconstructed_points_count": len(statistics.block.points),
@@ -109,8 +113,8 @@ def _reconstruction(findings: Findings, statistics: Statistics, has_gps: bool) -
     }
 
 
-def _opensfm_errors(residuals: Residuals) -> Numbers:
-    errors = residuals.east_north_up_m[residuals.used]
+def _opensfm_errors(comparison: Comparison) -> Numbers:
+    errors = comparison.residuals.error_m[comparison.used]
     if not len(errors):
         return {}
     horizontal, vertical = np.linalg.norm(errors[:, :2], axis=1), np.abs(errors[:, 2])
@@ -123,7 +127,7 @@ def _opensfm_errors(residuals: Residuals) -> Numbers:
         "ce90": np.percentile(horizontal, 90),
         "le90": np.percentile(vertical, 90),
         "count": len(errors),
-        "not_used": int((~residuals.used).sum()),
+        "not_used": int((~comparison.used).sum()),
         "rms_horizontal": np.hypot(rms[0], rms[1]),
         "rms_vertical": rms[2],
         "largest_horizontal": horizontal.max(),
@@ -160,7 +164,7 @@ def _ours(findings: Findings, statistics: Statistics) -> Numbers:
             "per_photograph": _spread(statistics.mean_px),
         },
         "cameras": [{key: value for key, value in camera.items() if key != "opensfm"} for camera in lenses(statistics)],
-        "residuals": [_residuals(residuals) for residuals in findings.residuals],
+        "residuals": [_residuals(comparison) for comparison in findings.comparisons()],
         "colour": None
         if colour is None
         else {
@@ -177,7 +181,7 @@ def _ours(findings: Findings, statistics: Statistics) -> Numbers:
 
 
 def crs_title(frame: LocalFrame) -> str:
-    """Name and code of the system that results are given in."""
+    """Name and code of the coordinate reference system of the results."""
     name = parse_crs(frame.crs).name
     return f"{name} (EPSG:{frame.epsg})" if frame.epsg else name
 
@@ -212,18 +216,18 @@ def _coverage(statistics: Statistics) -> Numbers:
     }
 
 
-def _residuals(residuals: Residuals) -> Numbers:
-    rows = zip(residuals.names, residuals.east_north_up_m, residuals.used, strict=True)
+def _residuals(comparison: Comparison) -> Numbers:
+    rows = zip(comparison.residuals.names, comparison.residuals.error_m, comparison.used, strict=True)
     return {
-        "kind": residuals.kind,
-        "title": residuals.title,
-        **_opensfm_errors(residuals),
-        "remarks": residuals.remarks,
+        "kind": comparison.kind,
+        "title": comparison.title,
+        **_opensfm_errors(comparison),
+        "remarks": comparison.remarks,
         "each": [{"name": n, "east": e[0], "north": e[1], "up": e[2], "used": used} for n, e, used in rows],
     }
 
 
-def _left_out(lost: LeftOut) -> Numbers:
+def _left_out(lost: UnusedPhotograph) -> Numbers:
     return {"name": lost.name, "stage": lost.stage, "reason": lost.reason, "measures": lost.measures}
 
 
@@ -252,3 +256,68 @@ def _spread(values: np.ndarray) -> Numbers:
     if not len(known):
         return {"min": None, "max": None, "mean": None, "median": None}
     return {"min": known.min(), "max": known.max(), "mean": known.mean(), "median": np.median(known)}
+
+
+def lenses(statistics: Statistics) -> list[dict[str, Any]]:
+    """Describe every lens: estimate and prior, in pixels with COLMAP's names and (`opensfm`) in OpenSfM's units."""
+    found: list[dict[str, Any]] = []
+    for index, camera in enumerate(statistics.block.cameras):
+        mine = np.flatnonzero(statistics.block.lens == index)
+        photograph = next((p for p in (statistics.photographs[i] for i in mine) if p is not None), None)
+        label = (photograph.camera if photograph else "") or "camera"
+        if any(other["name"] == label for other in found):
+            label = f"{label} ({index + 1})"
+        names = [name.strip() for name in camera.params_info.split(",")]
+        found.append(
+            {
+                "name": label,
+                "photographs": len(mine),
+                "width": camera.width,
+                "height": camera.height,
+                "model": camera.model_name,
+                "parameters": dict(zip(names, camera.params, strict=True)),
+                "focal_px": camera.mean_focal_length(),
+                **_prior(photograph, camera),
+                "corner_distortion_px": _corner_distortion(camera),
+                "opensfm": {
+                    "initial_values": _initial(photograph, camera),
+                    "optimized_values": _normalised(camera, names),
+                },
+            }
+        )
+    return found
+
+
+def _prior(photograph: Photograph | None, camera: pycolmap.Camera) -> dict[str, Any]:
+    if photograph is None or photograph.lens is None:
+        return {"prior_focal_px": None, "prior_source": None}
+    scale = camera.width / photograph.width  # the model's images may be smaller than the originals
+    return {"prior_focal_px": photograph.lens.focal_px * scale, "prior_source": photograph.lens.source}
+
+
+def _initial(photograph: Photograph | None, camera: pycolmap.Camera) -> dict[str, float]:
+    if photograph is None or photograph.lens is None:
+        return {}
+    focal = photograph.lens.focal_px / max(photograph.width, photograph.height)
+    known = {"focal_x": focal, "focal_y": focal}
+    if photograph.lens.distortion:
+        known |= dict(zip(("k1", "k2", "p1", "p2", "k3"), photograph.lens.distortion, strict=True))
+    return known
+
+
+def _normalised(camera: pycolmap.Camera, names: list[str]) -> dict[str, float]:
+    """Focal lengths, and offsets of the principal point from the middle, by the image's longer side."""
+    side = max(camera.width, camera.height)
+    middle = {"cx": camera.width / 2, "cy": camera.height / 2}
+    values = {}
+    for name, value in zip(names, camera.params, strict=True):
+        values[_OPENSFM_NAMES.get(name, name)] = (value - middle.get(name, 0)) / side if name in _IN_PIXELS else value
+    return values
+
+
+def _corner_distortion(camera: pycolmap.Camera) -> float:
+    """Largest displacement of an image corner by the distortion, in pixels."""
+    corners = np.array([(0, 0), (camera.width, 0), (0, camera.height), (camera.width, camera.height)], dtype=float)
+    straight = np.asarray(camera.cam_from_img(corners)) * (camera.focal_length_x, camera.focal_length_y)
+    straight += (camera.principal_point_x, camera.principal_point_y)
+    return float(np.linalg.norm(straight - corners, axis=1).max())

@@ -1,48 +1,50 @@
-"""report.html: one page without scripts and without anything from the network, of the numbers in report.json."""
+"""Render report.html from the numbers of report.json: one page without scripts and without network requests."""
 
 from __future__ import annotations
 
+import base64
+import io
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jaxtyping import UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from PIL import Image
 
-from tidefield.survey.report.charts import Bars, Scatter, bars, histogram, scatter
-from tidefield.survey.report.findings import Findings, LeftOut
-from tidefield.survey.report.graticule import spaced
-from tidefield.survey.report.map import draw_map
+from tidefield.survey.report.figures import COLOURS, draw_bars, draw_histogram, draw_map, draw_residuals, spaced
+from tidefield.survey.report.findings import Findings, UnusedPhotograph
 from tidefield.survey.report.numbers import Numbers, duration
-from tidefield.survey.report.pictures import COLOURS, thumbnail_uri
 from tidefield.survey.report.statistics import Statistics
 
 MOST_THUMBNAILS = 24  # of each stage
 MOST_EXAMPLES = 4
 MOST_ROWS = 24  # a longer list opens on a click
-LONGEST_TRACK = 20  # the bars beyond are put together
+LONGEST_TRACK = 20  # longer ones share a bar
 EXAMPLE_PX = 320
+THUMBNAIL_PX = 160
+JPEG_QUALITY = 72
 UNKNOWN, MINUS = "\u2013", "\u2212"
 STAGES = {
     "reading": "Could not be read",
-    "quality": "Left out for their quality",
-    "poses": "Found no place in the model",
+    "quality": "Rejected for their quality",
+    "poses": "Could not be registered",
 }
 
 
 def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
-    """The page as HTML; every name in it is escaped."""
+    """Render the page as HTML; every name in it is escaped."""
     environment = Environment(
         loader=PackageLoader("tidefield.survey.report", "templates"),
-        autoescape=select_autoescape(("html", "svg"), default=True),
+        autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters |= _formats(findings.frame is not None)
-    template = environment.get_template("page.html")
-    return template.render(
+    return environment.get_template("page.html").render(
         n=numbers,
         made=f"{findings.date:%Y-%m-%d %H:%M} {findings.date.tzname() or ''}".strip(),
         ours=numbers["tidefield"],
@@ -58,7 +60,7 @@ def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
 
 
 def _formats(located: bool) -> dict[str, Callable[..., Any]]:
-    """Filters that write numbers, each inside a `data` element with the value that report.json holds."""
+    """Filters that format numbers, each inside a `data` element with its value in report.json."""
 
     def written(value: float | int | None, text: Callable[[float], str]) -> str | Markup:
         if value is None:
@@ -94,42 +96,53 @@ def _formats(located: bool) -> dict[str, Callable[..., Any]]:
         "plainly": lambda value, digits, scale=1: UNKNOWN if value is None else f"{scale * value:.{digits}f}",
         "parameter": lambda value: written(value, lambda v: spaced(v, 2 if abs(v) >= 10 else 6)),
         "duration": lambda value: written(value, duration),
-        "px": lambda value: f"{value:.1f}".removesuffix(".0"),
     }
 
 
 def _significant(value: float) -> str:
-    """Three digits that count."""
+    """Format with three significant digits."""
     return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}" if value else "0"
 
 
-def _charts(statistics: Statistics, located: bool) -> list[Bars]:
+def _charts(statistics: Statistics, located: bool) -> list[tuple[str, Markup]]:
+    """Titles and charts; those without values are left out."""
     lengths = np.bincount(np.minimum(statistics.track_length, LONGEST_TRACK), minlength=4)[2:]
     edges = np.arange(2, 3 + len(lengths)) - 0.5
     scale, unit, digits = (100, "cm/px", 2) if located else (1, "units/px", 4)
     beyond = f" ({LONGEST_TRACK}: or more)" if len(lengths) + 1 == LONGEST_TRACK else ""
-    found = [
-        histogram("Reprojection errors", "px", statistics.error_px, 2),
-        bars("Track lengths", "photographs that see a point" + beyond, lengths.tolist(), edges.tolist()),
-        histogram("Ground sampling distances", f"{unit}, one value per photograph", scale * statistics.gsd, digits),
-        histogram("Points per photograph", "points", statistics.observed.astype(np.float64), 0),
-        histogram("Forward overlap", "% of the photograph", 100 * statistics.overlap.forward, 0),
-        histogram("Side overlap", "% of the photograph", 100 * statistics.overlap.side, 0),
+    observed = statistics.observed.astype(np.float64)
+    charts = [
+        ("Reprojection errors", "error (px)", "observations", statistics.error_px, 2),
+        (
+            "Ground sampling distances",
+            f"of each photograph ({unit})",
+            "photographs",
+            scale * statistics.gsd,
+            digits,
+        ),
+        ("Points per photograph", "points", "photographs", observed, 0),
+        ("Forward overlap", "share of the photograph (%)", "photographs", 100 * statistics.overlap.forward, 0),
+        ("Side overlap", "share of the photograph (%)", "photographs", 100 * statistics.overlap.side, 0),
     ]
-    return [chart for chart in found if chart]
+    found = [(chart[0], draw_histogram(*chart)) for chart in charts]
+    title, axis = "Track lengths", f"photographs that see a point{beyond}"
+    found.insert(1, (title, draw_bars(title, axis, "points", lengths.tolist(), edges.tolist(), None)))
+    return [(title, chart) for title, chart in found if chart]
 
 
-def _scatters(findings: Findings) -> list[Scatter]:
-    found = [scatter(residuals, "m") for residuals in findings.residuals]
-    return [chart for chart in found if chart]
+def _scatters(findings: Findings) -> list[tuple[str, Markup]]:
+    found = [(comparison.title, draw_residuals(comparison)) for comparison in findings.comparisons()]
+    return [(title, chart) for title, chart in found if chart]
 
 
-def _lost(left_out: tuple[LeftOut, ...]) -> list[tuple[str, list[tuple[LeftOut, str]], list[LeftOut]]]:
-    """By stage, what was lost there: the first with thumbnails, and the others."""
+def _lost(
+    left_out: tuple[UnusedPhotograph, ...],
+) -> list[tuple[str, list[tuple[UnusedPhotograph, str]], list[UnusedPhotograph]]]:
+    """Group photographs by the stage that left them out: the first with thumbnails, and the others."""
     groups = []
     for stage, heading in STAGES.items():
-        pictured: list[tuple[LeftOut, str]] = []
-        others: list[LeftOut] = []
+        pictured: list[tuple[UnusedPhotograph, str]] = []
+        others: list[UnusedPhotograph] = []
         for lost in (lost for lost in left_out if lost.stage == stage):
             if lost.thumbnail is not None and len(pictured) < MOST_THUMBNAILS:
                 pictured.append((lost, thumbnail_uri(lost.thumbnail)))
@@ -143,3 +156,12 @@ def _lost(left_out: tuple[LeftOut, ...]) -> list[tuple[str, list[tuple[LeftOut, 
 def _examples(findings: Findings) -> list[tuple[str, str, str]]:
     examples = findings.colour.examples[:MOST_EXAMPLES] if findings.colour else ()
     return [(e.name, thumbnail_uri(e.before, EXAMPLE_PX), thumbnail_uri(e.after, EXAMPLE_PX)) for e in examples]
+
+
+def thumbnail_uri(picture: UInt8[np.ndarray, "h w 3"], side_px: int = THUMBNAIL_PX) -> str:
+    """Encode a JPEG of at most `side_px` a side as a data URI."""
+    image = Image.fromarray(picture)
+    image.thumbnail((side_px, side_px))
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=JPEG_QUALITY, optimize=True)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""What a reader should know before relying on the results, said by rules whose limits are written here."""
+"""Warn of weak surveys, by the limits that are written here."""
 
 from __future__ import annotations
 
@@ -7,29 +7,25 @@ import numpy as np
 from tidefield.survey.report.findings import Findings
 from tidefield.survey.report.statistics import Statistics
 
-THIN_SHARE = 0.7  # of the area: less seen by three photographs is called thin
-LOW_FORWARD, LOW_SIDE = 0.6, 0.4  # what flight planning asks for, at the least
+THIN_SHARE = 0.7  # of the area, seen by three photographs
+LOW_FORWARD, LOW_SIDE = 0.6, 0.4  # the least of what flight planning asks for
 LARGE_ERROR_PX = 1.0
 FOCAL_CHANGE = 0.05
 TILT_DEG = 30.0
 
 
 def remarks(findings: Findings, statistics: Statistics) -> list[str]:
-    """Whole sentences: the pipeline's own first."""
-    said = list(findings.remarks)
-    said += _placement(findings)
-    said += _geometry(statistics)
-    said += _lens(statistics)
-    return said
+    """List warnings as whole sentences: those of the pipeline first."""
+    return [*findings.remarks, *_georeference(findings), *_geometry(statistics), *_lens(statistics)]
 
 
-def _placement(findings: Findings) -> list[str]:
+def _georeference(findings: Findings) -> list[str]:
     if findings.frame is None:
         return [
-            "Nothing says where on the Earth the model lies or how large it is: lengths are in its own unit, and its "
-            "ground plane was taken for level."
+            "The model has no georeference and no scale: lengths are in its own unit, and its ground plane is assumed "
+            "to be level."
         ]
-    kinds = {residuals.kind for residuals in findings.residuals}
+    kinds = {comparison.kind for comparison in findings.comparisons()}
     if not kinds & {"control", "check"}:
         return [
             "No surveyed points were used: the model is as well placed as the receiver's positions are, and their "
@@ -41,11 +37,11 @@ def _placement(findings: Findings) -> list[str]:
 
 
 def _geometry(statistics: Statistics) -> list[str]:
-    said = []
+    found = []
     coverage = statistics.coverage
     share = coverage.area(3) / max(coverage.area(1), 1e-12)
     if share < THIN_SHARE:
-        said.append(
+        found.append(
             f"Only {share:.0%} of the area is seen by three photographs or more; where fewer see it, heights are weak "
             "or unknown."
         )
@@ -57,15 +53,15 @@ def _geometry(statistics: Statistics) -> list[str]:
     ):
         known = values[np.isfinite(values) & ~oblique]
         if len(known) and np.median(known) < least:
-            said.append(f"The {name} overlap, {np.median(known):.0%} (median), is under the usual {least:.0%}.")
+            found.append(f"The {name} overlap, {np.median(known):.0%} (median), is under the usual {least:.0%}.")
     error = statistics.error_px[np.isfinite(statistics.error_px)]
     if len(error) and error.mean() > LARGE_ERROR_PX:
-        said.append(f"The reprojection error, {error.mean():.2f} px, is high: it should stay under a pixel.")
-    return said
+        found.append(f"The reprojection error, {error.mean():.2f} px, is high: it should stay under a pixel.")
+    return found
 
 
 def _lens(statistics: Statistics) -> list[str]:
-    said = []
+    found = []
     for index, camera in enumerate(statistics.block.cameras):
         mine = (statistics.photographs[i] for i in np.flatnonzero(statistics.block.lens == index))
         photograph = next((p for p in mine if p is not None and p.lens is not None), None)
@@ -73,8 +69,8 @@ def _lens(statistics: Statistics) -> list[str]:
             continue
         change = camera.mean_focal_length() / (photograph.lens.focal_px * camera.width / photograph.width) - 1
         if abs(change) > FOCAL_CHANGE:
-            said.append(
+            found.append(
                 f"The focal length came out {change:+.0%} from what {photograph.lens.source} says: flat ground seen "
                 "straight down cannot tell focal length from height, so check the flight height."
             )
-    return said
+    return found

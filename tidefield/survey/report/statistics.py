@@ -1,4 +1,4 @@
-"""What the reconstruction says of the survey: resolution, heights, coverage, overlap and errors, per photograph."""
+"""Measure a reconstruction: resolution, heights, coverage, overlap and errors, per photograph."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int
+from shapely import Polygon
 
 from tidefield.survey.report.block import Block, read_block
 from tidefield.survey.report.coverage import Coverage, Overlap, cover, overlap
@@ -16,15 +17,15 @@ from tidefield.survey.survey import Photograph
 
 @dataclass(frozen=True)
 class Statistics:
-    """Measures of a model; lengths in metres where it lies on the Earth, else in its own unit; NaN where unknown.
+    """Measures of a model; lengths in metres where it has a georeference, else in its own unit; NaN where unknown.
 
     Attributes:
-        block: the model that they are of.
+        block: the model as arrays.
         photographs: what was read of each registered photograph; None if it is not in the survey.
         order: registered photographs in the order of the flight: by time, or by name where times are missing.
         gsd: ground sampling distance of every photograph: median over its points of z-depth / focal length.
         height: of every camera above the ground beneath.
-        footprints: what each covers of the ground, counter-clockwise x and y.
+        footprints: what each covers of the ground, counter-clockwise x and y; empty if it sees none.
         coverage: how many photographs see each piece of ground.
         overlap: what each shares with its neighbours.
         error_px: reprojection error of every observation.
@@ -38,7 +39,7 @@ class Statistics:
     order: Int[np.ndarray, " N"]
     gsd: Float64[np.ndarray, " N"]
     height: Float64[np.ndarray, " N"]
-    footprints: tuple[Float64[np.ndarray, "_ 2"], ...]
+    footprints: tuple[Polygon, ...]
     coverage: Coverage
     overlap: Overlap
     error_px: Float64[np.ndarray, " O"]
