@@ -15,13 +15,13 @@ import pycolmap
 from tidefield import __version__
 from tidefield.data.georeference import Georeference
 from tidefield.survey import report
-from tidefield.survey.colour import Evening
+from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.georeference.alignment import camera_centres
 from tidefield.survey.io.pictures import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.report.page import MOST_THUMBNAILS
-from tidefield.survey.sfm.features import opened, real_name
-from tidefield.survey.sfm.lens_choice import told
+from tidefield.survey.sfm.features import decode_name
+from tidefield.survey.sfm.mapping import lens_notes
 from tidefield.survey.survey import Photograph
 
 THUMBNAIL_PX = 200
@@ -50,7 +50,7 @@ def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> rep
             "pycolmap": pycolmap.__version__,
             "Python": platform.python_version(),
         },
-        remarks=(*located.notes, *told(prepared.lens), *prepared.survey.remarks),
+        remarks=(*located.notes, *lens_notes(prepared.lens), *prepared.survey.remarks),
     )
 
 
@@ -141,8 +141,8 @@ def _why(photograph: Photograph, features: int, matches: list[int], elsewhere: d
 def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
     """Features of every photograph, and how many agree with each other photograph that any agree with."""
     matches: dict[str, list[int]] = {}
-    with opened(database) as db:
-        names = {image.image_id: real_name(image.name) for image in db.read_all_images()}
+    with pycolmap.Database.open(database) as db:
+        names = {image.image_id: decode_name(image.name) for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in names.items()}
         for pair, inliers in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
             if inliers:
@@ -152,7 +152,7 @@ def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
 
 
 def _colour(prepared: Prepared, scene: Path) -> report.ColourEvening | None:
-    evening = prepared.evening
+    evening = prepared.correction
     if evening is None or math.isnan(evening.before):
         return None
     unit = "% of a pixel's value"
@@ -174,7 +174,7 @@ def _colour(prepared: Prepared, scene: Path) -> report.ColourEvening | None:
     return report.ColourEvening(evening.helps, verdict, tuple(changes), _examples(prepared, scene, evening))
 
 
-def _examples(prepared: Prepared, scene: Path, evening: Evening) -> tuple[report.ColourExample, ...]:
+def _examples(prepared: Prepared, scene: Path, evening: ExposureCorrection) -> tuple[report.ColourExample, ...]:
     if not evening.helps:
         return ()
     by_name = {photograph.name: photograph for photograph in prepared.survey.photographs}
