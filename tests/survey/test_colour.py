@@ -1,4 +1,4 @@
-"""Gains and falloff are found where there are some, and left alone where there are none."""
+"""Gains and falloff are estimated where they exist, and photographs without them stay unchanged."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ import torch
 from tidefield.data.images import Photographs
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.survey.colour import estimate_evening, evened
+from tidefield.survey.colour import estimate_correction, to_common_exposure
 
 FALLOFF = np.array([-0.9, 0.3, 0.0])
 GAINS = np.exp(np.random.default_rng(1).normal(0, 0.2, (12, 3)))
@@ -37,24 +37,26 @@ def shaded(gains: np.ndarray, falloff: np.ndarray) -> Scene:
 
 def test_gains_and_falloff_are_found():
     scene = shaded(GAINS, FALLOFF)
-    evening = estimate_evening(scene, [0] * 12)
-    assert evening.helps
-    assert evening.sees_falloff
-    assert evening.after < evening.gains_alone < 0.5 * evening.before
-    relative = np.log(evening.gain / GAINS)
+    correction = estimate_correction(scene, [0] * 12)
+    assert correction.helps
+    assert correction.sees_falloff
+    assert correction.after < correction.gains_alone < 0.5 * correction.before
+    relative = np.log(correction.gain / GAINS)
     np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.02)
     r = tangent(scene, 0)
-    found, true = (np.stack([r**2, r**4, r**6], -1) @ f for f in (evening.falloff[0], FALLOFF))
+    found, true = (np.stack([r**2, r**4, r**6], -1) @ f for f in (correction.falloff[0], FALLOFF))
     np.testing.assert_allclose((found - found.min()) - (true - true.min()), 0, atol=0.03)
 
 
-def test_evened_photographs_agree():
+def test_corrected_photographs_agree():
     scene = shaded(GAINS, FALLOFF)
-    evening = estimate_evening(scene, [0] * 12)
+    correction = estimate_correction(scene, [0] * 12)
     flat = shaded(np.ones((12, 3)), np.zeros(3))
     ratios = []
     for k in range(12):
-        ours = evened(scene.photographs[k].numpy(), evening.gain[k], evening.falloff[k], tangent(scene, k))
+        ours = to_common_exposure(
+            scene.photographs[k].numpy(), correction.gain[k], correction.falloff[k], tangent(scene, k)
+        )
         ratios.append(
             (ours.astype(float).mean((0, 1)) + 1) / (flat.photographs[k].numpy().astype(float).mean((0, 1)) + 1)
         )
@@ -63,38 +65,38 @@ def test_evened_photographs_agree():
 
 
 def test_photographs_that_agree_are_left_alone():
-    evening = estimate_evening(shaded(np.ones((12, 3)), np.zeros(3)), [0] * 12)
-    assert not evening.helps
-    assert not evening.sees_falloff
-    np.testing.assert_array_equal(evening.gain, 1)
-    np.testing.assert_array_equal(evening.falloff, 0)
+    correction = estimate_correction(shaded(np.ones((12, 3)), np.zeros(3)), [0] * 12)
+    assert not correction.helps
+    assert not correction.sees_falloff
+    np.testing.assert_array_equal(correction.gain, 1)
+    np.testing.assert_array_equal(correction.falloff, 0)
 
 
 def test_gains_without_falloff_see_no_falloff():
-    evening = estimate_evening(shaded(GAINS, np.zeros(3)), [0] * 12)
-    assert evening.helps
-    np.testing.assert_allclose(evening.falloff, 0, atol=0.05)
+    correction = estimate_correction(shaded(GAINS, np.zeros(3)), [0] * 12)
+    assert correction.helps
+    np.testing.assert_allclose(correction.falloff, 0, atol=0.05)
 
 
 def test_each_lens_has_its_own_falloff():
     light, dark = shaded(GAINS, np.zeros(3)), shaded(GAINS, FALLOFF)
     mixed = tuple((dark if k % 2 else light).photographs[k] for k in range(12))
-    evening = estimate_evening(replace(light, photographs=Photographs(mixed)), [k % 2 for k in range(12)])
-    assert evening.sees_falloff
+    correction = estimate_correction(replace(light, photographs=Photographs(mixed)), [k % 2 for k in range(12)])
+    assert correction.sees_falloff
     r = 0.5
-    without, with_falloff = (evening.falloff[k] @ [r**2, r**4, r**6] for k in (0, 1))
+    without, with_falloff = (correction.falloff[k] @ [r**2, r**4, r**6] for k in (0, 1))
     assert with_falloff - without == pytest.approx(FALLOFF @ [r**2, r**4, r**6], abs=0.04)
 
 
 def test_without_points_nothing_is_done():
-    evening = estimate_evening(replace(shaded(GAINS, FALLOFF), points=None), [0] * 12)
-    assert not evening.helps
-    np.testing.assert_array_equal(evening.gain, 1)
+    correction = estimate_correction(replace(shaded(GAINS, FALLOFF), points=None), [0] * 12)
+    assert not correction.helps
+    np.testing.assert_array_equal(correction.gain, 1)
 
 
 def test_a_gain_is_divided_out_and_rounded():
     picture = np.full((2, 2, 3), 100, dtype=np.uint8)
     r = np.array([[0.0, 0.5], [0.5, 1.0]])
-    result = evened(picture, np.array([2.0, 1.0, 0.3]), np.array([-0.1, 0.0, 0.0]), r)
+    result = to_common_exposure(picture, np.array([2.0, 1.0, 0.3]), np.array([-0.1, 0.0, 0.0]), r)
     assert result[0, 0].tolist() == [50, 100, 255]
     assert result[1, 1, 1] == round(100 * np.exp(0.1))

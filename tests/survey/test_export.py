@@ -1,3 +1,5 @@
+"""`transforms.json` describes the same scene as the COLMAP model, for nerfstudio."""
+
 import json
 import os
 from dataclasses import replace
@@ -23,7 +25,7 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def exported(root: Path, truth: Truth) -> dict[str, Any]:
-    """Write a COLMAP scene and its transforms beside the model; the transforms as they are in the file."""
+    """Write a COLMAP scene and its transforms; return the content of the file."""
     model = pycolmap.Reconstruction(str(write_colmap(root, truth)))
     write_transforms(root, model)
     return json.loads((root / "transforms.json").read_text())
@@ -36,7 +38,7 @@ def points_of(root: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("truth", [survey(BARREL), survey(PINHOLE), with_one_larger(survey(BARREL))])
-def test_transforms_read_back_are_the_model(tmp_path: Path, truth: Truth) -> None:
+def test_transforms_round_trip(tmp_path: Path, truth: Truth) -> None:
     top = exported(tmp_path, truth)
     assert ("fl_x" in top) == (len(set(truth.lenses)) == 1)
     assert all(("fl_x" in frame) != ("fl_x" in top) for frame in top["frames"])
@@ -48,7 +50,7 @@ def test_transforms_read_back_are_the_model(tmp_path: Path, truth: Truth) -> Non
     np.testing.assert_allclose(posed.cloud_world, points_of(tmp_path), rtol=1e-6)
 
 
-def test_both_descriptions_hold_out_the_same_photographs(tmp_path: Path) -> None:
+def test_transforms_hold_out_the_same_photographs_as_the_model(tmp_path: Path) -> None:
     top = exported(tmp_path, survey(PINHOLE))
     scene = load_scene(tmp_path)  # of the model, which comes first
     assert scene.points is not None
@@ -62,7 +64,7 @@ def test_both_descriptions_hold_out_the_same_photographs(tmp_path: Path) -> None
     assert (alone.names, alone.train, alone.test) == (scene.names, scene.train, scene.test)
 
 
-def test_a_nerfstudio_camera_sees_points_where_colmaps_does(tmp_path: Path) -> None:
+def test_nerfstudios_cameras_project_points_as_colmaps_do(tmp_path: Path) -> None:
     top = exported(tmp_path, survey(BARREL))
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     for frame in top["frames"]:
@@ -71,7 +73,7 @@ def test_a_nerfstudio_camera_sees_points_where_colmaps_does(tmp_path: Path) -> N
         seen = [point for point in image.points2D if point.has_point3D()]
         xyz = np.array([[*model.points3D[point.point3D_id].xyz, 1] for point in seen])
         x, y, z = (xyz @ np.linalg.inv(frame["transform_matrix"]).T)[:, :3].T
-        assert (z < 0).all()  # OpenGL's cameras look along -z, and their y axis points up
+        assert (z < 0).all()  # OpenGL: -z forward, +y up
         a, b = x / -z, -y / -z
         r2 = a * a + b * b
         d = 1 + top["k1"] * r2 + top["k2"] * r2**2 + top["k3"] * r2**3
@@ -80,7 +82,7 @@ def test_a_nerfstudio_camera_sees_points_where_colmaps_does(tmp_path: Path) -> N
         np.testing.assert_allclose(np.stack([u, v], -1), [point.xy for point in seen], atol=1e-6)
 
 
-def test_no_term_of_a_lens_is_lost(tmp_path: Path) -> None:
+def test_all_terms_of_distortion_are_written(tmp_path: Path) -> None:
     lens = replace(BARREL, k3=0.01)
     model = pycolmap.Reconstruction(str(write_colmap(tmp_path, survey(BARREL))))
     camera = next(iter(model.cameras.values()))
@@ -90,7 +92,7 @@ def test_no_term_of_a_lens_is_lost(tmp_path: Path) -> None:
     assert set(read_transforms(tmp_path, False).lenses) == {lens}
 
 
-def test_coordinates_as_large_as_a_map_projections_are_written_small(tmp_path: Path) -> None:
+def test_large_coordinates_are_reduced(tmp_path: Path) -> None:
     truth = survey(BARREL, offset=UTM)
     top = exported(tmp_path, truth)
     posed = read_transforms(tmp_path, False)
@@ -103,7 +105,7 @@ def test_coordinates_as_large_as_a_map_projections_are_written_small(tmp_path: P
     np.testing.assert_allclose(posed.cloud_world, points_of(tmp_path) + applied[:, 3], atol=1e-6)
 
 
-def test_small_coordinates_stay_as_they_are_and_axes_are_left_alone_on_request(tmp_path: Path) -> None:
+def test_small_coordinates_stay_unchanged_and_orientation_is_fixed_on_request(tmp_path: Path) -> None:
     top = exported(tmp_path, survey(BARREL))
     assert top["applied_transform"] == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert "orientation_override" not in top
@@ -139,7 +141,7 @@ def test_photographs_without_a_pose_are_left_out(tmp_path: Path) -> None:
     assert names == {f"images/{image.name}" for i, image in model.images.items() if i != 3}
 
 
-def test_what_is_there_is_not_overwritten_unasked(tmp_path: Path) -> None:
+def test_files_are_overwritten_only_on_request(tmp_path: Path) -> None:
     exported(tmp_path, survey(PINHOLE))
     before = (tmp_path / "transforms.json").read_bytes()
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
@@ -153,7 +155,7 @@ def test_what_is_there_is_not_overwritten_unasked(tmp_path: Path) -> None:
     assert (tmp_path / "transforms.json").read_bytes() == before
 
 
-def test_cameras_that_cannot_be_expressed_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_unsupported_cameras_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(write_colmap(tmp_path, survey(PINHOLE))))
     camera = next(iter(model.cameras.values()))
     camera.model, camera.params = pycolmap.CameraModelId.OPENCV_FISHEYE, [*camera.params, 0, 0, 0, 0]

@@ -1,4 +1,4 @@
-"""Features and cameras in the database: what is known of lenses enters, and what is there is not done again."""
+"""Features and cameras are written to the database once, cameras with their priors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from located_surveys import unlocated_photograph
 from PIL import Image
 
 from tidefield.errors import DeviceError
-from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, first_camera, lens_groups, opened
+from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, initial_camera, lens_groups
 from tidefield.survey.survey import LensPrior, Photograph
 
 OPTIONS, CPU = FeatureOptions(side_px=400, count=200), pycolmap.Device.cpu
@@ -37,7 +37,7 @@ def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs
     assert calls[-1] == (3, 3)
     assert total > halved > 0
     for name in ("a.db", "b.db"):
-        with opened(tmp_path / name) as db:
+        with pycolmap.Database.open(tmp_path / name) as db:
             for image in db.read_all_images():
                 keypoints = np.asarray(db.read_keypoints(image.image_id))
                 assert (np.diff(keypoints[:, 2]) <= 0).all()
@@ -47,12 +47,12 @@ def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs
                 assert np.asarray(db.read_descriptors(image.image_id).data).shape == (len(keypoints), 128)
 
 
-def test_what_is_in_the_database_is_kept_and_the_rest_is_added(wall_photographs: list[Photograph], tmp_path: Path):
+def test_extraction_continues_where_it_was_interrupted(wall_photographs: list[Photograph], tmp_path: Path):
     calls: list[tuple[int, int]] = []
     extract(wall_photographs[:2], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
     extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: calls.append((done, whole)))
     assert calls == [(3, 3)]
-    with opened(tmp_path / "a.db") as db:
+    with pycolmap.Database.open(tmp_path / "a.db") as db:
         assert db.num_images() == 3
         assert db.num_cameras() == db.num_rigs() == 1
         assert db.num_frames() == 3
@@ -66,17 +66,17 @@ def test_photographs_of_one_camera_size_and_zoom_share_a_lens():
     assert lens_groups(own) == [0, 1, 2, 3, 0]
 
 
-def test_a_nominal_focal_length_is_a_prior_and_none_is_a_guess():
+def test_a_nominal_focal_length_is_a_prior_and_the_default_is_not():
     known = replace(unlocated_photograph(0, None), lens=LensPrior(350.0, None, None, "EXIF", trusted=False))
-    assert first_camera(known).has_prior_focal_length
-    assert first_camera(known).params.tolist() == [350, 350, 200, 150, 0, 0, 0, 0]
-    assert not first_camera(unlocated_photograph(0, None)).has_prior_focal_length
-    assert first_camera(unlocated_photograph(0, None)).focal_length_x == 480
+    assert initial_camera(known).has_prior_focal_length
+    assert initial_camera(known).params.tolist() == [350, 350, 200, 150, 0, 0, 0, 0]
+    assert not initial_camera(unlocated_photograph(0, None)).has_prior_focal_length
+    assert initial_camera(unlocated_photograph(0, None)).focal_length_x == 480
 
 
-def test_the_makers_calibration_acts_as_its_five_terms_do():
+def test_the_initial_camera_approximates_the_makers_five_term_distortion():
     lens = LensPrior(400.0, (210.0, 140.0), (-0.4, 0.37, 0.002, -0.001, -0.26), "maker", trusted=True)
-    camera = first_camera(replace(unlocated_photograph(0, None), lens=lens))
+    camera = initial_camera(replace(unlocated_photograph(0, None), lens=lens))
     assert camera.params[:4].tolist() == [400, 400, 210, 140]
     xy = np.array([[x, y] for x in np.linspace(-0.5, 0.45, 7) for y in np.linspace(-0.35, 0.35, 5)])
     k1, k2, p1, p2, k3 = lens.distortion
@@ -89,7 +89,7 @@ def test_the_makers_calibration_acts_as_its_five_terms_do():
     assert np.abs(found - true).max() < 0.35
 
 
-def test_a_device_that_pycolmap_does_not_have_is_an_error():
+def test_an_unsupported_device_is_an_error():
     assert choose_device("auto") == pycolmap.Device.auto
     assert choose_device("cpu") == pycolmap.Device.cpu
     with pytest.raises(DeviceError, match="expected one of auto, cpu"):

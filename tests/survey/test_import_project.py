@@ -45,7 +45,7 @@ def write_project(root: Path, kind: str = "brown", tracks: bool = True) -> None:
 
 
 def assert_same(own: Scene, other: Scene) -> None:
-    """The same but for what no scene on disk can say."""
+    """Compare what a scene on disk stores."""
     assert own.names == other.names
     for part in ("T_world_camera", "focal_px", "principal_px", "size_px"):
         torch.testing.assert_close(getattr(own.cameras, part), getattr(other.cameras, part))
@@ -56,7 +56,7 @@ def assert_same(own: Scene, other: Scene) -> None:
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize("truth", [survey(BARREL), with_one_larger(survey(BARREL)), survey(PINHOLE, offset=UTM)])
-def test_a_colmap_scene_is_imported_as_it_is(tmp_path: Path, truth: Truth, text: bool) -> None:
+def test_a_colmap_scene_is_imported_unchanged(tmp_path: Path, truth: Truth, text: bool) -> None:
     write_colmap(tmp_path / "theirs", truth, text)
     made = import_project(tmp_path / "theirs", tmp_path / "ours")
     theirs, ours = read_posed(tmp_path / "theirs", False), read_posed(tmp_path / "ours", False)
@@ -76,7 +76,7 @@ def test_a_colmap_scene_is_imported_as_it_is(tmp_path: Path, truth: Truth, text:
 
 
 @pytest.mark.parametrize("kind", ["perspective", "brown", "radial"])
-def test_an_opensfm_project_becomes_a_colmap_model_that_agrees_with_itself(tmp_path: Path, kind: str) -> None:
+def test_an_opensfm_project_becomes_a_consistent_colmap_model(tmp_path: Path, kind: str) -> None:
     write_project(tmp_path / "project", kind)
     made = import_project(tmp_path / "project", tmp_path / "scene")
     model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
@@ -92,7 +92,7 @@ def test_an_opensfm_project_becomes_a_colmap_model_that_agrees_with_itself(tmp_p
     assert_same(load_scene(tmp_path / "scene"), load_scene(tmp_path / "project"))
 
 
-def test_points_that_nobody_is_known_to_have_seen_are_kept(tmp_path: Path) -> None:
+def test_points_without_observations_are_kept(tmp_path: Path) -> None:
     write_project(tmp_path / "project", tracks=False)
     made = import_project(tmp_path / "project", tmp_path / "scene")
     assert (made.points, made.observations) == (600, 0)
@@ -107,9 +107,7 @@ def test_points_that_nobody_is_known_to_have_seen_are_kept(tmp_path: Path) -> No
     assert set(map(tuple, own.tolist())) == truth
 
 
-def test_scenes_of_other_layouts_are_imported_and_told_what_is_lost(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_other_layouts_are_imported_with_a_warning_of_losses(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_transforms(tmp_path / "nerfstudio", survey(BARREL))
     write_llff(tmp_path / "llff", survey(PINHOLE))
     write_blender(tmp_path / "blender", {"train": 6, "test": 3})
@@ -117,12 +115,12 @@ def test_scenes_of_other_layouts_are_imported_and_told_what_is_lost(
         for layout in ("nerfstudio", "llff", "blender"):
             import_project(tmp_path / layout, tmp_path / f"{layout}-scene")
             assert_same(load_scene(tmp_path / f"{layout}-scene"), load_scene(tmp_path / layout))
-    told = [record.getMessage() for record in caplog.records]
-    assert [Path(message.split()[0]).name for message in told] == ["llff", "blender", "blender"]
-    assert sum("every eighth held out instead" in message for message in told) == 1
+    warnings = [record.getMessage() for record in caplog.records]
+    assert [Path(message.split()[0]).name for message in warnings] == ["llff", "blender", "blender"]
+    assert sum("holds out every eighth photograph instead" in message for message in warnings) == 1
 
 
-def test_a_georeferenced_project_hands_on_where_it_is(tmp_path: Path) -> None:
+def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     assert import_project(tmp_path / "project", tmp_path / "a").georeference is None
     (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
@@ -157,7 +155,7 @@ def test_photographs_are_copied_or_linked_untouched(tmp_path: Path) -> None:
         assert not link.is_symlink()
 
 
-def test_photographs_reduced_beside_their_model_get_cameras_of_their_size(tmp_path: Path) -> None:
+def test_cameras_are_scaled_to_reduced_photographs(tmp_path: Path) -> None:
     truth = survey(BARREL)
     write_colmap(tmp_path / "theirs", truth)
     for name in truth.names:
@@ -172,7 +170,7 @@ def test_photographs_reduced_beside_their_model_get_cameras_of_their_size(tmp_pa
         import_project(tmp_path / "theirs", tmp_path / "refused")
 
 
-def test_names_of_windows_become_folders(tmp_path: Path) -> None:
+def test_backslashes_in_names_become_folders(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     write_colmap(tmp_path / "theirs", replace(truth, names=tuple(name.replace("/", "\\") for name in truth.names)))
     shutil.rmtree(tmp_path / "theirs" / "images")
@@ -182,7 +180,7 @@ def test_names_of_windows_become_folders(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "ours").names == tuple(sorted(truth.names))
 
 
-def test_a_photograph_named_twice_is_refused(tmp_path: Path) -> None:
+def test_a_photograph_listed_twice_is_refused(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     write_transforms(tmp_path / "theirs", replace(truth, names=(*truth.names[:8], truth.names[0])))
     with pytest.raises(SceneError, match=r"strip_0/photo_8\.png twice"):
@@ -199,7 +197,7 @@ def test_missing_photographs_are_left_out_on_request(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path / "scene").names) == 8
 
 
-def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     (tmp_path / "scene").mkdir()
     with pytest.raises(RunError, match=r"scene is there already: expected a new name; choose one$"):
@@ -207,7 +205,7 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     assert os.listdir(tmp_path / "scene") == []
 
 
-def test_an_import_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_import_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_project(tmp_path / "project")
 
     def stumble(*_: object) -> None:
@@ -226,7 +224,7 @@ def test_an_import_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     assert os.listdir(tmp_path) == ["project"]
 
 
-def test_a_folder_that_cannot_be_written_to_is_one_clear_error(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_an_error(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="cannot be written"):

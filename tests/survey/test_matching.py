@@ -1,12 +1,157 @@
-"""Pairs of photographs are matched and verified once."""
+"""Pairs are chosen by positions, times and their largest features; they are matched and verified once."""
 
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+import torch
+from located_surveys import unlocated_photograph
+from torch import Tensor
 
-from tidefield.survey.sfm.features import opened
-from tidefield.survey.sfm.matching import match
+from tidefield.survey.sfm.matching import (
+    EXHAUSTIVE,
+    MAX_ANGLE_RAD,
+    MAX_PAIRS,
+    MAX_RATIO,
+    MIN_PAIRS,
+    NEIGHBOURS,
+    PREVIEW,
+    SEQUENTIAL,
+    candidate_pairs,
+    match,
+    match_descriptors,
+    preview_descriptors,
+    select_pairs,
+)
+from tidefield.survey.survey import Photograph
+
+
+def lawnmower(rows: int, columns: int) -> list[Photograph]:
+    """Photographs 20 m apart along lines 30 m apart, flown back and forth."""
+    made = []
+    for row in range(rows):
+        for column in range(columns) if row % 2 == 0 else reversed(range(columns)):
+            made.append(unlocated_photograph(len(made), 54 + 30 * row / 111_000, 20 * column / 65_000))
+    return made
+
+
+def test_few_photographs_are_all_paired():
+    photographs = [unlocated_photograph(k, None) for k in range(EXHAUSTIVE)]
+    assert candidate_pairs(photographs) == list(combinations(range(EXHAUSTIVE), 2))
+
+
+def test_number_of_candidates_is_linear_with_positions():
+    small, large = lawnmower(8, 10), lawnmower(20, 100)
+    assert len(candidate_pairs(large)) < 1.3 * len(candidate_pairs(small)) * len(large) / len(small)
+    assert len(candidate_pairs(large)) <= len(large) * (NEIGHBOURS + SEQUENTIAL)
+
+
+def test_near_photographs_are_paired_and_far_ones_are_not():
+    flight = lawnmower(20, 20)
+    pairs = set(candidate_pairs(flight))
+    position = np.array(
+        [[p.position.latitude_deg * 111_000, p.position.longitude_deg * 65_000] for p in flight if p.position]
+    )
+    for i, j in combinations(range(len(flight)), 2):
+        apart = np.linalg.norm(position[i] - position[j])
+        if apart < 45:
+            assert (i, j) in pairs
+        if apart > 200 and j - i > SEQUENTIAL:
+            assert (i, j) not in pairs
+
+
+def test_fields_far_apart_are_not_paired():
+    here = lawnmower(4, 5)
+    there = [
+        replace(p, time_s=p.time_s + 1e6, position=replace(p.position, latitude_deg=55.0)) for p in here if p.position
+    ]
+    also = [
+        replace(p, time_s=p.time_s + 2e6, position=replace(p.position, latitude_deg=56.0)) for p in here if p.position
+    ]
+    pairs = candidate_pairs([*here, *there, *also])
+    assert not [pair for pair in pairs if pair[0] // 20 != pair[1] // 20]
+    assert len([pair for pair in pairs if pair[1] < 20]) > 100
+
+
+def test_a_photograph_without_position_is_paired_with_all():
+    flight = lawnmower(10, 10)
+    flight[37] = replace(flight[37], position=None)
+    pairs = set(candidate_pairs(flight))
+    assert all((min(37, k), max(37, k)) in pairs for k in range(100) if k != 37)
+
+
+def test_consecutive_photographs_are_paired_whatever_their_positions():
+    flight = lawnmower(10, 10)
+    assert flight[50].position is not None
+    flight[50] = replace(flight[50], position=replace(flight[50].position, latitude_deg=-10.0))
+    pairs = set(candidate_pairs(flight))
+    assert {(49, 50), (50, 51), (48, 50), (50, 52)} <= pairs
+
+
+def test_a_long_pause_ends_the_sequence():
+    field = [unlocated_photograph(k, 54 + 20 * k / 111_000) for k in range(30)]
+    later = [unlocated_photograph(30 + k, 54.5 + 20 * k / 111_000, time_s=3600.0 + k) for k in range(30)]
+    assert not [pair for pair in candidate_pairs([*field, *later]) if pair[0] < 30 <= pair[1]]
+    timeless = [replace(one, time_s=float("nan")) for one in (*field, *later)]
+    assert {(28, 30), (29, 30), (29, 31)} <= set(candidate_pairs(timeless))
+
+
+def test_pairs_whose_largest_features_match_are_selected_with_the_best_of_each_photograph():
+    rng, count = np.random.default_rng(0), 40
+    # Photograph k shares half of its features with k + 1.
+    ground = rng.integers(0, 255, (count + 1, PREVIEW // 2, 128)).astype(np.uint8)
+    table = preview_descriptors([np.concatenate([ground[k], ground[k + 1]]) for k in range(count)])
+    kept = select_pairs(list(combinations(range(count), 2)), table, lambda done, whole: None)
+    assert {(k, k + 1) for k in range(count - 1)} <= set(kept)
+    assert len(kept) <= count * MAX_PAIRS / 2
+    partners = [sum(k in pair for pair in kept) for k in range(count)]
+    assert min(partners) >= MIN_PAIRS
+
+
+def test_previews_are_padded_with_zeros():
+    table = preview_descriptors([np.full((3, 128), 9, dtype=np.uint8), np.zeros((0, 128), dtype=np.uint8)])
+    assert table.shape == (2, PREVIEW, 128)
+    assert table[0, :3].norm(dim=1).allclose(table.new_ones(3))
+    assert (table[0, 3:] == 0).all()
+    assert select_pairs([(0, 1)], table, lambda done, whole: None) == [(0, 1)]
+
+
+def unit(count: int, seed: int) -> Tensor:
+    values = torch.rand(count, 128, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(values**4, dim=1)
+
+
+def brute_force(ours: Tensor, theirs: Tensor) -> list[int]:
+    angle = (ours @ theirs.T).clamp(-1, 1).acos()
+    result = []
+    for i, row in enumerate(angle):
+        first, second = row.sort().values[:2].tolist()
+        j = int(row.argmin())
+        stands_out = first < MAX_RATIO * second and first < MAX_ANGLE_RAD
+        result.append(j if stands_out and int(angle[:, j].argmin()) == i else -1)
+    return result
+
+
+def test_descriptors_match_as_by_brute_force():
+    ours, strangers = unit(60, 0), unit(30, 1)
+    noisy = torch.nn.functional.normalize(ours[10:50] + 0.03 * unit(40, 2), dim=1)
+    theirs = torch.cat([strangers, noisy, ours[:1], ours[:1]])  # the last two are alike: nothing stands out
+    found = match_descriptors(ours, theirs)
+    assert found.tolist() == brute_force(ours, theirs)
+    assert found[0] == -1
+    assert (found[10:50] == torch.arange(30, 70)).float().mean() > 0.9
+
+
+def test_batched_matching_equals_single_pairs():
+    first, second = torch.stack([unit(20, 0), unit(20, 1)]), torch.stack([unit(25, 0), unit(25, 1)])
+    together = match_descriptors(first, second)
+    assert torch.equal(together, torch.stack([match_descriptors(a, b) for a, b in zip(first, second, strict=True)]))
+
+
+def test_zeros_match_nothing():
+    assert (match_descriptors(torch.zeros(4, 128), unit(6, 0)) == -1).all()
 
 
 def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
@@ -15,7 +160,7 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4, num_points3D=200
     )
-    with opened(path) as db:
+    with pycolmap.Database.open(path) as db:
         model = pycolmap.synthesize_dataset(options, db)
         descriptors = {number: rng.integers(0, 255, (128,)) for number in model.point3D_ids()}
         db.clear_matches()
@@ -39,5 +184,5 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
     )
     assert again[0] == 3
     assert calls[-1] == (3, 3)
-    with opened(path) as db:
+    with pycolmap.Database.open(path) as db:
         assert len(db.read_all_matches()[0]) == 3

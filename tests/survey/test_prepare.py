@@ -23,11 +23,11 @@ from tidefield.survey.report import write_report
 from tidefield.survey.sfm.features import FeatureOptions
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
-WISHES = PrepareOptions(features=FeatureOptions(count=1500))
+OPTIONS = PrepareOptions(features=FeatureOptions(count=1500))
 
 
-def run(folder: Path, scene: Path, wishes: PrepareOptions = WISHES) -> Prepared:
-    return prepare(read_survey(folder), scene, wishes, pycolmap.Device.cpu, Console(quiet=True))
+def run(folder: Path, scene: Path, options: PrepareOptions = OPTIONS) -> Prepared:
+    return prepare(read_survey(folder), scene, options, pycolmap.Device.cpu, Console(quiet=True))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def made(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 
 
 def position_error_m(scene: Path, flight: Flight) -> np.ndarray:
-    """How far the cameras lie from the truth, by way of longitude and latitude."""
+    """Distance of the cameras from the truth, through geographic coordinates."""
     located = read_georeference(scene)
     assert located is not None
     assert located.frame is not None
@@ -52,7 +52,7 @@ def position_error_m(scene: Path, flight: Flight) -> np.ndarray:
     return np.array([centres[name] for name in flight.names]) - truth
 
 
-def test_every_photograph_is_placed_in_metres_where_it_was_taken(made: tuple[Path, Prepared], flight: Flight):
+def test_all_cameras_are_at_their_true_positions(made: tuple[Path, Prepared], flight: Flight):
     scene, prepared = made
     assert prepared.models == [sorted(flight.names)]
     assert np.abs(position_error_m(scene, flight)).max() < 0.15
@@ -62,28 +62,28 @@ def test_every_photograph_is_placed_in_metres_where_it_was_taken(made: tuple[Pat
     assert camera.focal_length_x == pytest.approx(FOCAL, rel=0.01)
 
 
-def test_the_scene_loads_with_its_split_and_colours_that_agree(made: tuple[Path, Prepared]):
+def test_the_scene_loads_with_its_split_and_consistent_colours(made: tuple[Path, Prepared]):
     scene, prepared = made
     loaded = load_scene(scene)
     assert len(loaded.train) + len(loaded.test) == 12
     assert loaded.points is not None
-    assert prepared.evening is not None
-    assert prepared.evening.helps
-    assert prepared.evening.after < 0.4 * prepared.evening.before
-    relative = np.log(prepared.evening.gain / GAINS)
+    assert prepared.correction is not None
+    assert prepared.correction.helps
+    assert prepared.correction.after < 0.4 * prepared.correction.before
+    relative = np.log(prepared.correction.gain / GAINS)
     np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.03)
-    # What is left for the loader to even out is next to nothing.
+    # What is left for the loader to correct is next to nothing.
     assert loaded.cameras.gain.log().abs().max() < 0.05
 
 
-def test_nerfstudio_finds_the_same_photographs(made: tuple[Path, Prepared]):
+def test_transforms_list_the_same_photographs(made: tuple[Path, Prepared]):
     scene, _ = made
     written = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
     assert {frame["file_path"] for frame in written["frames"]} == {f"images/flight {k:03d}.jpg" for k in range(12)}
     assert (scene / written["ply_file_path"]).exists()
 
 
-def test_the_report_tells_what_was_found(made: tuple[Path, Prepared]):
+def test_the_report_shows_the_results(made: tuple[Path, Prepared]):
     scene, prepared = made
     report = write_report(findings(prepared, scene, {"colour": "auto"}), scene)
     table = json.loads(report.table.read_text(encoding="utf-8"))
@@ -94,7 +94,7 @@ def test_the_report_tells_what_was_found(made: tuple[Path, Prepared]):
     assert "flight 003.jpg" in report.page.read_text(encoding="utf-8")
 
 
-def test_nothing_is_done_twice_and_a_changed_option_redoes_only_what_depends_on_it(
+def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends_on_it(
     made: tuple[Path, Prepared], flight: Flight, tmp_path: Path
 ):
     scene = shutil.copytree(made[0], tmp_path / "scene")
@@ -103,26 +103,26 @@ def test_nothing_is_done_twice_and_a_changed_option_redoes_only_what_depends_on_
     assert again.models == made[1].models
     unchanged = {path for path, at in before.items() if path.stat().st_mtime_ns == at}
     assert unchanged >= set(before) - {scene / "prepare" / "stages.json"}
-    plain = run(flight.folder, scene, replace(WISHES, colour="off"))
-    assert plain.evening is None
+    plain = run(flight.folder, scene, replace(OPTIONS, colour="off"))
+    assert plain.correction is None
     assert (scene / "prepare" / "database.db").stat().st_mtime_ns == before[scene / "prepare" / "database.db"]
     name = flight.names[0]
     assert (scene / "images" / name).read_bytes() == (flight.folder / name).read_bytes()
     assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
 
 
-def test_a_stage_that_was_broken_off_goes_on(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import tidefield.survey.sfm.features as features
 
-    original, written = features._write, []
+    original, written = features._write_features, []
 
-    def breaks_at_the_seventh(db, photograph, *rest):
+    def interrupt_at_the_seventh(db, photograph, *rest):
         written.append(photograph.name)
         if len(written) == 7:
             raise KeyboardInterrupt
         original(db, photograph, *rest)
 
-    monkeypatch.setattr(features, "_write", breaks_at_the_seventh)
+    monkeypatch.setattr(features, "_write_features", interrupt_at_the_seventh)
     with pytest.raises(KeyboardInterrupt):
         run(flight.folder, tmp_path / "scene")
     prepared = run(flight.folder, tmp_path / "scene")
@@ -130,26 +130,26 @@ def test_a_stage_that_was_broken_off_goes_on(flight: Flight, tmp_path: Path, mon
     assert written == [*flight.names[:7], *flight.names[6:]]
 
 
-def test_photographs_of_two_places_make_the_larger_one_and_name_the_others(flight: Flight, tmp_path: Path):
+def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(flight: Flight, tmp_path: Path):
     folder = shutil.copytree(flight.folder, tmp_path / "both")
     other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
     prepared = run(folder, tmp_path / "scene")
     assert prepared.models[0] == sorted(flight.names)
-    told = {item.name: item.reason for item in findings(prepared, tmp_path / "scene", {}).left_out}
-    assert set(told) == set(other.names)
+    reasons = {item.name: item.reason for item in findings(prepared, tmp_path / "scene", {}).left_out}
+    assert set(reasons) == set(other.names)
     if len(prepared.models) > 1:
         assert set(prepared.models[1]) <= set(other.names)
-        assert "of a place that nothing connects" in told[prepared.models[1][0]]
+        assert "of a place that nothing connects" in reasons[prepared.models[1][0]]
 
 
-def test_photographs_that_show_nothing_in_common_are_an_error(tmp_path: Path):
+def test_photographs_without_overlap_are_an_error(tmp_path: Path):
     for k in range(4):
         fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=k)
     with pytest.raises(SurveyError, match="overlap"):
         run(tmp_path / "card", tmp_path / "scene")
 
 
-def test_a_folder_with_something_else_in_it_is_left_alone(flight: Flight, tmp_path: Path):
+def test_a_folder_with_other_content_is_left_alone(flight: Flight, tmp_path: Path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(RunError, match="something else"):
@@ -164,7 +164,7 @@ def test_a_folder_with_something_else_in_it_is_left_alone(flight: Flight, tmp_pa
         run(flight.folder, tmp_path / "file")
 
 
-def test_rotated_photographs_stand_upright_in_the_scene(flight: Flight, tmp_path: Path):
+def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: Path):
     from PIL import ExifTags, Image
 
     folder = shutil.copytree(flight.folder, tmp_path / "card")
@@ -174,7 +174,7 @@ def test_rotated_photographs_stand_upright_in_the_scene(flight: Flight, tmp_path
             table[ExifTags.Base.Orientation] = 6  # upright after a quarter turn clockwise
             turned = picture.transpose(Image.Transpose.ROTATE_90)
             turned.save(folder / name, quality=95, exif=table)
-    prepared = run(folder, tmp_path / "scene", replace(WISHES, colour="off"))
+    prepared = run(folder, tmp_path / "scene", replace(OPTIONS, colour="off"))
     assert len(prepared.models[0]) == 12
     for name in flight.names[:2]:
         with Image.open(tmp_path / "scene" / "images" / name) as picture:

@@ -1,4 +1,4 @@
-"""Stages are done once, redone with what follows when something changes, and go on where they were broken off."""
+"""Stages run once, run again with all that follow when something changes, and continue after an interruption."""
 
 import json
 import time
@@ -11,7 +11,7 @@ from tidefield.survey.stages import Facts, Stages, interruptible
 
 
 class Pipeline:
-    """Three stages that write down when they run."""
+    """Three stages that record when they run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.ran = folder, []
@@ -32,6 +32,15 @@ class Pipeline:
         return self.ran
 
 
+def test_keys_of_earlier_versions_stay_valid(tmp_path: Path):
+    """A stage that an earlier version completed, by its key on disk, is not repeated."""
+    record = {"key": "8e4aa3b88e3e5600", "done": True, "seconds": 2.5, "facts": {"a": 1}}
+    (tmp_path / "stages.json").write_text(json.dumps({"quality": record}))
+    stages = Stages(tmp_path, [["a.jpg", 1, 2, "None", "None"]])
+    assert stages.run("quality", {}, [], lambda resume: {"a": 2}) == {"a": 1}
+    assert stages.seconds == {"quality": 2.5}
+
+
 @pytest.fixture
 def pipeline(tmp_path: Path) -> Pipeline:
     made = Pipeline(tmp_path)
@@ -39,30 +48,30 @@ def pipeline(tmp_path: Path) -> Pipeline:
     return made
 
 
-def test_what_is_done_is_not_repeated(pipeline: Pipeline):
+def test_complete_stages_are_not_repeated(pipeline: Pipeline):
     assert pipeline.run() == []
 
 
-def test_a_changed_option_redoes_its_stage_and_what_follows(pipeline: Pipeline):
+def test_a_changed_option_repeats_its_stage_and_all_that_follow(pipeline: Pipeline):
     assert pipeline.run(two=1) == ["two", "three"]
     assert pipeline.run(two=1) == []
     assert pipeline.run(two=1, three=5) == ["three"]
 
 
-def test_other_photographs_redo_everything(pipeline: Pipeline):
+def test_other_photographs_repeat_all_stages(pipeline: Pipeline):
     assert pipeline.run("others") == ["one", "two", "three"]
 
 
-def test_a_stage_can_be_asked_for_again(pipeline: Pipeline):
+def test_a_stage_can_be_repeated_on_request(pipeline: Pipeline):
     assert pipeline.run(redo="two") == ["two", "three"]
 
 
-def test_an_output_that_was_removed_is_made_again(pipeline: Pipeline):
+def test_a_removed_output_is_made_again(pipeline: Pipeline):
     (pipeline.folder / "two.txt").unlink()
     assert pipeline.run() == ["two"]
 
 
-def test_a_broken_off_stage_is_told_that_it_may_go_on_and_its_time_adds_up(tmp_path: Path):
+def test_an_interrupted_stage_continues_and_its_times_add_up(tmp_path: Path):
     def breaks(resume: bool) -> Facts:
         assert not resume
         time.sleep(0.05)
@@ -76,7 +85,7 @@ def test_a_broken_off_stage_is_told_that_it_may_go_on_and_its_time_adds_up(tmp_p
     assert changed.run("long", 2, [], lambda resume: {"resumed": resume}) == {"resumed": False}
 
 
-def test_a_damaged_record_is_an_error_that_says_what_to_do(tmp_path: Path):
+def test_a_damaged_record_is_an_error(tmp_path: Path):
     for text in ("{", "[]", json.dumps({"one": 3})):
         (tmp_path / "stages.json").write_text(text)
         with pytest.raises(RunError, match="remove"):
@@ -92,7 +101,7 @@ def test_a_long_job_can_be_interrupted():
     assert interruptible(lambda token: 3) == 3
 
 
-def test_a_folder_that_cannot_be_written_to_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_unwritable_folder_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -1,1 +1,1 @@
-"""From photographs as the camera wrote them to a Scene on disk."""
+"""Make a Scene on disk from drone photographs: quality, poses, georeference, colour, report."""

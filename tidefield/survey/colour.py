@@ -1,9 +1,9 @@
-"""Colour differences between photographs, and their removal (method.md, section 12).
+"""Estimate and remove exposure differences and lens falloff (docs/method.md, section 12).
 
-On display-referred values, what photograph i shows of sparse point p is the point's own colour times the photograph's
-gain times the lens' falloff towards the corners: log I_ip = g_i + f(r_ip) + a_p, with r the tangent of the angle to the
-optical axis and f(r) = k1 r^2 + k2 r^4 + k3 r^6. Whether gains and falloff help is judged on points that took no part
-in their estimate.
+In display values, photograph i shows the sparse point p with the point's own colour times the photograph's gain times
+the lens falloff towards the corners: log I_ip = g_i + f(r_ip) + a_p, with r the tangent of the angle to the optical
+axis and f(r) = k1 r^2 + k2 r^4 + k3 r^6. Whether gains and falloff help is decided on points that took no part in
+their estimate.
 """
 
 from __future__ import annotations
@@ -13,37 +13,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from scipy import sparse
 
 from tidefield.data.exposure import ITERATIONS, LOOSE, Seen, huber_weights, observe, robust_gains, weighted_gains
 from tidefield.data.scene import Scene
 
 HELPS = 0.97
-"""Gains are worth it where the photographs' disagreement falls to this share of what it was, ..."""
+"""Gains are applied if they reduce the photographs' disagreement to this share, ..."""
 FALLOFF_HELPS = 0.99
-"""... and a falloff where it falls by so much again."""
-
-Array = NDArray[np.float64]
+"""... and the falloff if it reduces the rest to this share."""
 
 
 @dataclass(frozen=True)
-class Evening:
-    """How photographs are brought to a common exposure.
+class ExposureCorrection:
+    """How photographs are brought to a common exposure. The names of the attributes are keys of `stages.json`.
 
     Attributes:
-        gain: V x 3, by which a photograph is brighter than the common exposure; ones where that does not help.
-        falloff: of each photograph's lens, k1, k2, k3 of f(r); zeros where none is seen.
-        before, gains_alone, after: how much photographs disagree about points that took no part in the estimate, as
-            the standard deviation of log colours (0.05 is 5% of a pixel's value): as they are, after division by gains,
-            and by the falloff too.
+        gain: brightness of each photograph relative to the common exposure, in the three channels; ones if `helps` is
+            false.
+        falloff: k1, k2, k3 of f(r) of each photograph's lens; zeros if `sees_falloff` is false.
+        before, gains_alone, after: disagreement of the photographs about points that took no part in the estimate:
+            uncorrected, after division by gains, and after division by gains and falloff. A standard deviation of log
+            colours: 0.05 is 5% of a pixel's value. NaN without such points.
         helps: whether gains are worth applying.
         sees_falloff: whether the falloff is.
     """
 
-    gain: Array
-    falloff: Array
+    gain: Float64[np.ndarray, "V 3"]
+    falloff: Float64[np.ndarray, "V 3"]
     before: float
     gains_alone: float
     after: float
@@ -51,21 +49,21 @@ class Evening:
     sees_falloff: bool
 
 
-def estimate_evening(scene: Scene, lenses: Sequence[int], always: bool = False) -> Evening:
-    """Gains and falloff of all photographs of a scene.
+def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = False) -> ExposureCorrection:
+    """Estimate the gains and the falloff of all photographs of a scene.
 
     Args:
-        scene: with sparse points; a small width is enough.
-        lenses: any number for each photograph's lens.
-        always: apply gains even where they do not help.
+        scene: with sparse points; a small width suffices.
+        lenses: a number for each photograph's lens.
+        always: apply gains even if they do not help.
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
     seen = observe(scene.photographs, scene.points, range(count)) if scene.points is not None else None
     if seen is None or not len(seen.value):
-        return Evening(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
+        return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
     power = _powers(scene, seen)
-    # Whole points, not observations: a point on both sides would carry what was learned across.
+    # Points are divided, not observations: a point in both halves would be estimated and tested at once.
     odd = np.random.default_rng(0).permutation(int(seen.point.max()) + 1)[seen.point] % 2 == 1
     halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
     scores = np.zeros((2, 3))
@@ -80,34 +78,33 @@ def estimate_evening(scene: Scene, lenses: Sequence[int], always: bool = False) 
     if not sees:
         gains, falloff = robust_gains(seen, np.zeros(count))[0], np.zeros_like(falloff)
     gain = np.exp(gains - gains.mean(0)) if helps else np.exp(nothing)
-    return Evening(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
+    return ExposureCorrection(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
 
 
-def evened(
+def to_common_exposure(
     photograph: UInt8[np.ndarray, "H W 3"],
     gain: Float64[np.ndarray, "3"],
     falloff: Float64[np.ndarray, "3"],
     tangent: Float[np.ndarray, "_ _"],
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A photograph at the common exposure, without its lens' falloff.
+    """Bring a photograph to the common exposure and remove the lens falloff.
 
     Args:
-        photograph: H x W x 3.
-        gain: 3.
         falloff: k1, k2, k3.
-        tangent: H x W, of the angle between each pixel's ray and the optical axis; 1 x 1 where there is no falloff.
+        tangent: of the angle between each pixel's ray and the optical axis, H x W; 1 x 1 without falloff.
     """
     shade = np.exp(_polynomial(tangent) @ falloff)[..., None]
     return np.clip(np.rint(photograph / (shade * gain)), 0, 255).astype(np.uint8)
 
 
 def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
+    """Compute r^2, r^4, r^6."""
     square = np.square(tangent)
     return np.stack([square, square**2, square**3], axis=-1)
 
 
-def _powers(scene: Scene, seen: Seen) -> Array:
-    """r^2, r^4, r^6 of every observation, O x 3."""
+def _powers(scene: Scene, seen: Seen) -> Float64[np.ndarray, "O 3"]:
+    """Compute r^2, r^4, r^6 of every observation."""
     assert scene.points is not None
     uv = scene.points.uv_px[torch.from_numpy(seen.row)].double()
     which = torch.from_numpy(seen.photograph)
@@ -115,21 +112,18 @@ def _powers(scene: Scene, seen: Seen) -> Array:
     return _polynomial(xy.norm(dim=1).numpy())
 
 
-def _part(seen: Seen, chosen: NDArray[np.bool_]) -> Seen:
-    return replace(
-        seen,
-        value=seen.value[chosen],
-        point=seen.point[chosen],
-        photograph=seen.photograph[chosen],
-        row=seen.row[chosen],
-    )
+def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
+    """Select some of the observations."""
+    return replace(seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row")})
 
 
-def _gains_and_falloff(seen: Seen, power: Array, lens: NDArray[np.int64], count: int) -> tuple[Array, Array]:
-    """Log gains V x 3 and falloff L x 3, the same in all channels, by iteratively reweighted least squares.
+def _gains_and_falloff(
+    seen: Seen, power: Float64[np.ndarray, "O 3"], lens: Int64[np.ndarray, " V"], count: int
+) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "L 3"]]:
+    """Estimate log gains, and the falloff common to all channels, by iteratively reweighted least squares.
 
-    Gains and points are eliminated first (Frisch and Waugh, 1933): what of the falloff's terms no gain can explain is
-    fitted to what of the colours none can.
+    Gains and points are eliminated first (Frisch and Waugh, 1933): the residuals of the colours after fitting gains are
+    regressed on the residuals of the falloff's terms.
     """
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
     terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)
@@ -142,15 +136,21 @@ def _gains_and_falloff(seen: Seen, power: Array, lens: NDArray[np.int64], count:
         rest = seen.centred(values - fitted[seen.photograph], weight)
         root = np.sqrt(weight)[:, None]
         x, y = root * rest[:, 3:], root[:, 0] * rest[:, :3].mean(1)
-        # The little ridge leaves a falloff that nothing shows at zero.
+        # The small ridge keeps an unobserved falloff at zero.
         falloff = np.linalg.solve(x.T @ x + 1e-6 * np.eye(3 * lenses), x.T @ y)
         gains = fitted[:, :3] - (fitted[:, 3:] @ falloff)[:, None]
         weight, _ = huber_weights(rest[:, :3] - (rest[:, 3:] @ falloff)[:, None])
     return gains, falloff.reshape(lenses, 3)
 
 
-def _spread(seen: Seen, power: Array, gains: Array, falloff: Array, lens: NDArray[np.int64]) -> float:
-    """Robust standard deviation of the log colours of the same points, after gains and falloff."""
+def _spread(
+    seen: Seen,
+    power: Float64[np.ndarray, "O 3"],
+    gains: Float64[np.ndarray, "V 3"],
+    falloff: Float64[np.ndarray, "L 3"],
+    lens: Int64[np.ndarray, " V"],
+) -> float:
+    """Estimate the standard deviation of the log colours of each point, after gains and falloff (robust: MAD)."""
     own = lens[seen.photograph]
     shade = (power * falloff[own]).sum(1)[:, None] if falloff.any() else 0.0
     residual = seen.centred(seen.value - gains[seen.photograph] - shade)
@@ -158,6 +158,6 @@ def _spread(seen: Seen, power: Array, gains: Array, falloff: Array, lens: NDArra
     return float(1.4826 * np.median(np.abs(residual * np.sqrt(sharing / (sharing - 1))[:, None])))
 
 
-def _darkens(falloff: Array, power: Array) -> bool:
-    """Whether the corners are darker than the middle, as lenses make them."""
+def _darkens(falloff: Float64[np.ndarray, "O 3"], power: Float64[np.ndarray, "O 3"]) -> bool:
+    """Check that the corners are darker than the centre, as with real lenses."""
     return bool((falloff * power).sum(1)[power[:, 0] >= np.quantile(power[:, 0], 0.95)].mean() < 0)

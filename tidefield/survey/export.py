@@ -1,30 +1,101 @@
-"""nerfstudio's `transforms.json` and point cloud beside a COLMAP model, so that `ns-train` opens the scene as it is.
-
-As nerfstudio's own conversion of COLMAP writes them, but for the world, which it turns so that its guess of up is z:
-here it stays the model's, and `applied_transform` is the identity. `train_filenames` and the like hold out the same
-photographs as Tidefield does. (https://docs.nerf.studio/quickstart/data_conventions.html)
-"""
+"""Write the files of a scene: photographs, upright and at the common exposure, and nerfstudio's `transforms.json`."""
 
 from __future__ import annotations
 
-import json
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, UInt8
+from PIL import ExifTags, Image
 
-from tidefield.data.cloud import write_cloud
 from tidefield.data.scene import every_eighth
+from tidefield.data.transforms_file import write_transforms_file
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens, lens_from_colmap
+from tidefield.geometry.lenses import lens_from_colmap
+from tidefield.machine import cores
+from tidefield.survey.colour import ExposureCorrection, to_common_exposure
+from tidefield.survey.io.image_decoding import upright
+from tidefield.survey.survey import Photograph
 
-TRANSFORMS_FILE = "transforms.json"
-CLOUD_FILE = "sparse_pc.ply"
+GRID_PX = 8
+"""Spacing of the pixels whose viewing angles are computed; between them they are interpolated."""
+JPEG_QUALITY = 95
+MAX_COORDINATE_M = 10_000.0
+"""nerfstudio computes in float32, which resolves 1 mm up to this distance from the origin."""
 
-# nerfstudio computes in float32 from the beginning, which tells apart 1 mm up to so many metres from the origin.
-_FARTHEST = 10_000.0
+
+def write_images(
+    photographs: Sequence[Photograph],
+    folder: Path,
+    correction: ExposureCorrection | None,
+    cameras: Sequence[pycolmap.Camera],
+    progress: Callable[[int, int], object],
+) -> None:
+    """Write photographs into a folder under their names, and remove everything else from it.
+
+    A file that needs no change is copied byte for byte.
+
+    Args:
+        correction: of these photographs, in this order; None leaves their colours as they are.
+        cameras: of each photograph; photographs of one lens share the object.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {folder / photograph.name for photograph in photographs}
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and path not in wanted:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+    if correction is not None and not correction.helps:
+        correction = None
+    has_falloff = correction is not None and correction.sees_falloff
+    tangents = {camera.camera_id: tangent_map(camera) for camera in cameras} if has_falloff else {}
+
+    def write(index: int) -> None:
+        photograph = photographs[index]
+        target = folder / photograph.name
+        if correction is None and photograph.orientation == 1:
+            with completed_file(target, overwrite=True) as partial:
+                shutil.copyfile(photograph.path, partial)
+            return
+        pixels = upright(photograph)
+        if correction is not None:
+            tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
+            pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
+        _save(pixels, photograph.path, target)
+
+    with ThreadPoolExecutor(cores()) as pool:
+        for done, _ in enumerate(pool.map(write, range(len(photographs))), start=1):
+            progress(done, len(photographs))
+
+
+def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
+    """Compute the tangent of the angle between each pixel's ray and the optical axis."""
+    # From the centre of the first pixel to that of the last, so that nothing is extrapolated.
+    columns, rows = (max(2, 1 + -(-size // GRID_PX)) for size in (camera.width, camera.height))
+    u, v = np.linspace(0.5, camera.width - 0.5, columns), np.linspace(0.5, camera.height - 0.5, rows)
+    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    grid = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1).reshape(rows, columns).astype(np.float32)
+    column = np.linspace(0, columns - 1, camera.width, dtype=np.float32)
+    row = np.linspace(0, rows - 1, camera.height, dtype=np.float32)
+    return cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR)
+
+
+def _save(pixels: UInt8[np.ndarray, "H W 3"], source: Path, target: Path) -> None:
+    """Write pixels in the format of the target's name, with the source's EXIF."""
+    with Image.open(source) as original:
+        exif = original.getexif()
+    exif[ExifTags.Base.Orientation] = 1
+    is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")
+    options: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if is_jpeg else {}
+    with completed_file(target, overwrite=True) as partial:
+        Image.fromarray(pixels).save(partial, exif=exif, **options)
 
 
 def write_transforms(
@@ -32,69 +103,41 @@ def write_transforms(
 ) -> None:
     """Write `transforms.json` and `sparse_pc.ply` of a model whose photographs are in `folder/images`.
 
-    Coordinates are the model's. Where these are too large for float32, a whole number is subtracted from each, which
-    `applied_transform` states, as nerfstudio has it: what was done to the original coordinates.
+    Every eighth photograph is held out, as `load_scene` does. Coordinates are the model's; coordinates too large for
+    float32 are reduced by whole numbers, which `applied_transform` states.
 
     Args:
         folder: the scene.
         model: cameras with Brown's distortion; photographs without a pose are left out.
-        z_is_up: whether the world's z axis points up: nerfstudio then leaves its axes alone.
-        overwrite: replace the files if they are there.
+        z_is_up: whether the world's z axis points up: nerfstudio then does not rotate the world.
+        overwrite: replace existing files.
 
     Raises:
-        SceneError: for a camera that nerfstudio's and our own lenses cannot express.
-        RunError: when a file is there already, or cannot be written.
+        SceneError: a camera model that nerfstudio's and our lenses cannot express.
+        RunError: a file exists already, or cannot be written.
     """
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     T_world_camera = np.array([image.cam_from_world().inverse().matrix() for image in images]).reshape(-1, 3, 4)
-    origin = _origin(T_world_camera[:, :, 3])
-    T_world_camera[:, :, 3] -= origin
-    lenses = {key: _lens(camera) for key, camera in model.cameras.items()}
-    calibrations = [_calibration(lenses[image.camera_id]) for image in images]
-    files = [f"images/{image.name}" for image in images]
-    one_for_all = len({lenses[image.camera_id] for image in images}) == 1
-    train, test = ([files[i] for i in part] for part in every_eighth(len(files)))
-    top: dict[str, Any] = {"camera_model": "OPENCV", **(calibrations[0] if one_for_all else {})}
-    if z_is_up:
-        top["orientation_override"] = "none"
-    top["applied_transform"] = np.column_stack([np.eye(3), 0.0 - origin]).tolist()
-    xyz_world, rgb = _points(model)
-    if len(xyz_world):
-        write_cloud(folder / CLOUD_FILE, xyz_world - origin, rgb, overwrite)
-        top["ply_file_path"] = CLOUD_FILE
-    top |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
-    top["frames"] = [
-        {"file_path": file, "transform_matrix": _opengl(pose), **({} if one_for_all else calibration)}
-        for file, pose, calibration in zip(files, T_world_camera, calibrations, strict=True)
-    ]
-    with completed_file(folder / TRANSFORMS_FILE, overwrite=overwrite) as partial:
-        partial.write_text(json.dumps(top, indent=1, allow_nan=False), encoding="utf-8")
-
-
-def _origin(position_world: Float64[np.ndarray, "V 3"]) -> Float64[np.ndarray, " 3"]:
-    """What is subtracted from coordinates: nothing, unless they are too large for float32."""
-    if len(position_world) == 0 or np.abs(position_world).max() <= _FARTHEST:
-        return np.zeros(3)
-    return np.round(position_world.mean(axis=0))
-
-
-def _lens(camera: pycolmap.Camera) -> Lens:
-    return lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params.tolist())
-
-
-def _calibration(lens: Lens) -> dict[str, int | float]:
-    size = {"w": lens.width, "h": lens.height}
-    pinhole = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    return {**size, **pinhole, **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=True))}
-
-
-def _opengl(pose: Float64[np.ndarray, "3 4"]) -> list[list[float]]:
-    """The same pose as 4 x 4 matrix, with OpenGL's camera axes (+x right, +y up, -z forward)."""
-    return [*(pose * (1, -1, -1, 1)).tolist(), [0.0, 0.0, 0.0, 1.0]]
-
-
-def _points(model: pycolmap.Reconstruction) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    position = T_world_camera[:, :, 3]
+    is_large = np.abs(position).max(initial=0.0) > MAX_COORDINATE_M
+    origin = np.round(position.mean(axis=0)) if is_large else np.zeros(3)
+    position -= origin
+    lenses = {
+        key: lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params.tolist())
+        for key, camera in model.cameras.items()
+    }
     points = [point for _, point in sorted(model.points3D.items()) if np.isfinite(point.xyz).all()]
-    xyz = np.array([point.xyz for point in points], dtype=np.float64)
-    rgb = np.array([point.color for point in points], dtype=np.uint8)
-    return xyz.reshape(-1, 3), rgb.reshape(-1, 3)
+    write_transforms_file(
+        folder,
+        [f"images/{image.name}" for image in images],
+        [lenses[image.camera_id] for image in images],
+        T_world_camera,
+        every_eighth(len(images)),
+        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3) - origin,
+        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        header={
+            **({"orientation_override": "none"} if z_is_up else {}),
+            "applied_transform": np.column_stack([np.eye(3), 0.0 - origin]).tolist(),
+        },
+        overwrite=overwrite,
+    )

@@ -14,12 +14,12 @@ import pycolmap
 
 from tidefield import __version__
 from tidefield.survey import report
-from tidefield.survey.colour import Evening
+from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.report.page import MOST_THUMBNAILS
-from tidefield.survey.sfm.features import opened, real_name
-from tidefield.survey.sfm.lens_choice import told
+from tidefield.survey.sfm.features import decode_name
+from tidefield.survey.sfm.mapping import lens_notes
 from tidefield.survey.survey import Photograph
 
 THUMBNAIL_PX = 200
@@ -46,7 +46,7 @@ def findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> rep
             "pycolmap": pycolmap.__version__,
             "Python": platform.python_version(),
         },
-        remarks=(*located.notes, *told(prepared.lens), *prepared.survey.remarks),
+        remarks=(*located.notes, *lens_notes(prepared.lens), *prepared.survey.remarks),
     )
 
 
@@ -97,8 +97,8 @@ def _why(photograph: Photograph, features: int, matches: list[int], elsewhere: d
 def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
     """Count the features of every photograph, and its verified matches with each photograph that it matches."""
     matches: dict[str, list[int]] = {}
-    with opened(database) as db:
-        names = {image.image_id: real_name(image.name) for image in db.read_all_images()}
+    with pycolmap.Database.open(database) as db:
+        names = {image.image_id: decode_name(image.name) for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in names.items()}
         for pair, inliers in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
             if inliers:
@@ -108,34 +108,34 @@ def _counts(database: Path) -> tuple[dict[str, int], dict[str, list[int]]]:
 
 
 def _colour(prepared: Prepared, scene: Path) -> report.ColourCorrection | None:
-    evening = prepared.evening
-    if evening is None or math.isnan(evening.before):
+    correction = prepared.correction
+    if correction is None or math.isnan(correction.before):
         return None
     unit = "% of a pixel's value"
     changes = [
         report.Change(
             "difference between photographs at points that took no part in the estimate",
-            100 * evening.before,
-            100 * min(evening.gains_alone, evening.after),
+            100 * correction.before,
+            100 * min(correction.gains_alone, correction.after),
             unit,
         )
     ]
-    vignetting = " and the vignetting of the lens was removed" if evening.sees_falloff else ""
+    vignetting = " and the vignetting of the lens was removed" if correction.sees_falloff else ""
     verdict = (
         f"Exposure and white balance were corrected{vignetting}; the brightest photograph had "
-        f"{evening.gain.max() / evening.gain.min():.1f} times the gain of the darkest."
-        if evening.helps
+        f"{correction.gain.max() / correction.gain.min():.1f} times the gain of the darkest."
+        if correction.helps
         else "The photographs agree as they are: their colours were not changed."
     )
-    return report.ColourCorrection(evening.helps, verdict, tuple(changes), _examples(prepared, scene, evening))
+    return report.ColourCorrection(correction.helps, verdict, tuple(changes), _examples(prepared, scene, correction))
 
 
-def _examples(prepared: Prepared, scene: Path, evening: Evening) -> tuple[report.ColourExample, ...]:
-    if not evening.helps:
+def _examples(prepared: Prepared, scene: Path, correction: ExposureCorrection) -> tuple[report.ColourExample, ...]:
+    if not correction.helps:
         return ()
     by_name = {photograph.name: photograph for photograph in prepared.survey.photographs}
     names = sorted(prepared.models[0])
-    change = np.abs(np.log(evening.gain)).mean(1)
+    change = np.abs(np.log(correction.gain)).mean(1)
     shown = []
     for k in np.argsort(-change)[:EXAMPLES]:
         before = by_name[names[k]]

@@ -1,4 +1,4 @@
-"""Scenes and projects of others, made into a Scene on disk: photographs, a COLMAP model, nerfstudio's transforms."""
+"""Import scenes and projects of other programs as a Scene on disk."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
 from tidefield.data.images import Progress
@@ -34,13 +35,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Imported:
-    """What an imported scene has.
+    """Contents of an imported scene.
 
     Attributes:
-        photographs: how many; `held_out` of them.
-        cameras: different lenses.
-        points: sparse points, with `observations` in photographs.
-        georeference: where on Earth the world is, where the project said so.
+        photographs, held_out: number of photographs, and of those held out.
+        cameras: number of different lenses.
+        points, observations: number of sparse points, and of their observations in photographs.
+        georeference: of the world, if the project states it.
     """
 
     photographs: int
@@ -59,27 +60,27 @@ def import_project(
     allow_missing: bool = False,
     progress: Progress | None = None,
 ) -> Imported:
-    """Make a Scene of anything that `load_scene` reads: photographs and poses stay as they are, float64 and undecoded.
+    """Make a Scene of anything that `load_scene` reads; photographs (undecoded) and poses (float64) stay unchanged.
 
     Args:
         source: the project or scene.
-        out: the new folder, with images/, sparse/0/, transforms.json and, where the project says where on Earth it is,
+        out: the new folder, with images/, sparse/0/, transforms.json and, if the project is georeferenced,
             georeference.json; it appears when it is complete.
-        link: give the photographs a second name (a hard link) instead of copying them.
-        allow_missing: go on without photographs that are named but not there.
-        progress: called with (placed, of how many) photographs.
+        link: make hard links to the photographs instead of copies.
+        allow_missing: continue without photographs that are listed but do not exist.
+        progress: called with (written, of how many) photographs.
 
     Raises:
-        SceneError: when `source` is no scene, or a damaged one.
-        RunError: when `out` is there already or cannot be written.
+        SceneError: `source` is not a scene, or is damaged.
+        RunError: `out` exists already or cannot be written.
     """
     refuse_existing(out, replaceable=False)
-    posed = _as_on_disk(read_posed(source, allow_missing), source)
-    located = read_georeference(source) or _as_stated(posed.reference)
-    _tell_what_is_lost(posed, source)
+    posed = _at_file_size(read_posed(source, allow_missing), source)
+    located = read_georeference(source) or _georeference(posed.reference)
+    _warn_of_losses(posed, source)
     model = to_colmap(posed)
     with completed_folder(out) as folder:
-        _place(posed, folder / "images", link, progress)
+        _write_images(posed, folder / "images", link, progress)
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
@@ -96,8 +97,8 @@ def import_project(
     )
 
 
-def _as_stated(reference: Reference | None) -> Georeference | None:
-    """What a project says of its world, which is in metres east, north and up already."""
+def _georeference(reference: Reference | None) -> Georeference | None:
+    """Make a georeference of a project's reference point; its world is in metres east, north and up already."""
     if reference is None:
         return None
     return Georeference(
@@ -108,17 +109,17 @@ def _as_stated(reference: Reference | None) -> Georeference | None:
         control=Residuals(),
         check=Residuals(),
         left_out=(),
-        notes=("The origin is what the imported project states; how good it is, the project knows.",),
+        notes=("The origin is the imported project's; its accuracy is unknown.",),
     )
 
 
 def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
-    """A COLMAP model of posed photographs. Points of which nobody knows who saw them have tracks without elements."""
+    """Make a COLMAP model of posed photographs; points without observations get empty tracks."""
     model = pycolmap.Reconstruction()
     camera_of = {lens: number for number, lens in enumerate(dict.fromkeys(posed.lenses), start=1)}
     for lens, number in camera_of.items():
         model.add_camera_with_trivial_rig(_camera(lens, number))
-    points = posed.points or _unseen(posed)
+    points = posed.points or _unobserved(posed)
     rotation = posed.T_world_camera[:, :, :3].transpose(0, 2, 1)
     T_camera_world = np.concatenate([rotation, -rotation @ posed.T_world_camera[:, :, 3:]], axis=2)
     keypoint = np.zeros(len(points.uv_px), dtype=np.int64)
@@ -134,7 +135,7 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
 
 
 def _camera(lens: Lens, number: int) -> pycolmap.Camera:
-    """The plainest of COLMAP's cameras that has all of the lens's terms."""
+    """Make the simplest camera of COLMAP that has all of the lens's terms."""
     kind, parameters = "PINHOLE", [lens.fx, lens.fy, lens.cx, lens.cy]
     if lens.is_distorted:
         kind, parameters = "OPENCV", [*parameters, lens.k1, lens.k2, lens.p1, lens.p2]
@@ -143,14 +144,19 @@ def _camera(lens: Lens, number: int) -> pycolmap.Camera:
     return pycolmap.Camera(camera_id=number, model=kind, width=lens.width, height=lens.height, params=parameters)
 
 
-def _unseen(posed: PosedPhotographs) -> Observations:
-    """The points without observations; none where there are none."""
-    nobody = np.zeros(0, dtype=np.int64)
+def _unobserved(posed: PosedPhotographs) -> Observations:
+    """Wrap the point cloud, which may be missing, as points without observations."""
+    nothing = np.zeros(0, dtype=np.int64)
     cloud = np.zeros((0, 3)) if posed.cloud_world is None else posed.cloud_world
-    return Observations(cloud, nobody, nobody, np.zeros((0, 2)), posed.cloud_rgb)
+    return Observations(cloud, nothing, nothing, np.zeros((0, 2)), posed.cloud_rgb)
 
 
-def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: np.ndarray) -> None:
+def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: Int64[np.ndarray, " O"]) -> None:
+    """Add the points that are finite, with their tracks.
+
+    Args:
+        keypoint: number of each observation among those of its photograph.
+    """
     order = np.argsort(points.point_index, kind="stable")
     starts = np.searchsorted(points.point_index[order], np.arange(1, len(points.xyz_world)))
     grey = np.full(3, _GREY, dtype=np.uint8)
@@ -163,16 +169,16 @@ def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: 
         model.add_point3D(points.xyz_world[k], track, grey if points.rgb is None else points.rgb[k])
 
 
-def _as_on_disk(posed: PosedPhotographs, source: Path) -> PosedPhotographs:
-    """The same with lenses and observations at the sizes of the photographs' files, and plain names.
+def _at_file_size(posed: PosedPhotographs, source: Path) -> PosedPhotographs:
+    """Scale lenses and observations to the sizes of the photographs' files, and normalise names.
 
     Raises:
-        SceneError: when a file is no photograph of its camera, or a photograph is named twice.
+        SceneError: a file does not have its camera's shape, or a photograph is listed twice.
     """
     names = tuple(posixpath.normpath(name.replace("\\", "/")) for name in posed.names)
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise SceneError(f"{source} names the photograph {twice} twice: expected each once; take one out")
+        raise SceneError(f"{source} lists the photograph {twice} twice: expected each once; remove one")
     lenses = tuple(own_lens(path, lens)[0] for path, lens in zip(posed.paths, posed.lenses, strict=True))
     points = posed.points
     if points is not None:
@@ -183,26 +189,27 @@ def _as_on_disk(posed: PosedPhotographs, source: Path) -> PosedPhotographs:
     return replace(posed, names=names, lenses=lenses, points=points)
 
 
-def _tell_what_is_lost(posed: PosedPhotographs, source: Path) -> None:
+def _warn_of_losses(posed: PosedPhotographs, source: Path) -> None:
+    """Warn of what a Scene on disk cannot store."""
     if posed.split is not None:
-        _log.warning(f"{source} holds out photographs of its own choice: a scene has every eighth held out instead")
+        _log.warning(f"{source} has its own split: the imported scene holds out every eighth photograph instead")
     if posed.near_far is not None:
-        _log.warning(f"{source} states how near and far its photographs see: a scene has no place for that")
+        _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
 
 
-def _place(posed: PosedPhotographs, images: Path, link: bool, progress: Progress | None) -> None:
-    put: Callable[[Path, Path], object] = _link if link else shutil.copyfile
+def _write_images(posed: PosedPhotographs, images: Path, link: bool, progress: Progress | None) -> None:
+    write: Callable[[Path, Path], object] = _link if link else shutil.copyfile
     for done, (path, name) in enumerate(zip(posed.paths, posed.names, strict=True), start=1):
         target = images / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        put(path, target)
+        write(path, target)
         if progress is not None:
             progress(done, len(posed.names))
 
 
 def _link(path: Path, target: Path) -> None:
     try:
-        os.link(path.resolve(), target)  # what a link names, not the link
+        os.link(path.resolve(), target)  # the file itself, if the path is a symbolic link
     except OSError as error:
         if error.errno not in _CANNOT_LINK:
             raise

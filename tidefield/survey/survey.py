@@ -1,4 +1,8 @@
-"""What a surveyor brings: photographs with what their files say of them, and ground control."""
+"""Inputs of a survey: photographs with their metadata, and ground control.
+
+The `repr` of Position, LensPrior and Control is part of the keys in `stages.json`: renaming a class or a field makes
+scenes that were prepared earlier start again.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,14 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Position:
-    """Where a camera was, as its receiver says (WGS 84).
+    """Position of a camera from its GPS receiver (WGS 84).
 
     Attributes:
         latitude_deg, longitude_deg: geographic coordinates.
-        height_m: altitude, NaN where unknown; above `datum`.
-        horizontal_m, vertical_m: standard deviations that the receiver states (RTK); NaN where it states none.
-        datum: what the height counts from. EXIF says mean sea level or nothing; makers differ.
-        source: where this was read, such as "EXIF" or "gps.csv".
+        height_m: altitude above `datum`; NaN if unknown.
+        horizontal_m, vertical_m: standard deviations that the receiver states (RTK); NaN if it states none.
+        datum: zero of the height. EXIF states mean sea level or nothing; makers differ.
+        source: where the position was read, such as "EXIF" or "gps.csv".
     """
 
     latitude_deg: float
@@ -30,7 +34,7 @@ class Position:
 
 @dataclass(frozen=True)
 class LensPrior:
-    """What the file or the maker says of the lens, for the upright photograph at its own size.
+    """Calibration of a lens from the file or its maker, for the upright photograph at full size.
 
     Attributes:
         focal_px: focal length.
@@ -38,8 +42,8 @@ class LensPrior:
             is at 0.5, 0.5).
         distortion: OpenCV's (k1, k2, p1, p2, k3), if the maker calibrated it.
         source: such as "DJI dewarp data", "EXIF 35 mm equivalent", "EXIF focal plane resolution".
-        trusted: whether a maker calibrated it; EXIF's focal length is nominal, good to some percent.
-        design_focal_px: focal length of the lens's design, where the maker states it besides.
+        trusted: whether the maker calibrated it; EXIF's focal length is nominal, accurate to some percent.
+        design_focal_px: focal length of the lens's design, if the maker states it too.
     """
 
     focal_px: float
@@ -57,16 +61,16 @@ class Photograph:
     Attributes:
         path: the file.
         name: its path relative to the survey's folder, with forward slashes; unique.
-        width, height: pixels once it stands upright.
-        orientation: EXIF's, 1 to 8; 1 stands upright as stored.
+        width, height: pixels of the upright photograph.
+        orientation: EXIF's, 1 to 8; 1 is stored upright.
         camera: make and model; empty if unknown. Photographs of one camera, size and focal length share a lens.
-        serial: of the camera's body; empty if unknown.
-        focal_mm: nominal focal length, which tells zoom settings apart; NaN if unknown.
-        lens: what is known of the lens beforehand, or None.
-        time_s: when it was taken, seconds since 1970 by the camera's clock; NaN if unknown.
+        serial: serial number of the camera; empty if unknown.
+        focal_mm: nominal focal length, which differs between zoom settings; NaN if unknown.
+        lens: prior of the lens, or None.
+        time_s: seconds since 1970 by the camera's clock; NaN if unknown.
         log_exposure: natural log of exposure time x ISO / f-number squared; NaN if unknown.
-        position: where, or None.
-        relative_altitude_m: above the place of take-off; NaN if unknown.
+        position: of the camera, or None.
+        relative_altitude_m: height above take-off; NaN if unknown.
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
     """
 
@@ -88,12 +92,12 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Mark:
-    """Where a control point shows in a photograph.
+    """Image position of a control point in a photograph.
 
     Attributes:
         point: name of the control point.
         photograph: `Photograph.name`.
-        uv_px: pixel in the upright photograph at its own size; the first pixel's centre is at (0.5, 0.5).
+        uv_px: pixel in the upright photograph at full size; the first pixel's centre is at (0.5, 0.5).
     """
 
     point: str
@@ -103,13 +107,13 @@ class Mark:
 
 @dataclass(frozen=True)
 class Control:
-    """Surveyed ground points.
+    """Ground control points.
 
     Attributes:
         crs: their coordinate reference system, as pyproj understands it ("EPSG:27700", a proj4 string).
         points: by name, (easting or x, northing or y, height) in that system, in float64; for a geographic system
             (longitude, latitude, height).
-        marks: where they show.
+        marks: their image positions.
     """
 
     crs: str
@@ -119,13 +123,13 @@ class Control:
 
 @dataclass(frozen=True)
 class Survey:
-    """Everything that was read.
+    """All inputs.
 
     Attributes:
-        folder: where the photographs are.
+        folder: of the photographs.
         photographs: sorted by name.
-        control: ground control, if there is any.
-        remarks: what was left out or doubted while reading, one sentence each, for the report.
+        control: ground control, or None.
+        remarks: what was skipped or is doubtful, one sentence each, for the report.
     """
 
     folder: Path

@@ -1,59 +1,51 @@
-"""A Scene as nerfstudio reads it: the very pixels, cameras and split that every other method here gets."""
+"""Write a Scene for nerfstudio: the same pixels, cameras and split that all other methods use."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from jaxtyping import Float, UInt8
 from PIL import Image
+from torch import Tensor, ones, uint8
 
-from tidefield.data.cloud import write_cloud
 from tidefield.data.scene import Scene
+from tidefield.data.transforms_file import write_transforms_file
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.lenses import Lens
 
-TRANSFORMS_FILE, CLOUD_FILE = "transforms.json", "points.ply"
 
-
-def export(scene: Scene, folder: Path) -> torch.Tensor:
+def export(scene: Scene, folder: Path) -> Float[Tensor, "3"]:
     """Write photographs (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
-    Photographs are at the common exposure, as all other methods see them, times a factor that keeps the brightest in
-    range.
+    Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
 
     Returns:
         The factor: renderings divided by it are at the common exposure.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    factor = scene.cameras.gain.amin(0).clamp(max=1.0)
-    if scene.background_rgb is not None:
-        factor = torch.ones(3)
-    frames, files = [], []
-    for index in range(len(scene.names)):
-        file = f"images/{index:05d}.png"
-        even = scene.photographs[index].float() / scene.cameras.gain[index] * factor
-        Image.fromarray(even.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
-        files.append(file)
-        frames.append({"file_path": file, **_frame(scene.cameras[index])})
-    top: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "train_filenames": [files[i] for i in scene.train],
-        "val_filenames": [files[i] for i in scene.test],
-        "test_filenames": [files[i] for i in scene.test],
-        "frames": frames,
-    }
-    if scene.points is not None:
-        xyz = scene.points.xyz_world.double().numpy()
-        write_cloud(folder / CLOUD_FILE, xyz, _colours(scene), overwrite=True)
-        top["ply_file_path"] = CLOUD_FILE
-    (folder / TRANSFORMS_FILE).write_text(json.dumps(top), encoding="utf-8")
+    cameras, files = scene.cameras, [f"images/{index:05d}.png" for index in range(len(scene.names))]
+    factor = cameras.gain.amin(0).clamp(max=1.0) if scene.background_rgb is None else ones(3)
+    for index, file in enumerate(files):
+        colour = scene.photographs[index].float() / cameras.gain[index] * factor
+        Image.fromarray(colour.round().clamp(0, 255).to(uint8).numpy()).save(folder / file)
+    points = scene.points
+    write_transforms_file(
+        folder,
+        files,
+        [_lens(cameras[index]) for index in range(len(files))],
+        cameras.T_world_camera[:, :3].double().numpy(),
+        (scene.train, scene.test),
+        np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
+        _point_colours(scene),
+        overwrite=True,
+    )
     return factor
 
 
 def camera_to_json(camera: Cameras) -> dict[str, Any]:
-    """One camera, for the worker."""
+    """Describe one camera for the worker."""
     return {
         "T_world_camera": camera.T_world_camera[0].tolist(),
         "focal_px": camera.focal_px[0].tolist(),
@@ -62,19 +54,16 @@ def camera_to_json(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _frame(camera: Cameras) -> dict[str, Any]:
+def _lens(camera: Cameras) -> Lens:
     (fx, fy), (cx, cy) = camera.focal_px[0].tolist(), camera.principal_px[0].tolist()
-    # OpenGL's axes: +x right, +y up, -z forward.
-    pose = camera.T_world_camera[0].double() * torch.tensor([1.0, -1.0, -1.0, 1.0])
-    matrix = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    size = {"w": camera.width, "h": camera.height}
-    return {**size, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "transform_matrix": matrix}
+    return Lens(camera.width, camera.height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-def _colours(scene: Scene) -> np.ndarray:
-    """Colours of the sparse points, as the first photograph that may be learned from shows them."""
+def _point_colours(scene: Scene) -> UInt8[np.ndarray, "P 3"]:
+    """Sample each sparse point's colour in the first training photograph that shows it; grey where none does."""
     points = scene.points
-    assert points is not None, "asked for only where there are some"
+    if points is None:
+        return np.zeros((0, 3), dtype=np.uint8)
     rgb = np.full((len(points.xyz_world), 3), 128, dtype=np.uint8)
     for index in reversed(scene.train):
         mine = points.camera_index == index

@@ -1,1 +1,1 @@
-"""Structure from motion: features, pairs, matches, poses, lenses."""
+"""Structure from motion: features, matches, poses and lenses."""

@@ -1,12 +1,14 @@
-"""Features of every photograph, in a COLMAP database: SIFT by pycolmap (Lowe, 2004; as RootSIFT, Arandjelovic and
-Zisserman, 2012)."""
+"""Extract SIFT features (Lowe, 2004; as RootSIFT: Arandjelovic and Zisserman, 2012) into a COLMAP database.
+
+pycolmap's own `extract_features` is not used, because it does not enforce the maximum number of features (more of them
+make matching slower) and reports no progress.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,7 +17,7 @@ from urllib.parse import quote, unquote
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
+from jaxtyping import Float32, Float64, UInt8
 
 from tidefield.errors import DeviceError
 from tidefield.machine import cores
@@ -23,87 +25,81 @@ from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import LensPrior, Photograph
 
 Progress = Callable[[int, int], object]
+"""Called with (done, of how many)."""
+Keypoints = Float32[np.ndarray, "K 4"]
+Descriptors = UInt8[np.ndarray, "K 128"]
 
 DEFAULT_FOCAL = 1.2
-"""Focal length in widths of the photograph where nothing is known of the lens: COLMAP's guess."""
+"""Focal length in widths of the photograph where no prior exists: COLMAP's default."""
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """How features are found."""
+    """Options of feature extraction."""
 
     side_px: int = 2400
     """Longer side to which larger photographs are reduced."""
     count: int = 6000
-    """Features per photograph at most, the largest first."""
+    """Maximum number of features per photograph; the largest are kept."""
+
+
+def choose_device(name: str) -> pycolmap.Device:
+    """Choose where pycolmap computes: `auto` is CUDA if it is available, else the CPU.
+
+    Raises:
+        DeviceError: pycolmap does not support the device here.
+    """
+    kind = name.partition(":")[0]
+    supported = ["auto", "cpu", *(["cuda"] if pycolmap.has_cuda else [])]
+    if kind not in supported:
+        raise DeviceError(
+            f"pycolmap does not compute on {name!r} here: expected one of {', '.join(supported)}; for CUDA, install "
+            "pycolmap-cuda12 instead of pycolmap"
+        )
+    return getattr(pycolmap.Device, kind)
+
+
+def encode_name(name: str) -> str:
+    """Encode a photograph's name for the database: pycolmap separates the names of a pair by a space."""
+    return quote(name)
+
+
+def decode_name(encoded: str) -> str:
+    """Decode a photograph's name from the database."""
+    return unquote(encoded)
 
 
 def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
-    """A number for each photograph; photographs of one camera, size and zoom share a number, and so a lens."""
+    """Number the lenses: photographs of one camera, size and focal length share a number."""
     kinds = [(p.camera, p.serial, p.width, p.height, None if np.isnan(p.focal_mm) else p.focal_mm) for p in photographs]
     numbers = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     return [numbers[kind] for kind in kinds]
 
 
-def first_camera(photograph: Photograph) -> pycolmap.Camera:
-    """What is known of a photograph's lens before anything is measured, as COLMAP's OPENCV camera."""
+def initial_camera(photograph: Photograph) -> pycolmap.Camera:
+    """Make an OPENCV camera of COLMAP from the lens prior."""
     lens, width, height = photograph.lens, photograph.width, photograph.height
     focal = lens.focal_px if lens else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(pycolmap.INVALID_CAMERA_ID, "OPENCV", focal, width, height)
     if lens and lens.principal_px:
         camera.principal_point_x, camera.principal_point_y = lens.principal_px
     if lens and lens.distortion:
-        camera.params = [*camera.params[:4].tolist(), *_without_k3(lens, width, height).tolist()]
+        camera.params = [*camera.params[:4].tolist(), *_fit_without_k3(lens, width, height).tolist()]
     camera.has_prior_focal_length = lens is not None
     return camera
 
 
-def _without_k3(lens: LensPrior, width: int, height: int) -> NDArray[np.float64]:
-    """(k1, k2, p1, p2) that act over the picture as the five-term distortion does: OPENCV has no r^6."""
+def _fit_without_k3(lens: LensPrior, width: int, height: int) -> Float64[np.ndarray, " 4"]:
+    """Fit (k1, k2, p1, p2) to the five-term distortion over the photograph: OPENCV has no r^6."""
     assert lens.distortion is not None
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = np.linspace(0, 0.25 * (width**2 + height**2) / lens.focal_px**2, 50)
     shift = k1 * r2 + k2 * r2**2 + k3 * r2**3
-    # Displacements in the picture are r times the radial factor, and that many pixels at radius r have it.
+    # The displacement is r times the radial factor, and the number of pixels at radius r is proportional to r.
     weight = r2
     terms = np.stack([r2, r2**2], 1) * weight[:, None]
     k1, k2 = np.linalg.lstsq(terms, shift * weight, rcond=None)[0]
     return np.array([k1, k2, p1, p2])
-
-
-def stored_name(name: str) -> str:
-    """A photograph's name in the database: pycolmap's lists of pairs have spaces between names."""
-    return quote(name)
-
-
-def real_name(stored: str) -> str:
-    """The photograph's own name again."""
-    return unquote(stored)
-
-
-@contextmanager
-def opened(database: Path) -> Iterator[pycolmap.Database]:
-    handle = pycolmap.Database.open(database)
-    try:
-        yield handle
-    finally:
-        handle.close()
-
-
-def choose_device(name: str) -> pycolmap.Device:
-    """Where pycolmap computes: `auto` is CUDA where it has that, else the CPU.
-
-    Raises:
-        DeviceError: for a device that pycolmap does not have.
-    """
-    kind = name.partition(":")[0]
-    there = ["auto", "cpu", *(["cuda"] if pycolmap.has_cuda else [])]
-    if kind not in there:
-        raise DeviceError(
-            f"pycolmap does not compute on {name!r} here: expected one of {', '.join(there)}; for CUDA, install "
-            "pycolmap-cuda12 instead of pycolmap"
-        )
-    return getattr(pycolmap.Device, kind)
 
 
 def extract(
@@ -113,78 +109,67 @@ def extract(
     device: pycolmap.Device,
     progress: Progress,
 ) -> int:
-    """Write cameras, photographs and their features to a database; those that are in it already are kept.
+    """Write cameras, photographs and their features to a database; what it contains already is kept.
 
     Returns:
-        The number of features in all.
+        The total number of features.
     """
-    with opened(database) as db:
-        cameras = _cameras(db, photographs)
+    with pycolmap.Database.open(database) as db:
         todo = []
-        for photograph, camera in zip(photographs, cameras, strict=True):
-            image = db.read_image_with_name(stored_name(photograph.name))
+        for photograph, camera_id in zip(photographs, _write_cameras(db, photographs), strict=True):
+            image = db.read_image_with_name(encode_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
-                todo.append((photograph, camera))
-        done = len(photographs) - len(todo)
-        # Processes, because pycolmap keeps the interpreter's lock while it looks for features; new ones, because a fork
-        # of one that has threads may hang. A GPU works on one photograph at a time.
+                todo.append((photograph, camera_id))
+        # Processes, because pycolmap holds the interpreter's lock during extraction; spawned, because forking a process
+        # with threads may hang. A GPU works on one photograph at a time.
         on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
         workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
-        with ProcessPoolExecutor(workers, get_context("spawn"), _quieten) as pool:
-            for photograph, camera, (keypoints, descriptors) in _in_order(pool, todo, options, device):
-                _write(db, photograph, camera, keypoints, descriptors)
-                done += 1
-                progress(done, len(photographs))
+        # Only a few photographs are submitted in advance, so that memory use does not grow with their number.
+        ahead = 2 * cores() + 1
+        with ProcessPoolExecutor(workers, get_context("spawn"), _silence_pycolmap) as pool:
+            running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
+            for k, (photograph, camera_id) in enumerate(todo):
+                keypoints, descriptors = running.popleft().result()
+                if k + ahead < len(todo):
+                    running.append(pool.submit(_features, todo[k + ahead][0], options, device))
+                _write_features(db, photograph, camera_id, keypoints, descriptors)
+                progress(len(photographs) - len(todo) + k + 1, len(photographs))
         return db.num_keypoints()
 
 
-def _in_order(
-    pool: Executor, todo: Sequence[tuple[Photograph, int]], options: FeatureOptions, device: pycolmap.Device
-) -> Iterator:
-    """Features of photographs as they are ready, a few ahead: memory does not grow with their number."""
-    ahead = 2 * cores() + 1
-    running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
-    for k, (photograph, camera) in enumerate(todo):
-        found = running.popleft().result()
-        if k + ahead < len(todo):
-            running.append(pool.submit(_features, todo[k + ahead][0], options, device))
-        yield photograph, camera, found
-
-
-def _quieten() -> None:
-    """What pycolmap logs in a process of its own would come between the lines of progress."""
+def _silence_pycolmap() -> None:
+    """Keep the log of a worker process from mixing with the progress bar."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
 
 
 def _features(
     photograph: Photograph, options: FeatureOptions, device: pycolmap.Device
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Keypoints (K x 4: u, v, scale, orientation; upright pixels at full size) and descriptors (K x 128)."""
+) -> tuple[Keypoints, Descriptors]:
+    """Extract keypoints (u, v, scale, orientation; pixels of the upright photograph) and descriptors, largest first."""
     grey = cv2.cvtColor(upright(photograph), cv2.COLOR_RGB2GRAY)
-    shrunk = min(1.0, options.side_px / max(grey.shape))
-    if shrunk < 1:
-        size = (round(grey.shape[1] * shrunk), round(grey.shape[0] * shrunk))
+    scale = min(1.0, options.side_px / max(grey.shape))
+    if scale < 1:
+        size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     sift = pycolmap.FeatureExtractionOptions()
     sift.num_threads = 1
     sift.sift.max_num_features = options.count
     sift.sift.first_octave = 0
-    extractor = pycolmap.FeatureExtractor.create(sift, device=device)
-    found, descriptors = extractor.extract_from_uint8_array(grey)
+    found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
     keypoints[:, :3] *= photograph.width / grey.shape[1]
-    # The largest are found again the most reliably; VLFeat gives some more than were asked for.
+    # The largest are the most repeatable; VLFeat returns somewhat more than the maximum.
     largest = np.argsort(-keypoints[:, 2], kind="stable")[: options.count]
     return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]
 
 
-def _cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:
-    """Camera of each photograph; written, with a rig of its own, where the database has none yet."""
+def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:
+    """Write the cameras that the database lacks, each with its rig; return the camera of each photograph."""
     groups = lens_groups(photographs)
-    # Photographs keep their place in the list, so the cameras' numbers are the same in every attempt.
+    # The photographs' order is fixed, so cameras have the same numbers when an interrupted run continues.
     for group in sorted(set(groups)):
         if not db.exists_camera(group + 1):
-            camera = first_camera(photographs[groups.index(group)])
+            camera = initial_camera(photographs[groups.index(group)])
             camera.camera_id = group + 1
             db.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=group + 1)
@@ -193,15 +178,16 @@ def _cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[i
     return [group + 1 for group in groups]
 
 
-def _write(
-    db: pycolmap.Database, photograph: Photograph, camera: int, keypoints: NDArray, descriptors: NDArray
+def _write_features(
+    db: pycolmap.Database, photograph: Photograph, camera_id: int, keypoints: Keypoints, descriptors: Descriptors
 ) -> None:
+    """Write one photograph with its frame and features, all or nothing."""
     with pycolmap.DatabaseTransaction(db):
-        image = pycolmap.Image(name=stored_name(photograph.name), camera_id=camera)
+        image = pycolmap.Image(name=encode_name(photograph.name), camera_id=camera_id)
         image.image_id = db.write_image(image)
-        frame = pycolmap.Frame(rig_id=camera)
+        frame = pycolmap.Frame(rig_id=camera_id)
         frame.add_data_id(image.data_id)
         db.write_frame(frame)
         db.write_keypoints(image.image_id, keypoints)
-        described = pycolmap.FeatureDescriptors(data=descriptors, type=pycolmap.FeatureExtractorType.SIFT)
-        db.write_descriptors(image.image_id, described)
+        typed = pycolmap.FeatureDescriptors(data=descriptors, type=pycolmap.FeatureExtractorType.SIFT)
+        db.write_descriptors(image.image_id, typed)

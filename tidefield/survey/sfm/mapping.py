@@ -1,61 +1,139 @@
-"""Camera poses, lenses and sparse points from matches: structure from motion by pycolmap.
+"""Estimate poses, sparse points and lenses: incremental mapping by pycolmap, then a choice of the lens model.
 
-Flat ground photographed straight down does not tell the focal length: a longer one with a higher flight explains the
-matches as well (and bent ground, any error of the distortion). So while the model grows, focal lengths are held to what
-is known beforehand.
+Focal length: photographs with parallel optical axes do not determine it, whatever the relief, because a longer lens
+with a scene stretched along the axes explains the matches as well. During mapping, a focal length with a prior is
+therefore fixed. Afterwards it is refined only if the photographs look in different directions.
+
+Distortion: each further term reduces the reprojection error. But vertical photographs of flat ground do not distinguish
+distortion from curved ground, and the reduction may come from a bowl-shaped model. Camera positions (GPS) do
+distinguish them: a lens model with more terms is chosen only if the cameras fit their positions as well as before.
+
+Two focal lengths: some makers state one focal length of this lens and one of its design. The flight height is
+proportional to the focal length, so the one is chosen whose flight height agrees better with the drone's own.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from tidefield.errors import SurveyError
-from tidefield.survey.sfm.features import opened, real_name
+from tidefield.survey.georeference.adjustment import adjustment_options, all_images, thinned
+from tidefield.survey.georeference.alignment import PositionFit, camera_centres, find_down, fit_positions
+from tidefield.survey.georeference.gps import given_positions
+from tidefield.survey.sfm.features import Progress, decode_name
 from tidefield.survey.stages import interruptible
+from tidefield.survey.survey import Photograph
 
-log = logging.getLogger(__name__)
-
-FEWEST = 3
+MIN_PHOTOGRAPHS = 3
 """Photographs of the smallest model."""
+TERMS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
+"""Lens models of COLMAP, the simplest first, and their terms of distortion."""
+MAX_ERROR_RATIO = 0.99
+"""More terms must reduce the reprojection error to this share, ..."""
+MAX_POSITION_RATIO = 1.03
+"""... and may not increase the distance from the positions above this share."""
+MIN_POSITIONS = 6
+"""Fewer positions cannot show whether a model is curved."""
+MIN_FOCAL_DIFFERENCE = 0.01
+"""Relative difference below which two stated focal lengths count as one."""
+MIN_HEIGHT_M = 10.0
+"""Below this, the height above take-off is too inaccurate to be compared."""
+MIN_SPREAD_DEG = 10.0
+"""RMS angle of the optical axes from their mean that determines the focal length."""
 
 
 @dataclass(frozen=True)
 class Models:
-    """What structure from motion found.
+    """Result of incremental mapping.
 
     Attributes:
-        best: the model with the most photographs; its image names are the photographs'.
-        others: names of the photographs of the other models, the larger first: places that nothing connects.
+        best: the model with the most photographs, under their own names.
+        others: names of the photographs of the other, unconnected models, the larger first.
     """
 
     best: pycolmap.Reconstruction
     others: tuple[tuple[str, ...], ...]
 
 
-def reconstruct(database: Path, folder: Path, progress: Callable[[int, int], object]) -> Models:
-    """Grow models from the matches in a database.
+@dataclass(frozen=True)
+class LensTrial:
+    """Result of a bundle adjustment with one lens model.
+
+    Attributes:
+        lens: name of the lens model.
+        error_px: mean reprojection error.
+        off_m: RMS distance of the cameras from their positions, after the best similarity; None if there are too few.
+        focal_px: of the first camera.
+    """
+
+    lens: str
+    error_px: float
+    off_m: float | None
+    focal_px: float
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Flight heights above ground, relative to the drone's height above take-off, by focal length.
+
+    Attributes:
+        calibrated_px, design_px: the focal lengths that the maker states.
+        calibrated_share, design_share: median of the estimated height over the drone's own.
+    """
+
+    calibrated_px: float
+    design_px: float
+    calibrated_share: float
+    design_share: float
+
+    @property
+    def prefers_design(self) -> bool:
+        return abs(math.log(self.design_share)) < abs(math.log(self.calibrated_share))
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """How the lens of a model was chosen. The names of the attributes are keys of `stages.json`.
+
+    Attributes:
+        trials: lens models that were tried; the last one was chosen.
+        known: whether the focal length has a prior.
+        freed: whether it was refined.
+        spread_deg: RMS angle of the optical axes from their mean.
+        heights: comparison of two stated focal lengths; None if there are not two.
+    """
+
+    trials: tuple[LensTrial, ...]
+    known: bool
+    freed: bool
+    spread_deg: float
+    heights: Heights | None = None
+
+
+def reconstruct(database: Path, folder: Path, progress: Progress) -> Models:
+    """Run incremental mapping on the matches of a database.
 
     Args:
-        folder: where pycolmap may write; made if it is not there.
+        folder: where pycolmap may write; created if it does not exist.
 
     Raises:
         SurveyError: no three photographs fit together.
     """
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         count = db.num_images()
-        known = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
+        has_prior = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size, options.extract_colors, options.random_seed = FEWEST, False, 0
-    options.ba_refine_focal_length = not known
-    options.mapper.abs_pose_refine_focal_length = not known
+    options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not has_prior
     registered = 0
 
-    def one_more() -> None:
+    def count_image() -> None:
         nonlocal registered
         registered += 1
         progress(min(registered, count), count)
@@ -63,12 +141,12 @@ def reconstruct(database: Path, folder: Path, progress: Callable[[int, int], obj
     folder.mkdir(parents=True, exist_ok=True)
     found = interruptible(
         lambda token: pycolmap.incremental_mapping(
-            database, folder, folder, options, next_image_callback=one_more, cancellation_token=token
+            database, folder, folder, options, next_image_callback=count_image, cancellation_token=token
         )
     )
     for model in found.values():
         for image in model.images.values():
-            image.name = real_name(image.name)
+            image.name = decode_name(image.name)
     models = sorted(found.values(), key=lambda model: -model.num_reg_images())
     if not models:
         raise SurveyError(
@@ -79,4 +157,180 @@ def reconstruct(database: Path, folder: Path, progress: Callable[[int, int], obj
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:
+    """List the photographs that have a pose, sorted by name."""
     return sorted(model.image(number).name for number in model.reg_image_ids())
+
+
+def choose_lens(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], known: bool, progress: Progress
+) -> LensChoice:
+    """Adjust a model, in place, with the lens model of the most terms that does not make it curved.
+
+    Args:
+        photographs: of the survey.
+        known: whether the model's focal length has a prior.
+    """
+    light, trials, spread = thinned(model), [], axes_spread_deg(model)
+    try_focal = known and spread >= MIN_SPREAD_DEG
+    steps = len(TERMS) + 1 + try_focal
+
+    def attempt(lens: str, refine_focal: bool) -> LensTrial:
+        trials.append(_try_lens(light, photographs, lens, refine_focal))
+        progress(len(trials), steps)
+        return trials[-1]
+
+    best = best_of([attempt(lens, not known) for lens in TERMS])
+    freed = not known
+    if try_focal:
+        refined = attempt(best.lens, True)
+        freed = _is_better(refined, best)
+        best = refined if freed else best
+    _adjust(model, best.lens, freed)
+    heights = None if freed else _compare_heights(model, photographs)
+    if heights is not None and heights.prefers_design:
+        (camera,) = model.cameras.values()
+        for index in camera.focal_length_idxs():
+            camera.params[index] = heights.design_px
+        _adjust(model, best.lens, focal=False)
+    progress(steps, steps)
+    return LensChoice((*(trial for trial in trials if trial is not best), best), known, freed, spread, heights)
+
+
+def best_of(trials: Sequence[LensTrial]) -> LensTrial:
+    """Choose the last of the trials, simplest lens first, that reduces the error without making the model curved."""
+    best = trials[0]
+    for trial in trials[1:]:
+        best = trial if _is_better(trial, best) else best
+    return best
+
+
+def _is_better(richer: LensTrial, simpler: LensTrial) -> bool:
+    if richer.off_m is not None and simpler.off_m is not None and richer.off_m > MAX_POSITION_RATIO * simpler.off_m:
+        return False
+    return richer.error_px < MAX_ERROR_RATIO * simpler.error_px
+
+
+def axes_spread_deg(model: pycolmap.Reconstruction) -> float:
+    """Compute the RMS angle of the optical axes from their mean."""
+    axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
+    mean = axes.mean(axis=0)
+    cosine = np.clip(axes @ mean / max(float(np.linalg.norm(mean)), 1e-9), -1, 1)
+    return float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
+
+
+def _try_lens(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], lens: str, refine_focal: bool
+) -> LensTrial:
+    """Adjust a copy of a model with a lens model."""
+    model = pycolmap.Reconstruction(model)
+    _adjust(model, lens, refine_focal)
+    fit, names = _fit_to_positions(model, photographs)
+    off_m = None
+    if fit is not None:
+        centres = camera_centres(model)
+        error_m = (fit.world_from_model(np.array([centres[name] for name in names])) - fit.given_world)[fit.used]
+        off_m = float(np.sqrt((error_m**2).sum(1).mean()))
+    camera = model.cameras[min(model.cameras)]
+    return LensTrial(lens, model.compute_mean_reprojection_error(), off_m, camera.mean_focal_length())
+
+
+def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
+    """Adjust all poses, points and lenses of a model; `focal`: refine focal lengths too."""
+    for camera in model.cameras.values():
+        mean = (camera.focal_length_x + camera.focal_length_y) / 2
+        centre = camera.principal_point_x, camera.principal_point_y
+        terms = np.pad(camera.params[len(camera.focal_length_idxs()) + 2 :], (0, 4))[: TERMS[lens]]
+        camera.model = getattr(pycolmap.CameraModelId, lens)
+        camera.params = [*([mean, mean] if lens == "OPENCV" else [mean]), *centre, *terms]
+    options = adjustment_options()
+    options.refine_focal_length, options.refine_principal_point = focal, False
+    config = all_images(model)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not `bundle_adjustment`, which is the same but prints whatever the log level.
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+
+
+def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> Heights | None:
+    """Compare flight heights; None if the maker does not state two focal lengths of one lens, or no heights exist."""
+    stated = {(p.lens.focal_px, p.lens.design_focal_px) for p in photographs if p.lens and p.lens.design_focal_px}
+    if len(stated) != 1 or len(model.cameras) != 1:
+        return None
+    ((calibrated, design),) = stated
+    fit, names = _fit_to_positions(model, photographs)
+    if design is None or abs(math.log(design / calibrated)) < MIN_FOCAL_DIFFERENCE or fit is None:
+        return None
+    above_start_m = {p.name: p.relative_altitude_m for p in photographs}
+    shares = []
+    for image in (model.image(number) for number in model.reg_image_ids()):
+        if image.name in names and above_start_m[image.name] > MIN_HEIGHT_M:
+            seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+            ground, centre = fit.world_from_model(np.array(seen)), fit.world_from_model(image.projection_center()[None])
+            shares.append((centre[0, 2] - np.median(ground[:, 2])) / above_start_m[image.name])
+    if len(shares) < MIN_POSITIONS:
+        return None
+    share = float(np.median(shares))
+    return Heights(calibrated, design, share, share * design / calibrated)
+
+
+def _fit_to_positions(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph]
+) -> tuple[PositionFit | None, tuple[str, ...]]:
+    """Fit a similarity to the cameras' positions without moving the model; None if there are too few.
+
+    Returns:
+        The fit, and the names of the photographs that have a position.
+    """
+    centres = camera_centres(model)
+    own = [photograph for photograph in photographs if photograph.name in centres]
+    positions = given_positions(own)
+    if len(positions.names) < MIN_POSITIONS:
+        return None, positions.names
+    located = np.array([centres[name] for name in positions.names])
+    return fit_positions(located, positions, positions.frame(), find_down(model, own)), positions.names
+
+
+def lens_notes(choice: LensChoice) -> tuple[str, ...]:
+    """Describe a choice for the report, where the surveyor should know of it."""
+    return (*_focal_notes(choice), *_height_notes(choice.heights), *_distortion_notes(choice.trials))
+
+
+def _focal_notes(choice: LensChoice) -> list[str]:
+    axes = f"the directions of the photographs differ by {choice.spread_deg:.0f} degrees"
+    if choice.known and choice.freed:
+        prior_px, refined_px = choice.trials[0].focal_px, choice.trials[-1].focal_px
+        return [f"The focal length was refined from {prior_px:.1f} to {refined_px:.1f} px: {axes}."]
+    if not choice.known and choice.spread_deg < MIN_SPREAD_DEG:
+        return [
+            f"The photographs do not state the focal length, and matches alone determine it badly ({axes}): unless "
+            "ground control or differential GPS correct it, heights may be wrong by tens of percent. Photographs with "
+            "EXIF would help."
+        ]
+    return []
+
+
+def _height_notes(heights: Heights | None) -> list[str]:
+    if heights is None:
+        return []
+    calibrated = ("calibrated", heights.calibrated_px, heights.calibrated_share)
+    design = ("design", heights.design_px, heights.design_share)
+    used, other = (design, calibrated) if heights.prefers_design else (calibrated, design)
+    return [
+        f"The maker states two focal lengths. With the {used[0]} one ({used[1]:.1f} px) the flight height is "
+        f"{used[2]:.1%} of the drone's own, with the {other[0]} one ({other[1]:.1f} px) {other[2]:.1%}: the {used[0]} "
+        "one was used. The drone's height is above take-off, not above the ground."
+    ]
+
+
+def _distortion_notes(trials: Sequence[LensTrial]) -> list[str]:
+    """Explain why there are no more terms of distortion, where positions were the reason."""
+    *others, best = trials
+    richer = [t for t in others if TERMS[t.lens] > TERMS[best.lens] and t.error_px < MAX_ERROR_RATIO * best.error_px]
+    if not richer or best.off_m is None:
+        return []
+    other, terms = min(richer, key=lambda trial: trial.error_px), TERMS[best.lens]
+    return [
+        f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {TERMS[other.lens]} the matches would fit "
+        f"better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras fit their positions worse "
+        f"({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be curved."
+    ]

@@ -1,4 +1,4 @@
-"""Photographs in a scene: copied where nothing changes, upright and evened where something does."""
+"""Photographs of a scene are copied where nothing changes, else turned upright and corrected."""
 
 from pathlib import Path
 
@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import Base
 
-from tidefield.survey.colour import Evening
-from tidefield.survey.copy_images import place_photographs, tangent_map
+from tidefield.survey.colour import ExposureCorrection
+from tidefield.survey.export import tangent_map, write_images
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.survey import Photograph
@@ -25,9 +25,9 @@ def quiet(done: int, whole: int) -> None:
     assert 0 <= done <= whole
 
 
-def evening(gains: list[float], helps: bool = True, falloff: float = 0.0) -> Evening:
+def correction(gains: list[float], helps: bool = True, falloff: float = 0.0) -> ExposureCorrection:
     gain = np.outer(gains, np.ones(3))
-    return Evening(gain, np.full((3, 3), [falloff, 0, 0]), 0.2, 0.1, 0.1, helps, falloff != 0)
+    return ExposureCorrection(gain, np.full((3, 3), [falloff, 0, 0]), 0.2, 0.1, 0.1, helps, falloff != 0)
 
 
 @pytest.fixture
@@ -39,8 +39,8 @@ def photographs(tmp_path: Path) -> tuple[Photograph, ...]:
     return read_survey(tmp_path / "card").photographs
 
 
-def test_what_needs_no_change_is_copied_and_the_rest_stands_upright(photographs, tmp_path: Path):
-    place_photographs(photographs, tmp_path / "images", None, LENSES, quiet)
+def test_unchanged_files_are_copied_and_rotated_ones_turned_upright(photographs, tmp_path: Path):
+    write_images(photographs, tmp_path / "images", None, LENSES, quiet)
     for photograph in photographs[:2]:
         assert (tmp_path / "images" / photograph.name).read_bytes() == photograph.path.read_bytes()
     with Image.open(tmp_path / "images" / "turned.jpg") as picture:
@@ -51,12 +51,12 @@ def test_what_needs_no_change_is_copied_and_the_rest_stands_upright(photographs,
 
 
 def test_gains_that_do_not_help_change_nothing(photographs, tmp_path: Path):
-    place_photographs(photographs, tmp_path / "images", evening([2, 1, 1], helps=False), LENSES, quiet)
+    write_images(photographs, tmp_path / "images", correction([2, 1, 1], helps=False), LENSES, quiet)
     assert (tmp_path / "images" / "a b.jpg").read_bytes() == photographs[0].path.read_bytes()
 
 
-def test_gains_are_divided_out_and_the_exif_stays(photographs, tmp_path: Path):
-    place_photographs(photographs, tmp_path / "images", evening([0.8, 1.25, 1.0]), LENSES, quiet)
+def test_gains_are_divided_out_and_exif_is_kept(photographs, tmp_path: Path):
+    write_images(photographs, tmp_path / "images", correction([0.8, 1.25, 1.0]), LENSES, quiet)
     for photograph, gain in zip(photographs, (0.8, 1.25, 1.0), strict=True):
         with Image.open(tmp_path / "images" / photograph.name) as picture:
             ours = np.asarray(picture).astype(float)
@@ -67,7 +67,7 @@ def test_gains_are_divided_out_and_the_exif_stays(photographs, tmp_path: Path):
 
 
 def test_the_falloff_brightens_the_corners(photographs, tmp_path: Path):
-    place_photographs(photographs, tmp_path / "images", evening([1, 1, 1], falloff=-0.5), LENSES, quiet)
+    write_images(photographs, tmp_path / "images", correction([1, 1, 1], falloff=-0.5), LENSES, quiet)
     with Image.open(tmp_path / "images" / "flight é" / "b.png") as picture:
         ours = np.asarray(picture).astype(float)
     before = upright(photographs[1]).astype(float)
@@ -80,22 +80,22 @@ def test_tiffs_stay_tiffs(tmp_path: Path):
     for k in range(3):
         camera_files.photograph(tmp_path / "card" / f"{k}.tif", SIZE)
     photographs = read_survey(tmp_path / "card").photographs
-    place_photographs(photographs, tmp_path / "images", evening([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
+    write_images(photographs, tmp_path / "images", correction([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
     with Image.open(tmp_path / "images" / "0.tif") as picture:
         assert picture.format == "TIFF"
         np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
 
 
-def test_what_an_earlier_run_left_goes(photographs, tmp_path: Path):
+def test_files_of_an_earlier_run_are_removed(photographs, tmp_path: Path):
     (tmp_path / "images" / "old").mkdir(parents=True)
     (tmp_path / "images" / "old" / "gone.jpg").write_bytes(b"x")
-    place_photographs(photographs, tmp_path / "images", None, LENSES, quiet)
+    write_images(photographs, tmp_path / "images", None, LENSES, quiet)
     found = {path.relative_to(tmp_path / "images").as_posix() for path in (tmp_path / "images").rglob("*.*")}
     assert found == {photograph.name for photograph in photographs}
     assert not (tmp_path / "images" / "old").exists()
 
 
-def test_angles_between_the_grid_are_those_of_the_lens():
+def test_interpolated_angles_equal_the_lens_model():
     lens = pycolmap.Camera(model="RADIAL", width=403, height=301, params=[320, 200, 150, -0.2, 0.1], camera_id=1)
     found = tangent_map(lens)
     assert found.shape == (301, 403)

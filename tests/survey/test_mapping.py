@@ -1,4 +1,4 @@
-"""A lens gets the terms of distortion that it has, and none that would bend the model."""
+"""A lens gets the terms of distortion that it has, and none that would make the model curved."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
 
 from tidefield.survey.georeference.adjustment import adjustment_options
-from tidefield.survey.sfm.lens_choice import SPREAD_DEG, TERMS, Choice, Trial, best_of, choose_lens, told
+from tidefield.survey.sfm.mapping import MIN_SPREAD_DEG, TERMS, LensChoice, LensTrial, best_of, choose_lens, lens_notes
 from tidefield.survey.survey import LensPrior
 
 
@@ -45,14 +45,14 @@ def test_the_terms_that_a_lens_has_are_found(own: pycolmap.Camera, lens: str):
     np.testing.assert_allclose(np.asarray(found.params)[-TERMS[lens] :], true, atol=0.02)
 
 
-def test_without_enough_positions_matches_alone_decide():
+def test_without_enough_positions_matches_decide():
     flight = fly(camera=camera(-0.25, 0.2), noise_px=0.2)
     trials = choose_lens(pycolmap.Reconstruction(flight.model), flight.survey.photographs[:3], True, quiet).trials
     assert trials[-1].lens == "RADIAL"
     assert all(trial.off_m is None for trial in trials)
 
 
-def test_an_unknown_focal_length_is_refined():
+def test_a_focal_length_without_prior_is_refined():
     flight = fly(lines=4, each=6)
     model = pycolmap.Reconstruction(flight.model)
     (own,) = model.cameras.values()
@@ -60,7 +60,7 @@ def test_an_unknown_focal_length_is_refined():
     choice = choose_lens(model, flight.survey.photographs, False, quiet)
     (found,) = model.cameras.values()
     assert choice.freed
-    assert "heights may be wrong" in told(choice)[0]
+    assert "heights may be wrong" in lens_notes(choice)[0]
     assert found.focal_length_x != pytest.approx(1.1 * FOCAL, rel=1e-3)
     assert model.compute_mean_reprojection_error() < 0.45
 
@@ -75,43 +75,43 @@ def test_an_unknown_focal_length_is_refined():
         ((0.50, 0.45, 0.40), (None, None, None), "OPENCV"),
     ],
 )
-def test_a_richer_lens_must_be_worth_it_and_not_bend_the_model(errors, offs, lens):
-    trials = [Trial(*values, FOCAL) for values in zip(TERMS, errors, offs, strict=True)]
+def test_more_terms_must_reduce_the_error_and_not_curve_the_model(errors, offs, lens):
+    trials = [LensTrial(*values, FOCAL) for values in zip(TERMS, errors, offs, strict=True)]
     assert best_of(trials).lens == lens
 
 
-def test_the_surveyor_is_told_where_positions_spoke_against_a_richer_lens():
+def test_notes_explain_why_positions_ruled_out_more_terms():
     simple, radial, full = (
-        Trial(*values, FOCAL)
+        LensTrial(*values, FOCAL)
         for values in (("SIMPLE_RADIAL", 0.46, 0.59), ("RADIAL", 0.43, 0.65), ("OPENCV", 0.42, 0.67))
     )
-    (sentence,) = told(Choice((radial, full, simple), known=True, freed=False, spread_deg=3.0))
+    (sentence,) = lens_notes(LensChoice((radial, full, simple), known=True, freed=False, spread_deg=3.0))
     assert "0.42 px instead of 0.46" in sentence
     assert "0.67 m instead of 0.59" in sentence
-    assert told(Choice((simple, radial, full), known=True, freed=False, spread_deg=3.0)) == ()
+    assert lens_notes(LensChoice((simple, radial, full), known=True, freed=False, spread_deg=3.0)) == ()
 
 
-def test_a_wrong_focal_length_is_corrected_where_the_photographs_look_in_different_directions():
+def test_oblique_photographs_correct_a_wrong_focal_length():
     flight = fly(lines=4, each=6, tilt_deg=25.0, noise_px=0.2)
     model = adjusted_with(flight, 1.04 * FOCAL)
     choice = choose_lens(model, flight.survey.photographs, True, quiet)
-    assert choice.spread_deg > SPREAD_DEG
+    assert choice.spread_deg > MIN_SPREAD_DEG
     assert choice.freed
     assert model.cameras[1].focal_length_x == pytest.approx(FOCAL, rel=0.005)
-    assert f"refined from {1.04 * FOCAL:.1f} to" in told(choice)[0]
+    assert f"refined from {1.04 * FOCAL:.1f} to" in lens_notes(choice)[0]
 
 
-def test_photographs_straight_down_keep_the_focal_length_that_is_stated():
+def test_vertical_photographs_keep_the_prior_focal_length():
     flight = fly(lines=4, each=6, noise_px=0.2)
     model = adjusted_with(flight, 1.04 * FOCAL)
     choice = choose_lens(model, flight.survey.photographs, True, quiet)
-    assert choice.spread_deg < SPREAD_DEG
+    assert choice.spread_deg < MIN_SPREAD_DEG
     assert not choice.freed
     assert model.cameras[1].focal_length_x == pytest.approx(1.04 * FOCAL)
 
 
 def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
-    """As structure from motion leaves it that was told a wrong focal length."""
+    """The result of structure from motion with a wrong focal length."""
     model = pycolmap.Reconstruction(flight.model)
     model.cameras[1].params = [focal_px, *model.cameras[1].params[1:]]
     options = adjustment_options()
@@ -121,7 +121,7 @@ def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
 
 
 @pytest.mark.parametrize(("true", "design", "used"), [(1.0, 1.04, 1.0), (1.04, 1.0, 1.0), (1.04, 1.035, 1.04)])
-def test_of_two_stated_focal_lengths_the_one_is_held_whose_flight_height_is_the_drones(true, design, used):
+def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_chosen(true, design, used):
     """The stated calibration is `true` times the real focal length; the drone's own height is right."""
     flight = fly(lines=4, each=6, noise_px=0.2)
     lens = LensPrior(true * FOCAL, None, None, "DJI dewarp data", True, design * FOCAL)
@@ -138,6 +138,6 @@ def test_of_two_stated_focal_lengths_the_one_is_held_whose_flight_height_is_the_
     if design == 1.035:
         assert choice.heights is None
     else:
-        assert ("the design one was used" if true > design else "the calibrated one was used") in told(choice)[0]
+        assert ("the design one was used" if true > design else "the calibrated one was used") in lens_notes(choice)[0]
         assert choice.heights is not None
         assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)
