@@ -173,4 +173,7 @@ def test_noise_is_periodic_bounded_and_takes_its_lattice_values() -> None:
     # Octave 0 is neither turned nor shifted: 256 cells of 2 m are one period.
     assert torch.allclose(noise.octave(xy + 512.0, 2.0, 0), values, atol=2e-3)
     assert torch.allclose(noise.octave(torch.tensor([[6.0], [10.0]]), 2.0, 0)[:, 0], noise.table[0, :, 5, 3], atol=1e-4)
+    west, east = noise.table[0, :, 5, 3], noise.table[0, :, 5, 4]
+    quarter = noise.octave(torch.tensor([[6.5], [10.0]]), 2.0, 0)[:, 0]
+    assert torch.allclose(quarter, torch.lerp(west, east, 5 / 32), atol=1e-4)
     assert 0.3 < float(noise.fractal(xy, 9.0, 4).abs().max()) < 1.6

@@ -67,7 +67,7 @@ class _LeafPlanes(_Primitives):
     def meet(self, origin: Float[Tensor, "3 #N"], direction: Float[Tensor, "3 #N"]) -> tuple[Tensor, Tensor, Tensor]:
         """Intersect each plane with a ray: depth and the coordinates a, b."""
         offset = self.centre - origin
-        # A ray in the spray's own plane misses it: the division gives inf or NaN, which no comparison accepts.
+        # A ray in the spray's plane misses it: the division gives inf or NaN, which no comparison accepts.
         depth = dot(offset, self.normal) / dot(direction, self.normal)
         q = direction * depth - offset
         return depth, dot(q, self.u), dot(q, self.v)
@@ -172,7 +172,7 @@ class Plants:
 
     @property
     def highest_m(self) -> float:
-        """A height that no plant exceeds; -inf where there are none."""
+        """A height that no plant exceeds; -inf without plants."""
         stems = self.stems
         tops = [self.leaves.centre[2] + self.leaves.radius, stems.start[2] + stems.radius, stems.end[2] + stems.radius]
         return max((float(top.max()) for top in tops if len(top)), default=-math.inf)

@@ -104,14 +104,14 @@ class Parallel:
 
     @staticmethod
     def straight_down(extent: Extent, height_m: float, device: torch.device | str | None = None) -> Parallel:
-        """Look down on an extent from a height, north up: one ray through every node."""
+        """View an extent from above, north up: one ray through every node."""
         axes = torch.eye(3, device=device)
         corner = axes.new_tensor([extent.west_m, extent.north_m, height_m])
         return Parallel(corner, axes[0], -axes[1], -axes[2], extent.columns, extent.rows, extent.cell_m)
 
     @staticmethod
     def along_sun(extent: Extent, low_m: float, high_m: float, sun: Float[Tensor, "3"], cell_m: float) -> Parallel:
-        """Look from the sun at the box over an extent between two heights; `sun` points at it."""
+        """View the box over an extent, between two heights, from the sun; `sun` is the unit vector towards it."""
         forward = -sun
         right = torch.linalg.cross(forward, forward.new_tensor([0.0, 0.0, 1.0]))
         right = right / right.norm() if float(right.norm()) > 1e-3 else forward.new_tensor([1.0, 0.0, 0.0])
@@ -178,7 +178,7 @@ def height_field_depth(
     depth = ((height.values.max() - origin[2]) / fall).clamp(min=0)
     scale = 2 / fall.new_tensor([*height.extent.size_m, 2.0])[:, None]
     shift = fall.new_tensor([height.extent.west_m, height.extent.south_m, 0.0])[:, None]
-    # East and north in the raster's own [-1, 1]; the height stays in metres.
+    # East and north in the raster's [-1, 1]; the height stays in metres.
     start = (origin - shift) * scale - fall.new_tensor([1.0, 1.0, 0.0])[:, None]
     start, step, rate, depth = torch.broadcast_tensors(start, direction * scale, rate, depth)
     depth, gap = _sphere_trace(height.values[None], start, step, rate[0], depth[0])

@@ -56,9 +56,9 @@ class Flight:
     water_motion: float = 0.0
     """Seconds between photographs, for the wavelets; 0 freezes them."""
     sun_elevation_deg: float | None = None
-    """Drawn from the seed between 42 and 60 where None."""
+    """None draws it between 42 and 60 from the seed."""
     wetness: float | None = None
-    """0 to 1; the category's own where None."""
+    """0 to 1; None for that of the category."""
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ def _add_pools(
     warp: Float[Tensor, "2 P"],
     random: np.random.Generator,
 ) -> None:
-    """Press shallow hollows into the ground and fill each to its own level; changes `ground` and `water`."""
+    """Press shallow hollows into the ground and fill each to a level; changes `ground` and `water`."""
     width, height = extent.size_m
     nodes = extent.nodes()
     for _ in range(random.poisson(settings.pools_per_ha * width * height / 1e4)):
@@ -203,7 +203,7 @@ def _add_pools(
         y = nodes[1, node] - centre[1] + 0.7 * radius * warp[1, node]
         a, b = x * math.cos(turn) + y * math.sin(turn), (y * math.cos(turn) - x * math.sin(turn)) / stretch
         inside = smoothstep(1.25, 0.35, torch.hypot(a, b) / radius)
-        # A hollow flattens the ground, ripples and all, towards its own floor.
+        # A hollow flattens the ground, ripples and all, towards its floor.
         floor = level - depth * inside
         ground[node] = torch.lerp(ground[node], torch.minimum(ground[node], floor), inside)
         rim = node[(inside > 0.04) & (inside < 0.2)]

@@ -64,9 +64,9 @@ def _reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstr
     point, camera, uv = (x.cpu().numpy() for x in (points.point_index, points.camera_index, points.uv_px))
     slot = np.zeros(len(point), dtype=int)
     for i, name in enumerate(names):
-        own = np.nonzero(camera == i)[0]
-        slot[own] = np.arange(len(own))
-        image = pycolmap.Image(name=name, keypoints=uv[own].astype(np.float64), camera_id=1, image_id=i + 1)
+        rows = np.nonzero(camera == i)[0]
+        slot[rows] = np.arange(len(rows))
+        image = pycolmap.Image(name=name, keypoints=uv[rows].astype(np.float64), camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, _camera_from_world(cameras.T_world_camera[i]))
     photographs = survey.photographs.cpu().numpy()
     order = np.argsort(point, kind="stable")
