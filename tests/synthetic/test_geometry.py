@@ -1,39 +1,40 @@
-"""Rays against height field and plants, compared with brute force."""
+"""Intersect rays with height field and plants, compared with brute force; grids and noise."""
 
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from tidefield.geometry.cameras import Cameras
-from tidefield.synthetic.march import march
-from tidefield.synthetic.primitives import Leaves, Plants, Stems, box_pairs
-from tidefield.synthetic.raster import Extent, Raster
-from tidefield.synthetic.views import Pinhole, along_the_sun, straight_down
+from tidefield.synthetic import grids
+from tidefield.synthetic.foliage import Leaves, Plants, Stems
+from tidefield.synthetic.grids import Extent, Noise, Raster, box_pairs, resolved, smoothstep
+from tidefield.synthetic.rays import Parallel, Pinhole, height_field_depth
 
 EXTENT = Extent(-6.0, -5.0, 61, 51, 0.2)
 
 
-def bumpy() -> Raster:
+def bumpy_surface() -> Raster:
     x, y = EXTENT.nodes()
     return Raster.of(EXTENT, 0.8 * torch.sin(1.3 * x) * torch.cos(0.9 * y) + 0.3 * torch.sin(4 * x + y))
 
 
-def some_plants(random: np.random.Generator) -> Plants:
+def random_plants(random: np.random.Generator) -> Plants:
     def draw(low: float, high: float, *shape: int) -> torch.Tensor:
         return torch.from_numpy(random.uniform(low, high, shape)).float()
 
-    place = torch.cat([draw(-4, 4, 2, 40), draw(0.5, 3, 1, 40)])
+    centre = torch.cat([draw(-4, 4, 2, 40), draw(0.5, 3, 1, 40)])
     u = draw(-0.5, 0.5, 3, 40)
     v = torch.linalg.cross(u, draw(-1, 1, 3, 40), dim=0)
     leaves = Leaves(
-        place, u, v, draw(3, 9, 40).round(), draw(0, 6, 40), draw(0, 0.8, 40), draw(0, 1, 3, 40), draw(0, 1, 40)
+        centre, u, v, draw(3, 9, 40).round(), draw(0, 6, 40), draw(0, 0.8, 40), draw(0, 1, 3, 40), draw(0, 1, 40)
     )
     start = torch.cat([draw(-4, 4, 2, 15), draw(-1, 1, 1, 15)])
     return Plants(leaves, Stems(start, start + draw(-1.5, 1.5, 3, 15), draw(0.02, 0.3, 15), draw(0, 1, 3, 15)))
 
 
-def a_camera(width: int = 40, tilt: float = 0.4) -> Cameras:
+def make_camera(width: int = 40, tilt: float = 0.4) -> Cameras:
     sin, cos = math.sin(tilt), math.cos(tilt)
     pose = torch.tensor([[[1.0, 0, 0, 0.3], [0, -cos, sin, -4.0], [0, -sin, -cos, 9.0]]])
     size = torch.tensor([[width, width * 3 // 4]])
@@ -42,7 +43,7 @@ def a_camera(width: int = 40, tilt: float = 0.4) -> Cameras:
 
 
 def brute_force(plants: Plants, origin: np.ndarray, direction: np.ndarray) -> float:
-    """Nearest meeting of one ray: leaves by their definition, stems by walking along the ray."""
+    """Return the first depth of one ray: leaves by their definition, stems by small steps along the ray."""
     nearest = math.inf
     leaves = plants.leaves
     for i in range(len(leaves)):
@@ -62,35 +63,35 @@ def brute_force(plants: Plants, origin: np.ndarray, direction: np.ndarray) -> fl
     return nearest
 
 
-def test_plants_are_met_where_brute_force_meets_them() -> None:
-    plants = some_plants(np.random.default_rng(1))
+def test_plant_depths_match_brute_force() -> None:
+    plants = random_plants(np.random.default_rng(1))
     sun = torch.tensor([0.5, 0.3, 0.8])
     views = [
-        Pinhole(a_camera(), split=2),
-        straight_down(EXTENT, 8.0),
-        along_the_sun(EXTENT, -2.0, 5.0, sun / sun.norm(), 0.25),
+        Pinhole(make_camera(), split=2),
+        Parallel.straight_down(EXTENT, 8.0),
+        Parallel.along_sun(EXTENT, -2.0, 5.0, sun / sun.norm(), 0.25),
     ]
     for view in views:
         depth, number = plants.nearest(view)
         ray = torch.arange(0, len(depth), len(depth) // 250)
         origin, direction = (x.expand(3, len(ray)).double().numpy() for x in view.rays(ray))
         expected = np.array([brute_force(plants, o, d) for o, d in zip(origin.T, direction.T, strict=True)])
-        met = np.isfinite(expected)
-        assert 10 < met.sum() < len(ray)
+        hit = np.isfinite(expected)
+        assert 10 < hit.sum() < len(ray)
         # Rays along an edge may fall on either side of it in different arithmetic.
-        assert (np.isfinite(depth[ray].numpy()) == met).mean() > 0.99
-        both = met & np.isfinite(depth[ray].numpy())
+        assert (np.isfinite(depth[ray].numpy()) == hit).mean() > 0.99
+        both = hit & np.isfinite(depth[ray].numpy())
         assert (np.abs(depth[ray].numpy()[both] - expected[both]) < 6e-3).mean() > 0.98
         assert torch.equal(number >= 0, torch.isfinite(depth))
 
 
-def test_the_ground_is_met_where_small_steps_meet_it_first() -> None:
-    raster = bumpy()
+def test_height_field_depths_match_small_steps() -> None:
+    raster = bumpy_surface()
     for tilt in (0.0, 0.9):
-        view = Pinhole(a_camera(24, tilt))
+        view = Pinhole(make_camera(24, tilt))
         ray = torch.arange(view.columns * view.rows)
         origin, direction = view.rays(ray)
-        depth = march(raster, raster.steepest(), origin, direction)
+        depth = height_field_depth(raster, raster.max_slope(), origin, direction)
         walk = torch.arange(5, 30, 0.004)[:, None]
         points = origin[:, None] + direction[:, None] * walk
         gap = points[2] - raster.sample(points[:2].reshape(2, -1))[0].reshape(points.shape[1:])
@@ -104,32 +105,75 @@ def test_the_ground_is_met_where_small_steps_meet_it_first() -> None:
         assert (at[2] - raster.sample(at[:2])[0])[below].abs().max() < 2e-4
 
 
-def test_rays_that_rise_or_run_level_meet_no_ground() -> None:
+def test_rising_and_level_rays_miss_the_ground() -> None:
     direction = torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.0, 0.3], [0.0, 0.5, 0.4]])
-    depth = march(bumpy(), bumpy().steepest(), torch.tensor([[0.0], [0.0], [5.0]]), direction)
+    depth = height_field_depth(
+        bumpy_surface(), bumpy_surface().max_slope(), torch.tensor([[0.0], [0.0], [5.0]]), direction
+    )
     assert torch.isinf(depth).all()
 
 
-def test_no_part_of_the_surface_is_steeper_than_its_bound() -> None:
-    raster = bumpy()
+def test_max_slope_is_a_tight_bound() -> None:
+    raster = bumpy_surface()
     random = torch.Generator().manual_seed(0)
     xy = torch.rand(2, 4000, generator=random) * torch.tensor([[11.8], [9.8]]) + torch.tensor([[-5.9], [-4.9]])
     angle = torch.rand(4000, generator=random) * 2 * math.pi
     step = 0.01 * torch.stack([angle.cos(), angle.sin()])
     rise = (raster.sample(xy + step)[0] - raster.sample(xy)[0]).abs() / 0.01
-    assert 0.8 * raster.steepest() < rise.max() < 1.001 * raster.steepest()
+    assert 0.8 * raster.max_slope() < rise.max() < 1.001 * raster.max_slope()
 
 
-def test_boxes_are_emptied_into_all_their_cells_once() -> None:
+def test_box_pairs_list_every_cell_once() -> None:
     boxes = torch.tensor([[1, 3, 2], [0, 2, 5], [2, 3, 1], [1, 4, 9]])
     pairs = [torch.stack(pair, dim=1) for pair in box_pairs(boxes, columns=10)]
     expected = {(0, r * 10 + c) for r in (0, 1) for c in (1, 2)} | {(1, r * 10 + 3) for r in (2, 3, 4)}
     assert sorted(map(tuple, torch.cat(pairs).tolist())) == sorted(expected)
 
 
-def test_a_raster_gives_back_its_nodes_and_goes_on_beyond_its_border() -> None:
-    raster = bumpy()
+def test_raster_interpolates_nodes_exactly_and_extends_its_border() -> None:
+    raster = bumpy_surface()
     nodes = EXTENT.nodes()
     assert torch.allclose(raster.sample(nodes)[0], raster.values.reshape(-1), atol=1e-5)
     outside = raster.sample(torch.tensor([[-100.0], [EXTENT.south_m]]))
     assert torch.allclose(outside[0, 0], raster.values[0, 0, 0])
+
+
+def test_blocks_of_box_pairs_do_not_change_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = torch.Generator().manual_seed(3)
+    first = torch.randint(0, 20, (2, 30), generator=random)
+    boxes = torch.cat([first, first + torch.randint(-1, 6, (2, 30), generator=random)])
+    at_once = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
+    monkeypatch.setattr(grids, "_PAIRS", 17)
+    in_blocks = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
+    assert len(at_once) == 1
+    assert len(in_blocks) > 10
+    assert torch.equal(torch.cat(in_blocks, dim=1), at_once[0])
+
+
+def test_smoothstep_rises_falls_and_is_symmetric() -> None:
+    x = np.array([-1.0, 0.0, 0.25, 0.5, 0.75, 1.0, 2.0])
+    assert np.allclose(smoothstep(0.0, 1.0, x), [0, 0, 5 / 32, 0.5, 27 / 32, 1, 1])
+    assert np.allclose(smoothstep(1.0, 0.0, x), 1 - smoothstep(0.0, 1.0, x))
+    assert torch.allclose(smoothstep(0.0, 1.0, torch.from_numpy(x)), torch.from_numpy(smoothstep(0.0, 1.0, x)))
+
+
+def test_detail_fades_out_around_the_nyquist_limit() -> None:
+    share = resolved(0.6, torch.tensor([0.1, 0.2, 0.3, 0.4, 0.8]))
+    assert torch.equal(share[:2], torch.ones(2))
+    assert 0 < share[2] < 0.5
+    assert torch.equal(share[3:], torch.zeros(2))
+
+
+def test_noise_is_periodic_bounded_and_takes_its_lattice_values() -> None:
+    noise = Noise.make(np.random.default_rng(5), channels=3)
+    xy = torch.rand(2, 500, generator=torch.Generator().manual_seed(0)) * 200
+    values = noise.octave(xy, 2.0, 0)
+    assert values.shape == (3, 500)
+    assert values.abs().max() <= 1
+    # Octave 0 is neither turned nor shifted: 256 cells of 2 m are one period.
+    assert torch.allclose(noise.octave(xy + 512.0, 2.0, 0), values, atol=2e-3)
+    assert torch.allclose(noise.octave(torch.tensor([[6.0], [10.0]]), 2.0, 0)[:, 0], noise.table[0, :, 5, 3], atol=1e-4)
+    west, east = noise.table[0, :, 5, 3], noise.table[0, :, 5, 4]
+    quarter = noise.octave(torch.tensor([[6.5], [10.0]]), 2.0, 0)[:, 0]
+    assert torch.allclose(quarter, torch.lerp(west, east, 5 / 32), atol=1e-4)
+    assert 0.3 < float(noise.fractal(xy, 9.0, 4).abs().max()) < 1.6

@@ -1,4 +1,4 @@
-"""The procedural tidal flat: the same from the same seed, exact in depth and map, and worth photographing."""
+"""Check synthetic surveys: reproducible from a seed, exact in depth and map, with overlap and contrast."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,9 +10,9 @@ import torch
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey
-from tidefield.synthetic.raster import Extent
-from tidefield.synthetic.shading import ground_radiance
-from tidefield.synthetic.views import Pinhole
+from tidefield.synthetic.grids import Extent
+from tidefield.synthetic.rays import Pinhole
+from tidefield.synthetic.survey import _near_far
 
 
 @cache
@@ -21,18 +21,18 @@ def survey(category: str = "tidal_trees") -> Survey:
 
 
 def points_of(survey: Survey, view: int) -> torch.Tensor:
-    """World points [P 3] of a view's pixels."""
+    """Return the world points [P 3] of a view's pixels."""
     camera, depth = survey.cameras[view], survey.depth[view].reshape(-1, 1)
     return camera.position_world + camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0] * depth
 
 
-def wet_and_deep(survey: Survey, xy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Wetness and water depth at ground points."""
-    maps = survey.flat.ground.maps.sample(xy)
-    return maps[5], maps[6]
+def wetness_and_depth(survey: Survey, xy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return wetness and water depth at ground points."""
+    at = survey.flat.ground.sample(xy)
+    return at.wetness, at.water_depth_m
 
 
-def test_the_same_seed_gives_the_same_pixels_on_any_number_of_cores() -> None:
+def test_a_seed_gives_the_same_pixels_on_any_number_of_cores() -> None:
     before = torch.get_num_threads()
     made = []
     try:
@@ -49,12 +49,12 @@ def test_the_same_seed_gives_the_same_pixels_on_any_number_of_cores() -> None:
     assert (other.photographs.float() - made[0].photographs.float()).abs().mean() > 5
 
 
-def test_an_unknown_category_is_named_with_the_known_ones() -> None:
+def test_error_for_an_unknown_category_lists_the_categories() -> None:
     with pytest.raises(SceneError, match=r"'lagoon'.*tidal_trees.*deep_water"):
         make_survey("lagoon", seed=0)
 
 
-def test_points_of_the_depth_lie_on_the_ground_or_above_it_where_plants_are() -> None:
+def test_depth_points_lie_on_the_ground_or_on_plants_above_it() -> None:
     points = torch.cat([points_of(survey("vegetation"), v) for v in range(0, 30, 6)]).T
     above = points[2] - survey("vegetation").flat.surface.sample(points[:2])[0]
     assert above.min() > -3e-4
@@ -63,7 +63,7 @@ def test_points_of_the_depth_lie_on_the_ground_or_above_it_where_plants_are() ->
     assert 0.5 < above.max() < 6.0
 
 
-def test_two_views_agree_exactly_on_what_they_both_see() -> None:
+def test_depths_of_two_views_agree() -> None:
     scene = survey("vegetation")
     points = points_of(scene, 4)[::97]
     uv, z = scene.cameras[5].project(points)
@@ -82,10 +82,10 @@ def test_two_views_agree_exactly_on_what_they_both_see() -> None:
     assert (difference.abs() < 1e-4).float().mean() > 0.7
 
 
-def test_dry_ground_looks_the_same_from_everywhere_in_the_photographs() -> None:
+def test_dry_ground_has_the_same_colour_in_all_photographs() -> None:
     scene = survey("ground_textures")
     points = points_of(scene, 4)
-    wet, deep = wet_and_deep(scene, points.T[:2])
+    wet, deep = wetness_and_depth(scene, points.T[:2])
     on_ground = (points[:, 2] - scene.flat.surface.sample(points.T[:2])[0]).abs() < 1e-3
     uv, _ = scene.cameras[5].project(points)
     inside = ((uv[0] > 1) & (uv[0] < scene.cameras.size_px[0] - 1)).all(1) & (wet < 0.35) & (deep == 0) & on_ground
@@ -97,17 +97,17 @@ def test_dry_ground_looks_the_same_from_everywhere_in_the_photographs() -> None:
     assert (there - here).abs().mean() < 0.025
 
 
-def test_wet_places_shine_by_direction_and_dry_mud_does_not() -> None:
+def test_only_wet_ground_and_water_are_specular() -> None:
     flat = survey().flat
     xy = flat.extent.nodes()[:, ::37]
-    wet, deep = wet_and_deep(survey(), xy)
+    wet, deep = wetness_and_depth(survey(), xy)
     footprint = torch.full_like(wet, 0.1)
-    seen = []
+    radiance = []
     for mirrors_the_sun in (True, False):
         eye = flat.light.sun * torch.tensor([-1.0, -1.0, 1.0]) if mirrors_the_sun else torch.tensor([0.0, 0.0, 1.0])
         to_eye = eye[:, None].expand(3, xy.shape[1])
-        seen.append(ground_radiance(flat.ground, flat.light, flat.noise, xy, to_eye, footprint, 0.0))
-    change = (seen[0] - seen[1]).abs().amax(0)
+        radiance.append(flat.ground.radiance(flat.light, xy, to_eye, footprint, 0.0))
+    change = (radiance[0] - radiance[1]).abs().amax(0)
     dry, soaked, water = (wet < 0.35) & (deep == 0), (wet > 0.9) & (deep == 0), deep > 0.1
     assert min(int(dry.sum()), int(soaked.sum()), int(water.sum())) > 50
     assert change[dry].max() == 0
@@ -115,7 +115,7 @@ def test_wet_places_shine_by_direction_and_dry_mud_does_not() -> None:
     assert change[water].median() > 0.1
 
 
-def test_the_map_is_what_a_camera_far_above_sees() -> None:
+def test_orthophoto_matches_a_camera_far_above() -> None:
     scene, cell = survey("vegetation"), 0.25
     extent = Extent(-12.0, -9.0, 97, 73, cell)
     ortho = scene.flat.orthophoto(extent)
@@ -130,7 +130,7 @@ def test_the_map_is_what_a_camera_far_above_sees() -> None:
         gain=torch.ones(1, 3),
     )
     colour, depth = scene.flat.render(camera)
-    wet, deep = wet_and_deep(scene, extent.nodes())
+    wet, deep = wetness_and_depth(scene, extent.nodes())
     dry = ((wet < 0.35) & (deep == 0)).reshape(73, 97).flip(0)
     assert dry.float().mean() > 0.2
     assert (colour[0] - ortho.colour)[dry].abs().mean() < 0.01
@@ -138,7 +138,7 @@ def test_the_map_is_what_a_camera_far_above_sees() -> None:
 
 
 @pytest.mark.parametrize("category", list(CATEGORIES))
-def test_every_category_makes_a_survey_with_overlap(category: str) -> None:
+def test_every_category_has_overlap_contrast_and_sparse_points(category: str) -> None:
     scene = survey(category)
     assert scene.photographs.shape == (30, 72, 96, 3)
     assert torch.isfinite(scene.depth).all()
@@ -152,22 +152,21 @@ def test_every_category_makes_a_survey_with_overlap(category: str) -> None:
     brightness = scene.photographs.float().mean() / 255
     assert 0.2 < brightness < 0.6
     assert scene.photographs.float().std(dim=(1, 2)).mean() > 8
-    # The sparse points leave no photograph of land without any.
     assert len(scene.points.xyz_world) > 300
 
 
-def test_the_categories_are_what_they_are_called() -> None:
+def test_categories_differ_as_their_names_say() -> None:
     water, plants = {}, {}
     for category in CATEGORIES:
         flat = survey(category).flat
-        water[category] = float((flat.ground.maps.values[6] > 0.02).float().mean())
+        water[category] = float((flat.ground.sample(flat.extent.nodes()).water_depth_m > 0.02).float().mean())
         plants[category] = len(flat.plants.leaves) / flat.extent.columns / flat.extent.rows
     assert max(water, key=lambda c: water[c]) == "deep_water"
     assert water["deep_water"] > 0.35
     assert max(plants, key=lambda c: plants[c]) == "vegetation"
 
 
-def test_gains_and_moving_water_are_off_unless_asked_for() -> None:
+def test_gains_and_moving_water_are_optional() -> None:
     assert torch.equal(survey().cameras.gain, torch.ones(30, 3))
     flight = Flight(exposure_spread=0.2, water_motion=1.5)
     scene = make_survey("tidal_trees", seed=4, views=3, width=96, flight=flight, supersample=1)
@@ -183,11 +182,11 @@ def test_gains_and_moving_water_are_off_unless_asked_for() -> None:
     assert changed[2].any()
     points = points_of(scene, 2)
     above = points[:, 2] - scene.flat.surface.sample(points.T[:2])[0]
-    _, deep = wet_and_deep(scene, points.T[:2])
+    _, deep = wetness_and_depth(scene, points.T[:2])
     assert not changed[2].reshape(-1)[(deep == 0) & (above < 1e-3)].any()
 
 
-def test_a_small_photograph_is_the_average_of_a_large_one() -> None:
+def test_a_small_photograph_averages_a_large_one() -> None:
     scene = survey("river_mouths")
     camera = scene.cameras[[5]]
     large, _ = scene.flat.render(camera.resized(384, 288), supersample=1)
@@ -198,7 +197,7 @@ def test_a_small_photograph_is_the_average_of_a_large_one() -> None:
     assert np.isclose(float(average.mean()), float(small.mean()), atol=0.01)
 
 
-def test_oblique_photographs_reach_the_sky_at_no_harm() -> None:
+def test_oblique_photographs_may_contain_sky() -> None:
     scene = survey()
     pose = torch.tensor([[[1.0, 0, 0, 0], [0, -0.2588, 0.9659, -60.0], [0, -0.9659, -0.2588, 20.0]]])
     camera = replace(scene.cameras[[0]], T_world_camera=pose)
@@ -207,3 +206,31 @@ def test_oblique_photographs_reach_the_sky_at_no_harm() -> None:
     assert torch.isfinite(depth[0, -1]).all()
     assert torch.isfinite(colour).all()
     assert (colour[0, 0, :, 2] > colour[0, -1, :, 2]).float().mean() > 0.9
+
+
+def test_near_and_far_ignore_the_sky() -> None:
+    depth = torch.tensor([[[5.0, 8.0], [torch.inf, 6.0]]])
+    assert torch.allclose(_near_far(depth), torch.tensor([[4.5, 8.8]]))
+
+
+def test_flight_options_reach_the_flat_and_the_poses() -> None:
+    low = make_survey("ground_textures", 4, views=2, width=48, flight=Flight(sun_elevation_deg=12.0), supersample=1)
+    assert float(low.flat.light.sun[2]) == pytest.approx(np.sin(np.radians(12.0)))
+    wet, dry = (
+        make_survey("ground_textures", 4, views=2, width=48, flight=Flight(wetness=w), supersample=1).flat.ground
+        for w in (1.0, 0.0)
+    )
+    assert wet.maps.values[5].mean() > dry.maps.values[5].mean() + 0.2
+    oblique = make_survey("ground_textures", 4, views=4, width=48, flight=Flight(oblique_share=1.0), supersample=1)
+    tilt_deg = torch.rad2deg(torch.arccos(-oblique.cameras.forward_world[:, 2]))
+    assert tilt_deg.min() > 18
+    assert tilt_deg.max() < 52
+    assert torch.equal(survey().cameras.forward_world[:, 2] < -0.98, torch.ones(30, dtype=torch.bool))
+
+
+def test_plants_cast_shadows() -> None:
+    flat = survey("vegetation").flat
+    sunlit = flat.shadows.sunlit(torch.cat([flat.extent.nodes(), flat.surface.values.reshape(1, -1)]))
+    assert 0.02 < float((sunlit < 0.5).float().mean()) < 0.6
+    high = torch.cat([flat.extent.nodes(), torch.full_like(flat.surface.values.reshape(1, -1), flat.highest_m + 1)])
+    assert flat.shadows.sunlit(high).min() == 1

@@ -1,4 +1,4 @@
-"""A synthetic survey on disk: COLMAP reads it, this package reads it, and the truth lies beside it."""
+"""Write synthetic surveys: COLMAP and this package read them, and the ground truth is next to them."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ def folder(survey: Survey, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_colmap_opens_it_and_its_points_reproject_within_a_pixel(folder: Path, survey: Survey) -> None:
+def test_colmap_reads_the_model_and_its_reprojection_errors(folder: Path, survey: Survey) -> None:
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
     assert model.num_reg_images() == 9
     assert model.num_points3D() == len(survey.points.xyz_world) > 200
@@ -40,16 +40,16 @@ def test_colmap_opens_it_and_its_points_reproject_within_a_pixel(folder: Path, s
     assert min(point.track.length() for point in model.points3D.values()) >= 2
 
 
-def test_sparse_points_lie_where_the_surface_is(survey: Survey) -> None:
-    seen = survey.cameras.project(survey.points.xyz_world)[1][survey.points.camera_index, survey.points.point_index]
+def test_sparse_points_lie_on_the_surface(survey: Survey) -> None:
+    z = survey.cameras.project(survey.points.xyz_world)[1][survey.points.camera_index, survey.points.point_index]
     column, row = survey.points.uv_px.floor().long().T
     depth = survey.depth[survey.points.camera_index, row, column]
     footprint = float(survey.depth.median() / survey.cameras.focal_px[0, 0])
-    assert (seen - depth).abs().median() < footprint
-    assert ((seen - depth).abs() < 6 * footprint).float().mean() > 0.97
+    assert (z - depth).abs().median() < footprint
+    assert ((z - depth).abs() < 6 * footprint).float().mean() > 0.97
 
 
-def test_it_loads_as_a_scene_with_the_same_photographs_and_poses(folder: Path, survey: Survey) -> None:
+def test_load_scene_returns_the_same_photographs_and_poses(folder: Path, survey: Survey) -> None:
     scene = load_scene(folder)
     assert scene.names[0] == "river_mouths_0001.png"
     assert torch.equal(torch.as_tensor(scene.photographs[3]), survey.photographs[3])
@@ -58,12 +58,12 @@ def test_it_loads_as_a_scene_with_the_same_photographs_and_poses(folder: Path, s
     assert torch.allclose(scene.cameras.T_world_camera[..., :3], survey.cameras.T_world_camera[..., :3], atol=1e-5)
     assert scene.points is not None
     assert len(scene.points.xyz_world) == len(survey.points.xyz_world)
-    seen = survey.depth.flatten(1)
-    assert (scene.cameras.near_far[:, 0] < seen.quantile(0.01, dim=1)).all()
-    assert (scene.cameras.near_far[:, 1] > seen.quantile(0.99, dim=1)).all()
+    depth = survey.depth.flatten(1)
+    assert (scene.cameras.near_far[:, 0] < depth.quantile(0.01, dim=1)).all()
+    assert (scene.cameras.near_far[:, 1] > depth.quantile(0.99, dim=1)).all()
 
 
-def test_the_truth_lies_beside_it(folder: Path, survey: Survey) -> None:
+def test_ground_truth_files_match_the_survey(folder: Path, survey: Survey) -> None:
     truth = json.loads((folder / "truth" / "truth.json").read_text())
     depth = np.load(folder / "truth" / "depth" / "river_mouths_0005.npy")
     assert np.array_equal(depth, survey.depth[4].numpy())
@@ -73,7 +73,7 @@ def test_the_truth_lies_beside_it(folder: Path, survey: Survey) -> None:
     assert picture.shape[:2] == surface.shape == (truth["map"]["rows"], truth["map"]["columns"])
     east, north = truth["map"]["first_pixel_centre_east_north_m"]
     step = truth["map"]["pixel_step_east_north_m"]
-    # Most sparse points are on bare ground: the map's surface, read at their places, is their height.
+    # Most sparse points are on bare ground, where their height is that of the map's surface.
     x, y, z = survey.points.xyz_world.numpy().T
     column, row = np.rint((x - east) / step[0]).astype(int), np.rint((y - north) / step[1]).astype(int)
     assert np.median(np.abs(surface[row, column] - z)) < 0.3
@@ -87,7 +87,7 @@ def test_photographs_can_be_jpegs(survey: Survey, tmp_path: Path) -> None:
     assert np.abs(picture[..., ::-1].astype(int) - survey.photographs[1].numpy()).mean() < 4
 
 
-def test_a_folder_with_something_in_it_is_left_alone(survey: Survey, tmp_path: Path) -> None:
+def test_a_folder_that_is_not_empty_is_refused(survey: Survey, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("keep me")
     with pytest.raises(SceneError, match="not empty"):
         write_survey(survey, tmp_path)

@@ -1,4 +1,4 @@
-"""A tidal flat that can be photographed and mapped from anywhere."""
+"""The renderer: a tidal flat that can be photographed and mapped from anywhere."""
 
 from __future__ import annotations
 
@@ -13,23 +13,18 @@ from torch import Tensor
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.parallel import in_parallel
-from tidefield.synthetic.foliage import Shadows, plant_radiance
-from tidefield.synthetic.ground import Ground, make_ground
-from tidefield.synthetic.light import Light, to_display
-from tidefield.synthetic.march import march
-from tidefield.synthetic.noise import Noise
+from tidefield.synthetic.foliage import Plants, Shadows
+from tidefield.synthetic.grids import Extent, Noise, Raster, blurred
 from tidefield.synthetic.plants import grow, marsh_map
-from tidefield.synthetic.primitives import Plants, dot
-from tidefield.synthetic.raster import Extent, Raster, blurred
+from tidefield.synthetic.rays import Parallel, Pinhole, View, height_field_depth, normalised
 from tidefield.synthetic.settings import Settings
-from tidefield.synthetic.shading import ground_radiance
+from tidefield.synthetic.shading import Ground, Light, make_ground, to_srgb
 from tidefield.synthetic.terrain import make_terrain
-from tidefield.synthetic.views import Pinhole, View, straight_down
 
 _RAYS = 1 << 16
 """Rays shaded at once: bounds memory, and small enough for the cache."""
 _FAR_M = 1e4
-"""Where rays into the sky are said to end, so that arithmetic on them stays finite."""
+"""Depth given to rays into the sky, so that arithmetic on them stays finite."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +32,7 @@ class Orthophoto:
     """A map of a flat: row 0 in the north, pixel (i, j) centred on the ground point of its indices.
 
     Attributes:
-        colour: the dull (view-independent) colour straight down, display-referred, in [0, 1].
+        colour: diffuse (view-independent) colour seen straight down, sRGB in [0, 1].
         height_m: the surface, plants and water included.
         west_m, north_m: centre of the first pixel.
         cell_m: pixel size.
@@ -52,23 +47,22 @@ class Orthophoto:
 
 @dataclass(frozen=True)
 class TidalFlat:
-    """Shape, matter and light. World: metres east, north and up.
+    """Shape, material and light of a flat. World: metres east, north and up.
 
     Attributes:
         surface: the higher of ground and water, without plants.
-        steepest: a bound on the surface's slope.
-        ground: the maps that shading reads.
+        max_slope: a bound on the surface's slope.
+        ground: its material.
         plants: leaf sprays and stems.
-        noise: the pattern of fine detail.
+        shadows: of the plants.
     """
 
     surface: Raster
-    steepest: float
+    max_slope: float
     ground: Ground
     plants: Plants
     light: Light
     shadows: Shadows
-    noise: Noise
 
     @property
     def extent(self) -> Extent:
@@ -77,15 +71,15 @@ class TidalFlat:
     def render(
         self, cameras: Cameras, supersample: int = 2, seconds: Float[Tensor, " V"] | None = None
     ) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, "V H W"]]:
-        """What pinhole cameras of one size see.
+        """Render pinhole cameras of one size.
 
         Args:
             cameras: their gains are applied to the colours.
             supersample: rays per pixel along each side, averaged as light.
-            seconds: time of each view, which moves the wavelets; 0 where None.
+            seconds: time of each view, which moves the wavelets; None for 0.
 
         Returns:
-            Colour in [0, 1], display-referred; and exact z-depth at pixel centres, metres, inf where there is sky.
+            sRGB colour in [0, 1]; and exact z-depth at pixel centres, metres, inf where there is sky.
         """
         times = [0.0] * len(cameras) if seconds is None else seconds.tolist()
         tasks = [partial(self._photograph, cameras[i], supersample, times[i]) for i in range(len(cameras))]
@@ -93,22 +87,22 @@ class TidalFlat:
         return torch.stack(colour), torch.stack(depth)
 
     def _photograph(self, camera: Cameras, supersample: int, seconds: float) -> tuple[Tensor, Tensor]:
-        """Colour [H W 3] and depth [H W] of one camera."""
+        """Render colour [H W 3] and depth [H W] of one camera."""
         fine = Pinhole(camera, supersample)
-        colour = to_display(_pooled(self._radiance(fine, seconds), fine, supersample)) * camera.gain[0]
+        colour = to_srgb(_averaged(self._radiance(fine, seconds), fine, supersample)) * camera.gain[0]
         return colour.clamp(0, 1), self.depth(Pinhole(camera)).reshape(camera.height, camera.width)
 
     def orthophoto(self, extent: Extent, supersample: int = 2) -> Orthophoto:
-        """The map of an extent, one pixel centred on each of its nodes."""
+        """Render the map of an extent, one pixel centred on each of its nodes."""
         cell = extent.cell_m / supersample
         edge = 0.5 * (extent.cell_m - cell)
         columns, rows = extent.columns * supersample, extent.rows * supersample
         fine = Extent(extent.west_m - edge, extent.south_m - edge, columns, rows, cell)
         top = self.highest_m + 1
-        view, fine_view = (straight_down(e, top, self.surface.values.device) for e in (extent, fine))
-        tasks = [partial(self._radiance, fine_view, dull=True), partial(self.depth, view)]
+        view, fine_view = (Parallel.straight_down(e, top, self.surface.values.device) for e in (extent, fine))
+        tasks = [partial(self._radiance, fine_view, diffuse=True), partial(self.depth, view)]
         radiance, depth = in_parallel(tasks, view.device)
-        colour = to_display(_pooled(radiance, fine_view, supersample))
+        colour = to_srgb(_averaged(radiance, fine_view, supersample))
         height = top - depth.reshape(extent.rows, extent.columns)
         return Orthophoto(colour, height, extent.west_m, extent.north_m, extent.cell_m)
 
@@ -118,43 +112,42 @@ class TidalFlat:
         return max(float(self.surface.values.max()), self.plants.highest_m)
 
     def water_depth(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, " P"]:
-        """Depth of the water under surface points; 0 on dry ground and on plants."""
+        """Read the depth of the water under surface points; 0 on dry ground and on plants."""
         above = points[2] - self.surface.sample(points[:2])[0]
-        return torch.where(above < 0.02, self.ground.maps.sample(points[:2])[6], 0.0)
+        return torch.where(above < 0.02, self.ground.sample(points[:2]).water_depth_m, 0.0)
 
     def depth(self, view: View) -> Float[Tensor, " R"]:
-        """Depth of the first surface along every ray of a view; inf where there is none."""
+        """Compute the depth of the first surface along every ray of a view; inf where there is none."""
         depth, _ = self.plants.nearest(view)
         for ray in torch.arange(len(depth), device=view.device).split(_RAYS):
-            depth[ray] = torch.minimum(depth[ray], march(self.surface, self.steepest, *view.rays(ray)))
+            depth[ray] = torch.minimum(depth[ray], height_field_depth(self.surface, self.max_slope, *view.rays(ray)))
         return depth
 
-    def _radiance(self, view: View, seconds: float = 0.0, dull: bool = False) -> Float[Tensor, "3 R"]:
-        """Radiance along every ray of a view."""
+    def _radiance(self, view: View, seconds: float = 0.0, diffuse: bool = False) -> Float[Tensor, "3 R"]:
+        """Compute the radiance along every ray of a view."""
         nearest, primitive = self.plants.nearest(view)
         radiance = torch.empty(3, len(nearest), device=view.device)
         for ray in torch.arange(len(nearest), device=view.device).split(_RAYS):
             origin, direction = view.rays(ray)
-            depth = march(self.surface, self.steepest, origin, direction)
-            onward = direction / torch.sqrt(dot(direction, direction))
+            depth = height_field_depth(self.surface, self.max_slope, origin, direction)
+            onward = normalised(direction)
             reached = depth.clamp(max=_FAR_M)
             points = origin + direction * reached
-            to_eye = None if dull else (-onward).expand_as(points)
+            to_eye = None if diffuse else (-onward).expand_as(points)
             # Slanting rays lie further apart on the ground in one direction: the geometric mean of both.
             footprint = (view.footprint_m(reached) * (-onward[2]).clamp(min=0.1) ** -0.5).expand_as(reached)
-            part = ground_radiance(self.ground, self.light, self.noise, points[:2], to_eye, footprint, seconds)
+            part = self.ground.radiance(self.light, points[:2], to_eye, footprint, seconds)
             sky = torch.nonzero(torch.isinf(depth))[:, 0]
             part[:, sky] = self.light.sky(onward.expand_as(points)[:, sky])
             plant = torch.nonzero(nearest[ray] < depth)[:, 0]
-            part[:, plant] = plant_radiance(
-                self.plants, self.light, self.shadows, view, ray[plant], primitive[ray[plant]]
-            )
+            hit = ray[plant]
+            part[:, plant] = self.plants.radiance(self.light, self.shadows, view, hit, primitive[hit])
             radiance[:, ray] = part
         return radiance
 
 
-def _pooled(radiance: Tensor, view: View, split: int) -> Float[Tensor, "H W 3"]:
-    """Mean over the rays of each pixel."""
+def _averaged(radiance: Tensor, view: View, split: int) -> Float[Tensor, "H W 3"]:
+    """Average the rays of each pixel."""
     blocks = radiance.reshape(3, view.rows // split, split, view.columns // split, split)
     return blocks.mean(dim=(2, 4)).permute(1, 2, 0)
 
@@ -177,12 +170,11 @@ def make_flat(
     nodes = torch.cat([extent.nodes(), surface.values.reshape(1, -1)])
     shade = blurred(shadows.sunlit(nodes).reshape(terrain.ground.shape), 1)
     ground = make_ground(settings, terrain, marsh, light.sun, shade, random)
-    noise = Noise.make(random, channels=4)
-    return TidalFlat(surface, surface.steepest(), ground, plants, light, shadows, noise)
+    return TidalFlat(surface, surface.max_slope(), ground, plants, light, shadows)
 
 
 def moved(thing: Any, device: torch.device | str) -> Any:
-    """A copy of a dataclass with every tensor in it, and in the dataclasses in it, on a device."""
+    """Copy a dataclass to a device: its tensors and those of the dataclasses in it."""
     changed = {}
     for field in fields(thing):
         value = getattr(thing, field.name)

@@ -1,4 +1,4 @@
-"""The paper's five categories of tidal flat as five settings of one procedure."""
+"""Settings of the paper's five categories of tidal flat."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tidefield.errors import SceneError
 
 @dataclass(frozen=True)
 class Settings:
-    """What one tidal flat is like. Lengths in metres, mean mud level 0, heights above it."""
+    """Parameters of one tidal flat. Lengths in metres; heights above mean mud level."""
 
     tide_m: float
     """Height of the water in channels and sea."""
     tilt_m: float
-    """How far the ground falls from the landward to the seaward edge."""
+    """Fall of the ground from the landward to the seaward edge."""
     relief_m: float
     """Amplitude of the broad humps and hollows."""
     channel_half_width_m: float
@@ -42,7 +42,7 @@ class Settings:
     shells: float
     """Density of pale shell and stone litter."""
     wetness: float
-    """0 for a flat long dry, 1 for one that the tide just left."""
+    """0 for a flat that has been dry for long, 1 for one that the tide has just left."""
     wave_slope: float
     """Root-mean-square slope of the wavelets on open water."""
 
@@ -84,10 +84,10 @@ CATEGORIES: dict[str, Settings] = {
 
 
 def settings_for(category: str, random: np.random.Generator) -> Settings:
-    """A category's settings, each varied by about a tenth.
+    """Draw the settings of a category, each varied by up to 15 percent.
 
     Raises:
-        SceneError: there is no such category.
+        SceneError: the category is unknown.
     """
     if category not in CATEGORIES:
         raise SceneError(f"no synthetic category {category!r}: choose one of {', '.join(CATEGORIES)}")

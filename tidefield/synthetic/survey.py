@@ -1,4 +1,4 @@
-"""A drone's survey of a tidal flat: the flight, the photographs, and what structure-from-motion would know."""
+"""A drone survey of a tidal flat: the flight, the photographs, and sparse points as from structure from motion."""
 
 from __future__ import annotations
 
@@ -6,28 +6,38 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from tidefield.data.scene import SparsePoints
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.parallel import in_parallel
 from tidefield.synthetic.flat import TidalFlat, make_flat, moved
-from tidefield.synthetic.raster import Extent
+from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.settings import settings_for
-from tidefield.synthetic.tracks import sparse_points
 
 _CELL_PER_ALTITUDE = 0.0035
 """Spacing of the terrain's nodes: some two thirds of a pixel of a photograph 240 wide, whatever the altitude."""
 _LARGEST_CELL_M = 0.6
-"""Creeks need it, from however high they are seen."""
+"""Upper limit of that spacing: creeks need it, whatever the altitude."""
+_NOISE_PX = 0.3
+"""Standard deviation of an observation, per axis."""
+_MATCHED = 0.7
+"""Chance that a point is matched in a photograph in which it is visible."""
+_VISIBLE_PX = 0.75
+"""A point is visible where its depth agrees with that of its pixel, to so many footprints of a pixel."""
+_MAX_SIGMA_PX = 3.0
+"""Points with a standard deviation above so many footprints of a pixel are dropped: their rays are near parallel."""
+_MAX_WATER_M = 0.1
+"""No points are matched on water deeper than this: its appearance moves with the eye."""
 
 
 @dataclass(frozen=True)
 class Flight:
-    """How a survey is flown and photographed."""
+    """Flight plan and exposure of a survey."""
 
     altitude_m: float = 45.0
     """Height above mean mud level."""
@@ -46,9 +56,9 @@ class Flight:
     water_motion: float = 0.0
     """Seconds between photographs, for the wavelets; 0 freezes them."""
     sun_elevation_deg: float | None = None
-    """Drawn from the seed between 42 and 60 where None."""
+    """None draws it between 42 and 60 from the seed."""
     wetness: float | None = None
-    """0 to 1; the category's own where None."""
+    """0 to 1; None for that of the category."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +66,13 @@ class Survey:
     """Photographs of a procedural flat and the truth about them.
 
     Attributes:
-        category: which of the five.
-        seed: what it was drawn from.
-        flat: the flat, which can be rendered from any other camera.
-        cameras: one per photograph, true; near and far enclose everything each one sees.
-        photographs: 8 bits, display-referred.
+        category: one of CATEGORIES.
+        seed: of everything random.
+        flat: the scene, which can be rendered from any other camera.
+        cameras: one per photograph, with true poses; near and far enclose all depths of each.
+        photographs: sRGB, 8 bits.
         depth: exact z-depth at pixel centres, metres; inf where there is sky.
-        points: as structure-from-motion would have them: triangulated from noisy observations.
+        points: triangulated from noisy observations, as by structure from motion.
     """
 
     category: str
@@ -90,19 +100,19 @@ def make_survey(
         seed: of everything random.
         views: photographs.
         width: of a photograph, pixels; neither the flat nor the flight depends on it.
-        flight: how it is flown; the defaults suit a demonstration.
+        flight: None for the defaults, which suit a demonstration.
         supersample: rays per pixel along each side.
-        device: where it is rendered, and where the result lies.
+        device: renders the survey and holds the result.
 
     Raises:
-        SceneError: there is no such category.
+        SceneError: the category is unknown.
     """
     flight = flight or Flight()
     random = np.random.default_rng([seed, 20260])
     settings = settings_for(category, random)
     if flight.wetness is not None:
         settings = replace(settings, wetness=flight.wetness)
-    cameras = fly(flight, views, width, random)
+    cameras = _fly(flight, views, width, random)
     elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
     extent = _ground_extent(cameras, flight)
     azimuth = float(random.uniform(0, 360))
@@ -112,18 +122,18 @@ def make_survey(
     tasks = [partial(_photograph, flat, cameras[i], supersample, i * flight.water_motion) for i in range(views)]
     photographs, depth = (torch.stack(parts) for parts in zip(*in_parallel(tasks, device), strict=True))
     cameras = replace(cameras, near_far=_near_far(depth))
-    points = sparse_points(flat, cameras, photographs, depth, random)
+    points = _sparse_points(flat, cameras, photographs, depth, random)
     return Survey(category, seed, flat, cameras, photographs, depth, points)
 
 
 def _photograph(flat: TidalFlat, camera: Cameras, supersample: int, seconds: float) -> tuple[Tensor, Tensor]:
-    """One photograph [H W 3] in 8 bits and its depth [H W]."""
+    """Render one photograph [H W 3] in 8 bits and its depth [H W]."""
     colour, depth = flat.render(camera, supersample, torch.tensor([seconds]))
     return (colour[0] * 255).round().to(torch.uint8), depth[0]
 
 
-def fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
-    """A lawn-mower flight over the origin: strips north and south in turn, the image's top towards the nose."""
+def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
+    """Plan a lawn-mower flight over the origin: strips north and south in turn, image tops in flight direction."""
     height = round(width * flight.aspect)
     across = flight.altitude_m / flight.focal_ratio
     along = across * flight.aspect
@@ -134,11 +144,11 @@ def fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> 
         heading = 0.0 if strip % 2 == 0 else math.pi
         for k in range(len(members)):
             ahead = (k - (len(members) - 1) / 2) * spacing_m[1] * math.cos(heading)
-            place = np.array([(strip - (strips - 1) / 2) * spacing_m[0], ahead, flight.altitude_m])
-            place = place + random.normal(0, 0.012, 3) * flight.altitude_m
+            position = np.array([(strip - (strips - 1) / 2) * spacing_m[0], ahead, flight.altitude_m])
+            position = position + random.normal(0, 0.012, 3) * flight.altitude_m
             tilt = random.uniform(25, 45) if random.random() < flight.oblique_share else 0.0
             turn = random.normal(0, flight.jitter_deg, 3) + np.array([tilt, 0.0, 0.0])
-            poses.append(np.column_stack([_attitude(heading) @ _turned(np.radians(turn)), place]))
+            poses.append(np.column_stack([_nadir(heading) @ _rotation(np.radians(turn)), position]))
     pose = torch.from_numpy(np.stack(poses)).float()
     focal = torch.full((views, 2), flight.focal_ratio * width)
     principal, size = torch.tensor([[width / 2, height / 2]]), torch.tensor([[width, height]])
@@ -154,18 +164,19 @@ def fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> 
 
 
 def _gains(flight: Flight, views: int, random: np.random.Generator) -> Float[Tensor, "V 3"]:
+    """Draw the gains of exposure and colour balance."""
     exposure = random.normal(0, 1, (views, 1)) + random.normal(0, 1 / 3, (views, 3))
     return torch.from_numpy(np.exp(flight.exposure_spread * exposure)).float()
 
 
-def _attitude(heading: float) -> np.ndarray:
-    """Camera-to-world rotation of a camera that looks straight down, its top towards a heading clockwise from north."""
+def _nadir(heading: float) -> np.ndarray:
+    """Rotate camera to world for a view straight down, its top towards a heading clockwise from north."""
     sin, cos = math.sin(heading), math.cos(heading)
     return np.array([[cos, -sin, 0.0], [-sin, -cos, 0.0], [0.0, 0.0, -1.0]])
 
 
-def _turned(angles: np.ndarray) -> np.ndarray:
-    """Rotation about the camera's own x, y and z axes, in turn; about x raises the view towards the image's top."""
+def _rotation(angles: np.ndarray) -> np.ndarray:
+    """Rotate about the camera's x, y and z axes in turn; about x tilts the view towards the image's top."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -174,7 +185,7 @@ def _turned(angles: np.ndarray) -> np.ndarray:
 
 
 def _ground_extent(cameras: Cameras, flight: Flight) -> Extent:
-    """The ground that the photographs show, out to four flight heights, with a margin for shadows and crowns."""
+    """Bound the ground in the photographs, out to four flight heights, with a margin for shadows and crowns."""
     width, height = cameras.width, cameras.height
     corners = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
     direction = cameras.directions_world(corners.expand(len(cameras), -1, -1))
@@ -188,8 +199,113 @@ def _ground_extent(cameras: Cameras, flight: Flight) -> Extent:
 
 
 def _near_far(depth: Float[Tensor, "V H W"]) -> Float[Tensor, "V 2"]:
-    """Bounds around the finite depths of each view, with a margin of a tenth."""
+    """Bound the finite depths of each view, with a margin of a tenth."""
     flat = depth.flatten(1)
     near = flat.amin(1)
     far = torch.where(torch.isfinite(flat), flat, near[:, None]).amax(1)
     return torch.stack([0.9 * near, 1.1 * far], dim=1)
+
+
+def _sparse_points(
+    flat: TidalFlat,
+    cameras: Cameras,
+    photographs: UInt8[Tensor, "V H W 3"],
+    depth: Float[Tensor, "V H W"],
+    random: np.random.Generator,
+) -> SparsePoints:
+    """Pick corners, match them in the other photographs by their true depth, add noise and triangulate.
+
+    There are no outliers.
+    """
+    device = depth.device
+    true = torch.cat([_corners(cameras[i], photographs[i], depth[i], random) for i in range(len(cameras))])
+    true = true[flat.water_depth(true.T) < _MAX_WATER_M]
+    visible = _visible(cameras, depth, true)
+    visible &= torch.from_numpy(random.random(visible.shape) < _MATCHED).to(device)
+    camera, point = torch.nonzero(visible, as_tuple=True)
+    noise = torch.from_numpy(random.normal(0, _NOISE_PX, (*visible.shape, 2))).to(device)
+    uv = cameras.project(true)[0].double()[camera, point] + noise[camera, point]
+    xyz, certain = _triangulate(cameras, true.double(), point, camera, uv)
+    inside = ((uv > 0) & (uv < cameras.size_px[camera])).all(1)
+    often = torch.bincount(point[inside], minlength=len(true)) >= 2
+    kept = certain & often
+    point, camera, uv = (x[inside & kept[point]] for x in (point, camera, uv))
+    _, _, residual = _linearise(cameras, xyz, point, camera, uv)
+    count = torch.bincount(point, minlength=len(true))
+    total = torch.zeros(len(true), dtype=torch.float64, device=device).index_add_(0, point, residual.norm(dim=1))
+    number = kept.cumsum(0) - 1
+    return SparsePoints(xyz[kept].float(), (total / count)[kept].float(), number[point], camera, uv.float())
+
+
+def _corners(
+    camera: Cameras, photograph: UInt8[Tensor, "H W 3"], depth: Float[Tensor, "H W"], random: np.random.Generator
+) -> Float[Tensor, "P 3"]:
+    """Draw pixels by their corner strength and return their world points."""
+    grey = cv2.cvtColor(photograph.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    strength = np.sqrt(cv2.cornerMinEigenVal(grey, 3).clip(min=1e-8)).reshape(-1)
+    strength = np.where(np.isfinite(depth.cpu().numpy().reshape(-1)), strength, 0)
+    wanted = int(np.clip(grey.size / 400, 60, 200))
+    # The largest of u^(1/w) are a weighted sample without replacement (Efraimidis and Spirakis 2006).
+    key = np.log(random.random(grey.size)) / np.maximum(strength, 1e-12)
+    pixel = torch.from_numpy(np.sort(np.argpartition(-key, wanted)[:wanted])).to(depth.device)
+    z = depth.reshape(-1)[pixel]
+    uv = pixel_grid(camera.width, camera.height, depth.device)[pixel]
+    at = camera.position_world + camera.directions_world(uv[None])[0] * z[:, None]
+    return at[torch.isfinite(z)]
+
+
+def _visible(cameras: Cameras, depth: Float[Tensor, "V H W"], points: Float[Tensor, "P 3"]) -> Bool[Tensor, "V P"]:
+    """Test the points' visibility in each photograph."""
+    uv, z = cameras.project(points)
+    height, width = depth.shape[1:]
+    column, row = uv.floor().long().unbind(-1)
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    surface = depth.flatten(1).gather(1, pixel)
+    return inside & ((z - surface).abs() < _VISIBLE_PX * z / cameras.focal_px[:, :1])
+
+
+def _triangulate(
+    cameras: Cameras,
+    start: Float[Tensor, "P 3"],
+    point: Int[Tensor, " O"],
+    camera: Int[Tensor, " O"],
+    uv: Float[Tensor, "O 2"],
+) -> tuple[Tensor, Tensor]:
+    """Triangulate points [P 3] by Gauss-Newton, and test which of them [P] are well determined."""
+    xyz = start
+    for _ in range(3):
+        normal, right, _ = _normal_equations(cameras, xyz, point, camera, uv)
+        # Points with fewer than two rays are dropped later; this keeps their matrices regular.
+        tiny = 1e-9 * torch.eye(3, dtype=xyz.dtype, device=xyz.device)
+        xyz = xyz + torch.linalg.solve(normal + tiny, right).clamp(-10, 10)
+    normal, _, z = _normal_equations(cameras, xyz, point, camera, uv)
+    sigma = _NOISE_PX / torch.sqrt(torch.linalg.eigvalsh(normal)[:, 0].clamp(min=1e-12))
+    footprint = torch.zeros_like(sigma).scatter_reduce_(0, point, z / cameras.focal_px[camera, 0], "amax")
+    return xyz, sigma < _MAX_SIGMA_PX * footprint
+
+
+def _normal_equations(
+    cameras: Cameras, xyz: Tensor, point: Tensor, camera: Tensor, uv: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute left [P 3 3] and right [P 3] sides per point, and the z-depth [O] per observation."""
+    jacobian, z, residual = _linearise(cameras, xyz, point, camera, uv)
+    transposed = jacobian.transpose(1, 2)
+    normal = torch.zeros(len(xyz), 3, 3, dtype=xyz.dtype, device=xyz.device)
+    normal.index_add_(0, point, transposed @ jacobian)
+    right = torch.zeros_like(xyz).index_add_(0, point, (transposed @ residual[..., None])[..., 0])
+    return normal, right, z
+
+
+def _linearise(
+    cameras: Cameras, xyz: Tensor, point: Tensor, camera: Tensor, uv: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute Jacobians [O 2 3] of observations by their points, z-depths [O] and residuals [O 2]."""
+    pose = cameras.T_world_camera.double()[camera]
+    focal, principal = cameras.focal_px.double()[camera], cameras.principal_px.double()[camera]
+    local = ((xyz[point] - pose[:, :, 3])[:, None] @ pose[:, :, :3])[:, 0]
+    z = local[:, 2]
+    ratio = local[:, :2] / z[:, None]
+    axes = pose[:, :, :3].transpose(1, 2)
+    jacobian = (focal / z[:, None])[..., None] * (axes[:, :2] - ratio[..., None] * axes[:, 2:])
+    return jacobian, z, uv - (ratio * focal + principal)

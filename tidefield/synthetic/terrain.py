@@ -1,4 +1,4 @@
-"""The ground and the still water on it: height fields on one raster."""
+"""The ground and the still water on it: relief, tidal creeks, sand waves and pools as height fields on one raster."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.signal import lfilter
 from torch import Tensor
 
-from tidefield.synthetic.channels import carve, creeks
-from tidefield.synthetic.noise import Noise, resolved, smoothstep
-from tidefield.synthetic.raster import Extent, Raster
+from tidefield.synthetic.grids import Extent, Noise, Raster, box_pairs, resolved, smoothstep
 from tidefield.synthetic.settings import Settings
 
 _SAND_WAVE_M = 1.35
@@ -40,7 +39,7 @@ class Terrain:
 
     @property
     def surface(self) -> Raster:
-        """What a photograph sees of it: the higher of bed and water."""
+        """The higher of bed and water."""
         return Raster(self.extent, torch.maximum(self.ground, self.water)[None])
 
     @property
@@ -49,7 +48,7 @@ class Terrain:
 
 
 def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator) -> Terrain:
-    """Humps and hollows, creeks, sand waves and pools."""
+    """Build humps and hollows, creeks, sand waves and pools."""
     noise = Noise.make(random, channels=4)
     nodes = extent.nodes()
     broad = noise.fractal(nodes, 38.0, 4)
@@ -60,11 +59,11 @@ def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator
     base = base + 0.018 * noise.fractal(nodes - 300, 2.4, 3)[1]
 
     rill = _rills(nodes, noise, fine[2:4]) * smoothstep(-0.1, 0.45, broad[3])
-    # The banks are roughened by looking at a smooth network from displaced places.
-    seen_from = nodes + 0.9 * fine[2:4] + 0.22 * noise.fractal(nodes, 1.9, 2)[0:2]
-    (west, south), (east, north) = seen_from.amin(1).tolist(), seen_from.amax(1).tolist()
+    # Banks are roughened by sampling a smooth network at displaced points.
+    displaced = nodes + 0.9 * fine[2:4] + 0.22 * noise.fractal(nodes, 1.9, 2)[0:2]
+    (west, south), (east, north) = displaced.amin(1).tolist(), displaced.amax(1).tolist()
     wider = Extent.around(west, south, east, north, 2 * extent.cell_m)
-    carved, near = carve(creeks(settings, extent, random), wider).sample(seen_from)
+    carved, near = _carve(_creeks(settings, extent, random), wider).sample(displaced)
     ripple = smoothstep(-0.25, 0.35, broad[1]) * (1 - smoothstep(0.3, 0.9, near)) + 0.35 * smoothstep(0.2, 0.6, fine[1])
     ripple = ripple.clamp(max=1) * (1 - 0.85 * smoothstep(0.25, 0.6, -fine[1]))
     crests = _sand_waves(nodes, noise, float(random.uniform(0, math.pi)))
@@ -72,17 +71,18 @@ def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator
     crests = crests * resolved(_SAND_WAVE_M, torch.tensor(extent.cell_m))
     ground = base - carved - 0.05 * rill * (1 - near) + settings.ripple_m * ripple * crests
     water = torch.full_like(ground, settings.tide_m)
-    ground, water = _pools(settings, extent, ground, water, near, fine[2:4] + noise.fractal(nodes, 2.6, 3)[0:2], random)
+    warp = fine[2:4] + noise.fractal(nodes, 2.6, 3)[0:2]
+    _add_pools(settings, extent, ground, water, near, warp, random)
 
     shape = (extent.rows, extent.columns)
     ground, water, near, rill, ripple = (x.reshape(shape) for x in (ground, water, near, rill, ripple))
-    # Where the bed stands clear of it, the water's plane is of no use and its shoreline would be ragged.
+    # On dry ground the water's plane is lowered out of reach: close below, it would make the shoreline ragged.
     water = torch.where(water > ground, water, ground - 10.0)
     return Terrain(extent, ground, water, near, rill, ripple)
 
 
 def _rills(nodes: Tensor, noise: Noise, warp: Tensor) -> Tensor:
-    """Threads where a noise crosses zero, thinner and denser ones joining thicker ones."""
+    """Draw threads where a noise crosses zero, thinner and denser ones joining thicker ones."""
     bent = nodes + 1.6 * warp + 0.5 * noise.octave(nodes, 1.6, 7)[0:2]
     thick = 1 - (noise.octave(bent, 11.0, 8)[0].abs() / 0.07)
     thin = 1 - (noise.octave(bent, 4.6, 9)[1].abs() / 0.10)
@@ -90,58 +90,134 @@ def _rills(nodes: Tensor, noise: Noise, warp: Tensor) -> Tensor:
 
 
 def _sand_waves(nodes: Tensor, noise: Noise, heading: float) -> Tensor:
-    """Crests in [-0.5, 0.5] whose spacing and direction wander; steeper on the lee side, with forks."""
+    """Compute crests in [-0.5, 0.5] whose spacing and direction wander; steeper on the lee side, with forks."""
     warp = noise.fractal(nodes + 200, 22.0, 3)
-    x = nodes[0] + 2.6 * warp[0] + 0.35 * noise.octave(nodes, 3.1, 3)[1]
-    y = nodes[1] + 2.6 * warp[1] + 0.35 * noise.octave(nodes, 3.1, 3)[2]
+    bend = noise.octave(nodes, 3.1, 3)
+    x = nodes[0] + 2.6 * warp[0] + 0.35 * bend[1]
+    y = nodes[1] + 2.6 * warp[1] + 0.35 * bend[2]
     phase = (x * math.cos(heading) + y * math.sin(heading)) * (2 * math.pi / _SAND_WAVE_M)
     forked = phase + 1.1 * noise.octave(nodes, 4.3, 5)[3]
     return 0.5 * torch.sin(forked + 0.35 * torch.sin(forked)) * (0.7 + 0.3 * warp[2])
 
 
-def _pools(
+@dataclass(frozen=True)
+class _Reaches:
+    """Straight pieces of channel, one column each, in metres; half width and depth are those at mid-reach."""
+
+    start: Float[Tensor, "2 N"]
+    end: Float[Tensor, "2 N"]
+    half_width: Float[Tensor, " N"]
+    depth: Float[Tensor, " N"]
+
+
+def _creeks(settings: Settings, extent: Extent, random: np.random.Generator) -> _Reaches:
+    """Grow a network of meandering creeks from the seaward (south) edge, branching headward."""
+    rows: list[np.ndarray] = []
+
+    def grow(mouth: np.ndarray, heading: float, length_m: float, size: float, orders: int) -> None:
+        """Add one creek and, recursively, its branches; `size` scales width and depth."""
+        half_width, depth = settings.channel_half_width_m * size, settings.channel_depth_m * size**0.5
+        step = max(0.5, 0.5 * half_width)
+        count = max(4, int(length_m / step))
+        along = np.arange(count + 1) * step
+        meander = 14 * half_width + 4
+        bend = 0.75 * np.sin(2 * np.pi * (along / meander + random.random()))
+        # A wandering course that keeps coming back to its heading.
+        wander = lfilter([1.0], [1.0, -0.93], random.normal(0, 0.09, count + 1))
+        angle = heading + bend * random.uniform(0.5, 1.2) + wander - bend[0] * 0.5
+        taper = 1 - 0.75 * (along / along[-1]) ** (0.8 if orders < settings.branch_orders else 1.4)
+        points = mouth + np.cumsum(np.stack([np.cos(angle), np.sin(angle)], 1) * step, axis=0)
+        rows.append(np.column_stack([points[:-1], points[1:], half_width * taper[:-1], depth * taper[:-1] ** 0.7]))
+        if orders == 0:
+            return
+        side = 1 if random.random() < 0.5 else -1
+        at = settings.branch_spacing_m * random.uniform(0.3, 1.0) * size
+        while at < 0.97 * along[-1]:
+            i = int(at / step)
+            side = side if random.random() < 0.25 else -side
+            child = size * taper[i] * random.uniform(0.4, 0.62)
+            reach = length_m * (1 - 0.6 * at / along[-1]) * random.uniform(0.25, 0.65)
+            turn = side * random.uniform(0.65, 1.15)
+            if reach > 3 * half_width * child / size:
+                grow(points[i], angle[i] + turn, reach, child, orders - 1)
+            at += settings.branch_spacing_m * random.uniform(0.5, 1.5) * max(size, 0.45)
+
+    width, height = extent.size_m
+    count = max(1, round(width / settings.channel_spacing_m))
+    for k in range(count):
+        x = extent.west_m + width * (k + random.uniform(0.3, 0.7)) / count
+        heading, size = math.pi / 2 + random.uniform(-0.35, 0.35), random.uniform(0.8, 1.2)
+        length_m = height * random.uniform(0.95, 1.15)
+        grow(np.array([x, extent.south_m - 5.0]), heading, length_m, size, settings.branch_orders)
+    table = torch.from_numpy(np.concatenate(rows).astype(np.float32)).T
+    return _Reaches(table[0:2], table[2:4], table[4], table[5])
+
+
+def _carve(reaches: _Reaches, extent: Extent) -> Raster:
+    """Compute the creeks' depth below the flat in metres, and `Terrain.near_channel`."""
+    # The sloping bank is wide enough for mud to stand.
+    banks = 0.5 * reaches.half_width + 1.6 * reaches.depth
+    nodes = extent.nodes()
+    carved, near = torch.zeros(nodes.shape[1]), torch.zeros(nodes.shape[1])
+    margin = reaches.half_width + 2 * banks
+    low = torch.minimum(reaches.start, reaches.end) - margin
+    high = torch.maximum(reaches.start, reaches.end) + margin
+    west_south = torch.tensor([[extent.west_m], [extent.south_m]])
+    limit = torch.tensor([[extent.columns - 1], [extent.rows - 1]])
+    first = torch.ceil((low - west_south) / extent.cell_m).clamp(min=0)
+    last = torch.minimum(torch.floor((high - west_south) / extent.cell_m), limit).maximum(first - 1)
+    axis = reaches.end - reaches.start
+    table = torch.cat([reaches.start, axis / (axis**2).sum(0), axis, reaches.half_width[None], banks[None]])
+    for i, node in box_pairs(torch.cat([first, last]).long(), extent.columns):
+        x0, y0, ax, ay, bx, by, half_width, bank = table[:, i]
+        x, y = nodes[0, node] - x0, nodes[1, node] - y0
+        along = (x * ax + y * ay).clamp(0, 1)
+        distance = torch.hypot(x - along * bx, y - along * by)
+        depth = reaches.depth[i] * smoothstep(half_width + 0.8 * bank, 0.3 * half_width, distance)
+        carved.scatter_reduce_(0, node, depth, "amax")
+        near.scatter_reduce_(0, node, smoothstep(half_width + 2 * bank, 0.5 * half_width, distance), "amax")
+    return Raster.of(extent, carved, near)
+
+
+def _add_pools(
     settings: Settings,
     extent: Extent,
-    ground: Tensor,
-    water: Tensor,
-    near_channel: Tensor,
-    warp: Tensor,
+    ground: Float[Tensor, " P"],
+    water: Float[Tensor, " P"],
+    near_channel: Float[Tensor, " P"],
+    warp: Float[Tensor, "2 P"],
     random: np.random.Generator,
-) -> tuple[Tensor, Tensor]:
-    """Press shallow hollows into the flat and fill each to its own level."""
+) -> None:
+    """Press shallow hollows into the ground and fill each to a level; changes `ground` and `water`."""
     width, height = extent.size_m
-    count = random.poisson(settings.pools_per_ha * width * height / 1e4)
     nodes = extent.nodes()
-    ground, water = ground.clone(), water.clone()
-    for _ in range(count):
+    for _ in range(random.poisson(settings.pools_per_ha * width * height / 1e4)):
         centre = (extent.west_m + width * random.random(), extent.south_m + height * random.random())
         radius, depth = float(random.gamma(3.0, 0.65) + 0.5), float(random.uniform(0.06, 0.2))
         stretch, turn = float(random.uniform(0.4, 1.0)), float(random.uniform(0, math.pi))
-        node = _near(extent, centre, 2 * radius)
-        level = float(ground[_near(extent, centre, 0.5)].mean())
+        node = _nodes_around(extent, centre, 2 * radius)
+        level = float(ground[_nodes_around(extent, centre, 0.5)].mean())
         if float(near_channel[node].max()) > 0.6 or level < settings.tide_m + 0.15:
             continue
         x = nodes[0, node] - centre[0] + 0.7 * radius * warp[0, node]
         y = nodes[1, node] - centre[1] + 0.7 * radius * warp[1, node]
         a, b = x * math.cos(turn) + y * math.sin(turn), (y * math.cos(turn) - x * math.sin(turn)) / stretch
         inside = smoothstep(1.25, 0.35, torch.hypot(a, b) / radius)
-        # A hollow flattens what was there, ripples and all, towards its own floor.
+        # A hollow flattens the ground, ripples and all, towards its floor.
         floor = level - depth * inside
         ground[node] = torch.lerp(ground[node], torch.minimum(ground[node], floor), inside)
         rim = node[(inside > 0.04) & (inside < 0.2)]
         full = min(level - 0.2 * depth, float(ground[rim].quantile(0.1))) if len(rim) else level - depth
         water[node] = torch.where(inside > 0.04, water[node].clamp(min=full), water[node])
-    return ground, water
 
 
-def _near(extent: Extent, centre: tuple[float, float], reach_m: float) -> Tensor:
-    """Numbers of the nodes in a square around a place."""
-    spans = []
-    for at, start, count in (
-        (centre[0], extent.west_m, extent.columns),
-        (centre[1], extent.south_m, extent.rows),
-    ):
-        first = max(0, math.ceil((at - reach_m - start) / extent.cell_m))
-        last = min(count - 1, math.floor((at + reach_m - start) / extent.cell_m))
-        spans.append(torch.arange(first, max(first, last) + 1).clamp(max=count - 1))
-    return (spans[1][:, None] * extent.columns + spans[0]).reshape(-1)
+def _nodes_around(extent: Extent, centre: tuple[float, float], reach_m: float) -> Int[Tensor, " K"]:
+    """Number the nodes in a square around a point."""
+
+    def span(at: float, start_m: float, count: int) -> Tensor:
+        first = max(0, math.ceil((at - reach_m - start_m) / extent.cell_m))
+        last = min(count - 1, math.floor((at + reach_m - start_m) / extent.cell_m))
+        return torch.arange(first, max(first, last) + 1).clamp(max=count - 1)
+
+    column, row = span(centre[0], extent.west_m, extent.columns), span(centre[1], extent.south_m, extent.rows)
+    return (row[:, None] * extent.columns + column).reshape(-1)

@@ -1,4 +1,4 @@
-"""A survey on disk as the field reads it, with the truth beside it."""
+"""Write a synthetic survey as a COLMAP dataset, with the ground truth next to it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from tidefield.errors import SceneError
-from tidefield.synthetic.raster import Extent
+from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.survey import Survey
 
 
@@ -25,37 +25,35 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
     photograph's gain.
 
     Args:
-        survey: what to write.
+        survey: photographs, cameras and truth.
         folder: new or empty.
         suffix: of the photographs, .png or .jpg (quality 97).
 
     Raises:
-        SceneError: there is something in the folder already, or it cannot be written.
+        SceneError: the folder is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SceneError(
-            f"{folder} is not empty: a synthetic scene needs a folder of its own; name another or empty it"
-        )
-    names = photograph_names(survey, suffix)
+        raise SceneError(f"{folder} is not empty: a synthetic scene needs an empty folder; name another or empty it")
+    names = _photograph_names(survey, suffix)
     try:
         for part in ("images", "sparse/0", "truth/depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         for name, photograph, depth in zip(names, survey.photographs.cpu(), survey.depth.cpu(), strict=True):
             _write_picture(folder / "images" / name, photograph)
             np.save(folder / "truth" / "depth" / f"{Path(name).stem}.npy", depth.numpy())
-        reconstruction(survey, names).write_binary(folder / "sparse" / "0")
+        _reconstruction(survey, names).write_binary(folder / "sparse" / "0")
         _write_map(survey, names, folder / "truth")
     except OSError as error:
         raise SceneError(f"cannot write to {folder}: {error}; free some space or name another folder") from error
 
 
-def photograph_names(survey: Survey, suffix: str = ".png") -> tuple[str, ...]:
-    """File names in the order of flight, which is their sorted order too."""
+def _photograph_names(survey: Survey, suffix: str = ".png") -> tuple[str, ...]:
+    """Name the photographs; flight order is sorted order."""
     return tuple(f"{survey.category}_{i + 1:04d}{suffix}" for i in range(len(survey.cameras)))
 
 
-def reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstruction:
-    """The survey's COLMAP model: true poses, one PINHOLE camera, the sparse points and who saw them."""
+def _reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstruction:
+    """Build the COLMAP model: true poses, one PINHOLE camera, the sparse points and their tracks."""
     cameras, points = survey.cameras.to("cpu"), survey.points
     model = pycolmap.Reconstruction()
     (fx, fy), (cx, cy) = cameras.focal_px[0].tolist(), cameras.principal_px[0].tolist()
@@ -66,9 +64,9 @@ def reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstru
     point, camera, uv = (x.cpu().numpy() for x in (points.point_index, points.camera_index, points.uv_px))
     slot = np.zeros(len(point), dtype=int)
     for i, name in enumerate(names):
-        own = np.nonzero(camera == i)[0]
-        slot[own] = np.arange(len(own))
-        image = pycolmap.Image(name=name, keypoints=uv[own].astype(np.float64), camera_id=1, image_id=i + 1)
+        rows = np.nonzero(camera == i)[0]
+        slot[rows] = np.arange(len(rows))
+        image = pycolmap.Image(name=name, keypoints=uv[rows].astype(np.float64), camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, _camera_from_world(cameras.T_world_camera[i]))
     photographs = survey.photographs.cpu().numpy()
     order = np.argsort(point, kind="stable")
@@ -78,8 +76,8 @@ def reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstru
         elements = [pycolmap.TrackElement(int(camera[k]) + 1, int(slot[k])) for k in track]
         column, row = uv[track[0]].astype(int)
         colour = photographs[camera[track[0]], row, column]
-        number = model.add_point3D(xyz[point[track[0]]], pycolmap.Track(elements), colour)
-        model.point3D(number).error = float(error[point[track[0]]])
+        point_id = model.add_point3D(xyz[point[track[0]]], pycolmap.Track(elements), colour)
+        model.point3D(point_id).error = float(error[point[track[0]]])
     return model
 
 
@@ -95,7 +93,7 @@ def _write_picture(path: Path, colour: UInt8[Tensor, "H W 3"]) -> None:
 
 
 def _write_map(survey: Survey, names: tuple[str, ...], folder: Path) -> None:
-    """The orthophoto and surface of the surveyed ground, at about the photographs' own resolution."""
+    """Write orthophoto, surface and truth.json of the surveyed ground, at about the photographs' resolution."""
     cameras, extent = survey.cameras, survey.flat.extent
     cell = float((cameras.position_world[:, 2] / cameras.focal_px[:, 0]).median())
     ground = survey.flat.orthophoto(Extent.around(extent.west_m, extent.south_m, extent.east_m, extent.north_m, cell))
