@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, UInt8
 
-from tidefield.data.cloud import write_cloud
+from tidefield.data.ply import write_ply
 from tidefield.data.scene import every_eighth
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens, lens_from_colmap
@@ -60,7 +60,7 @@ def write_transforms(
     top["applied_transform"] = np.column_stack([np.eye(3), 0.0 - origin]).tolist()
     xyz_world, rgb = _points(model)
     if len(xyz_world):
-        write_cloud(folder / CLOUD_FILE, xyz_world - origin, rgb, overwrite)
+        write_ply(folder / CLOUD_FILE, xyz_world - origin, rgb, overwrite)
         top["ply_file_path"] = CLOUD_FILE
     top |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
     top["frames"] = [

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from tidefield.data.cloud import write_cloud
+from tidefield.data.ply import write_ply
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 
@@ -46,7 +46,7 @@ def export(scene: Scene, folder: Path) -> torch.Tensor:
     }
     if scene.points is not None:
         xyz = scene.points.xyz_world.double().numpy()
-        write_cloud(folder / CLOUD_FILE, xyz, _colours(scene), overwrite=True)
+        write_ply(folder / CLOUD_FILE, xyz, _colours(scene), overwrite=True)
         top["ply_file_path"] = CLOUD_FILE
     (folder / TRANSFORMS_FILE).write_text(json.dumps(top), encoding="utf-8")
     return factor
