@@ -75,7 +75,9 @@ class Objective(nn.Module):
         if batch.images:
             with mixed_precision(priors.device):
                 encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
-            seen = Views(cameras[batch.neighbours.reshape(-1)], batch.which, batch.presence, Encoded.joined(encoded))
+            seen = Views(
+                cameras[batch.neighbours.reshape(-1)], batch.which, batch.blend_weight, Encoded.joined(encoded)
+            )
         tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)
         return network(tiles, seen, start_intervals(network, tiles, priors), opaque, generator)
 
