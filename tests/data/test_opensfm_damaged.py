@@ -98,7 +98,7 @@ def test_truncated_reconstructions_are_refused(tmp_path: Path) -> None:
     content = write_opensfm(tmp_path, reconstruction()).read_bytes()
     for keep in np.linspace(0, len(content) - 1, 40).astype(int):
         (tmp_path / "reconstruction.json").write_bytes(content[:keep])
-        with pytest.raises(SceneError, match="not complete JSON"):
+        with pytest.raises(SceneError, match="not whole JSON"):
             read_posed(tmp_path, False)
 
 

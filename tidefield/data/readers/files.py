@@ -123,7 +123,7 @@ def read_json_value(file: Path, megabytes: int) -> Any:
     try:
         return json.loads(bounded_bytes(file, megabytes))
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file} is not complete JSON ({error}); copy or export it again") from error
+        raise SceneError(f"{file} is not whole JSON ({error}); copy or export it again") from error
 
 
 def number(values: Mapping[str, Any], key: str, file: Path, default: float | None = None) -> float:
