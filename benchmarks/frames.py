@@ -219,7 +219,7 @@ def _without_fading() -> Iterator[None]:
 
     def full(*words: Any) -> Neighbours:
         found = choose_neighbours(*words)
-        return replace(found, presence=torch.ones_like(found.presence))
+        return replace(found, blend_weight=torch.ones_like(found.blend_weight))
 
     with patch("tidefield.model.renderer.choose_neighbours", full):
         yield

@@ -1,4 +1,4 @@
-"""Captures of each kind with nothing but cameras and points: a survey, a few steps before a motif, an object."""
+"""Scenes with cameras and points only: a survey, a forward-facing capture, an object."""
 
 import math
 from dataclasses import replace
@@ -13,12 +13,12 @@ from tidefield.geometry.cameras import Cameras
 
 TILT = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
 TILT = TILT * torch.linalg.det(TILT)
-"""Structure-from-motion's arbitrary axes: every scene here is turned by this."""
+"""Structure-from-motion's arbitrary axes: every scene here is rotated by this."""
 UP = TILT[:, 2]
 
 
 def scene_of(position: Tensor, forward: Tensor, image_up: Tensor, near_far=(2.0, 6.0), points=None) -> Scene:
-    """A scene of N cameras, all of them training cameras, in turned coordinates."""
+    """A scene of N cameras, all of them training cameras, in rotated coordinates."""
     count = len(position)
     ahead = torch.nn.functional.normalize(forward.expand(count, 3), dim=1)
     right = torch.nn.functional.normalize(torch.linalg.cross(ahead, image_up.expand(count, 3)), dim=1)
@@ -64,14 +64,14 @@ def survey(rows: int = 3, every: int = 1) -> Scene:
 
 
 def motif() -> Scene:
-    """A few steps before a wall, as for LLFF."""
+    """Cameras close together before a wall, as in LLFF."""
     generator = torch.Generator().manual_seed(3)
     position = torch.rand(12, 3, generator=generator) * torch.tensor([4.0, 0.5, 2.0])
     return scene_of(position, torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]), (10.0, 40.0))
 
 
 def object_scene() -> Scene:
-    """Cameras on the upper half of a sphere of radius 4, looking at its middle, named in no order (Blender)."""
+    """Cameras on the upper half of a sphere of radius 4, pointing at its middle, in random order (Blender)."""
     generator = torch.Generator().manual_seed(4)
     azimuth = torch.rand(60, generator=generator) * 2 * math.pi
     height = 0.1 + 0.8 * torch.rand(60, generator=generator)
@@ -81,7 +81,7 @@ def object_scene() -> Scene:
 
 
 def oblique() -> Scene:
-    """The same flight, looking 45 degrees aside: nothing straight below was photographed."""
+    """The same flight with cameras tilted by 45 degrees: the ground below the flight is not in the photographs."""
     position = survey().cameras.position_world @ TILT
     return scene_of(position, torch.tensor([0.0, 1.0, -1.0]), torch.tensor([0.0, 1.0, 1.0]), (30.0, 90.0))
 

@@ -57,8 +57,8 @@ def looking(
     prior = surface_prior(at.cameras[TARGET], at.points, at.cameras)
     start = own.start_intervals(tiles, prior.expand(len(corners), -1, -1, -1))
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
-    presence, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
-    return tiles, FeatureCache(own, at, CPU).views(Neighbours(neighbours, presence), middle), start
+    blend_weight, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
+    return tiles, FeatureCache(own, at, CPU).views(Neighbours(neighbours, blend_weight), middle), start
 
 
 def outputs(rendering: TileRendering) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""OpenSfM projects as OpenSfM writes them, and its documented projection, written down once more and point by point."""
+"""OpenSfM projects in OpenSfM's format, and an independent implementation of its documented projection."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Small scenes with known cameras, written in each of the layouts that are read."""
+"""Small synthetic surveys with exact cameras, written in each supported layout."""
 
 import json
 from dataclasses import dataclass, replace

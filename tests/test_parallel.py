@@ -76,7 +76,7 @@ def test_parts_of_a_batch_are_its_tiles_with_their_own_crops() -> None:
     batch = batch_of(3)
     parts = batch.parts(2)
     assert [len(part.targets) for part in parts] == [2, 1]
-    for name in ("targets", "corner_px", "colours", "weight", "neighbours", "presence"):
+    for name in ("targets", "corner_px", "colours", "weight", "neighbours", "blend_weight"):
         torch.testing.assert_close(torch.cat([getattr(part, name) for part in parts]), getattr(batch, name))
     crops = [part.images[0][part.which] for part in parts]
     torch.testing.assert_close(torch.cat(crops), batch.images[0][batch.which])

@@ -40,7 +40,7 @@ def seeds(own: Scene, config: TrainConfig, count: int = 8) -> list[Batch]:
 
 
 @pytest.mark.parametrize("config", [CROPS, WHOLE, replace(CROPS, neighbours="direction")])
-def test_a_target_is_never_its_own_neighbour_and_test_photographs_take_no_part(config: TrainConfig):
+def test_targets_and_test_photographs_are_no_neighbours(config: TrainConfig):
     for drawn in seeds(scene(), config):
         assert not (drawn.neighbours == drawn.targets[:, None]).any()
         assert not torch.isin(torch.cat([drawn.targets, drawn.neighbours.flatten()]), torch.tensor(TEST)).any()
@@ -107,7 +107,7 @@ def test_crops_show_what_the_tile_shows():
                 assert (corner - wanted).abs().max() <= 0.51
 
 
-def test_tiles_are_drawn_from_everywhere():
+def test_tiles_cover_all_training_photographs():
     drawn = seeds(scene(), CROPS, 40)
     corners = torch.cat([d.corner_px for d in drawn])
     assert corners.amin(0).tolist() == [0, 0]
@@ -115,7 +115,7 @@ def test_tiles_are_drawn_from_everywhere():
     assert torch.cat([d.targets for d in drawn]).unique().tolist() == [0, 2, 3, 5, 6]
 
 
-def test_a_photograph_smaller_than_a_tile_says_which_pixels_it_has():
+def test_pixels_outside_a_photograph_smaller_than_a_tile_have_weight_zero():
     drawn = [b for b in seeds(mixed_scene(), CROPS) if (b.targets % 2 == 1).any()]
     assert drawn
     for b in drawn:
@@ -132,18 +132,18 @@ def test_whole_photographs_serve_all_tiles_of_one_target():
         assert len(drawn.targets) == 6
 
 
-def test_evened_photographs_are_at_the_common_exposure():
+def test_photographs_at_the_common_exposure():
     own = scene()
-    level = wall.scene(wall.cameras(7), TEST)
-    unclipped = (own.photographs[2] < 255).all(-1) & (level.photographs[2] < 255).all(-1)
-    difference = (to_common_exposure(own, 2) - to_common_exposure(level, 2)).abs()[unclipped]
+    reference = wall.scene(wall.cameras(7), TEST)
+    unclipped = (own.photographs[2] < 255).all(-1) & (reference.photographs[2] < 255).all(-1)
+    difference = (to_common_exposure(own, 2) - to_common_exposure(reference, 2)).abs()[unclipped]
     assert difference.max() < 0.5 / 255 * (1 + 1 / own.cameras.gain[2].min()) + 1e-6
     torch.testing.assert_close(
         to_common_exposure(own, 2, slice(3, 9), slice(5, 6)), to_common_exposure(own, 2)[3:9, 5:6]
     )
 
 
-def test_the_surface_behind_pixels_lies_on_the_wall():
+def test_unprojected_pixels_lie_on_the_wall():
     own = scene()
     camera, asked = own.cameras[2], torch.tensor([[4.0, 4.0], [44.0, 32.0], [50.0, -3.0]])
     points = unproject_to_surface(camera, DepthPriors(own)[2], asked)
@@ -160,30 +160,30 @@ def test_without_points_the_surface_is_between_near_and_far():
 
 
 @pytest.mark.parametrize("strategy", ["seen", "direction"])
-def test_a_view_to_render_has_the_training_photographs_around_it(strategy: str):
+def test_neighbours_of_a_view_are_training_photographs(strategy: str):
     own = scene()
 
     def neighbours(target: int, count: int, excluded: int | None = None) -> Neighbours:
         prior = DepthPriors(own)[target]
         return choose_neighbours(own.cameras[target], prior, torch.zeros(2), (3, 2), 16, own, count, strategy, excluded)
 
-    everyone = neighbours(1, 100)
-    assert everyone.index.shape == (6, 5)
-    assert all(sorted(chosen) == list(own.train) for chosen in everyone.index.tolist())
+    every = neighbours(1, 100)
+    assert every.index.shape == (6, 5)
+    assert all(sorted(chosen) == list(own.train) for chosen in every.index.tolist())
     assert sorted(neighbours(2, 100, 2).index[0].tolist()) == [0, 3, 5, 6]
     if strategy == "seen":
         assert set(neighbours(1, 2).index[0, :2].tolist()) == {0, 2}
 
 
-def test_tiles_side_by_side_agree_about_who_is_there_between_them():
+def test_adjacent_tiles_share_the_blend_weights_of_their_common_corners():
     at = wall.scene(wall.cameras(12, 96, 72, step=0.2), (6,))
     found = choose_neighbours(at.cameras[6], DepthPriors(at)[6], torch.zeros(2), (6, 4), 16, at, 4, "seen")
-    presence = torch.zeros(6 * 4, 12, 4).scatter_(1, found.index[..., None].expand(-1, -1, 4), found.presence)
-    grid = presence.reshape(4, 6, 12, 4)
-    beside = (grid[:, :-1, :, [1, 3]] - grid[:, 1:, :, [0, 2]]).abs()
-    under = (grid[:-1, :, :, [2, 3]] - grid[1:, :, :, [0, 1]]).abs()
+    table = torch.zeros(6 * 4, 12, 4).scatter_(1, found.index[..., None].expand(-1, -1, 4), found.blend_weight)
+    grid = table.reshape(4, 6, 12, 4)
+    across = (grid[:, :-1, :, [1, 3]] - grid[:, 1:, :, [0, 2]]).abs()
+    down = (grid[:-1, :, :, [2, 3]] - grid[1:, :, :, [0, 1]]).abs()
     assert len({tuple(sorted(index)) for index in found.index.tolist()}) > 2, "neighbours change"
-    assert max(beside.max(), under.max()) < 0.1, "and those that change are hardly there where they do"
+    assert max(across.max(), down.max()) < 0.1, "and have hardly any weight where they change"
 
 
 def test_a_batch_for_a_network_without_views_has_nothing_to_encode():
@@ -194,7 +194,7 @@ def test_a_batch_for_a_network_without_views_has_nothing_to_encode():
     assert drawn.colours.shape == (6, 64, 3)
 
 
-def test_pixels_that_fewer_than_two_others_see_weigh_as_little_as_is_said():
+def test_pixels_seen_by_fewer_than_two_others_have_the_unseen_weight():
     """Three cameras in a row: the outer ones' outer edges are seen by themselves alone."""
     own = wall.scene(wall.cameras(3, step=1.5), ())
     config = replace(CROPS, tile_px=8, unseen_weight=0.25)
@@ -204,10 +204,14 @@ def test_pixels_that_fewer_than_two_others_see_weigh_as_little_as_is_said():
             tile = own.cameras[target]
             u, v = (drawn.corner_px[t] + 0.5).tolist()
             pixels = torch.tensor([[u + x, v + y] for y in range(8) for x in range(8)])
-            spot = tile.directions_world(pixels[None])[0] * wall.DEPTH + tile.position_world
+            surface = tile.directions_world(pixels[None])[0] * wall.DEPTH + tile.position_world
             others = own.cameras[[i for i in range(3) if i != target]]
-            seen = ((others.project(spot)[0] > 0) & (others.project(spot)[0] < others.size_px[:, None])).all(-1).sum(0)
-            # Told by cells of four pixels, so at the border between seen and unseen it may differ.
+            seen = (
+                ((others.project(surface)[0] > 0) & (others.project(surface)[0] < others.size_px[:, None]))
+                .all(-1)
+                .sum(0)
+            )
+            # Decided on cells of four pixels, so it may differ at the border between seen and unseen.
             agree = torch.where(seen >= 2, 1.0, 0.25) == drawn.weight[t]
             assert agree.float().mean() >= 0.75
             weights |= set(drawn.weight[t].tolist())
@@ -223,15 +227,15 @@ def test_sparse_points_give_their_pixels_the_depth_of_the_wall(config: TrainConf
         for t, target in enumerate(drawn.targets.tolist()):
             uv = points.uv_px[points.camera_index == target] - drawn.corner_px[t]
             inside = uv[((uv >= 0) & (uv < 8)).all(-1)].long()
-            known = torch.zeros(64, dtype=torch.bool)
-            known[inside[:, 1] * 8 + inside[:, 0]] = True
-            assert torch.equal(drawn.depth_weight[t] > 0, known)
-            torch.testing.assert_close(drawn.inverse_depth[t], known / wall.DEPTH)
-            found += int(known.sum())
+            observed = torch.zeros(64, dtype=torch.bool)
+            observed[inside[:, 1] * 8 + inside[:, 0]] = True
+            assert torch.equal(drawn.depth_weight[t] > 0, observed)
+            torch.testing.assert_close(drawn.inverse_depth[t], observed / wall.DEPTH)
+            found += int(observed.sum())
     assert found > 20
 
 
-def test_a_point_of_large_reprojection_error_is_trusted_less():
+def test_points_of_large_reprojection_error_have_less_weight():
     own = scene()
     assert own.points is not None
     error = torch.ones(len(own.points.xyz_world))
@@ -241,7 +245,7 @@ def test_a_point_of_large_reprojection_error_is_trusted_less():
     torch.testing.assert_close(DepthPriors(own).observed(0).weight, expected)
 
 
-def test_without_sparse_points_no_depth_is_held():
+def test_without_sparse_points_no_depth_is_supervised():
     drawn = batch(replace(scene(), points=None), CROPS)
     assert drawn.depth_weight.abs().max() == 0
     assert drawn.inverse_depth.abs().max() == 0

@@ -1,12 +1,23 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import textured_wall as wall
 import torch
 from torch import Tensor
 
-from tidefield.data.depth_prior import STRIDE, read_prior, surface_prior
+from tidefield.data.depth_prior import (
+    INTERVAL_POINTS,
+    LEAST_MARGIN,
+    MARGIN,
+    SPARSE_DISTANCE,
+    SPARSE_MARGIN,
+    STRIDE,
+    read_prior,
+    surface_prior,
+)
+from tidefield.data.surface import trusted_points
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
 TILT = (0.15, -0.1)
@@ -51,8 +62,8 @@ def test_beyond_the_image_the_border_continues():
     prior = surface_prior(own[1], wall.points(own), own)[None]
     outside = read_prior(prior, torch.tensor([[[-50.0, 10.0], [500.0, 10.0]]]))
     border = read_prior(prior, torch.tensor([[[0.0, 10.0], [48.0, 10.0]]]))
-    for far_off, at in zip(outside, border, strict=True):
-        torch.testing.assert_close(far_off, at)
+    for one, other in zip(outside, border, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("count", [1, 5, 40, 400])
@@ -78,7 +89,7 @@ def test_more_points_make_the_interval_narrower():
     assert widths[2] < 0.25 * (1 / 3 - 1 / 10)
 
 
-def test_without_points_nothing_is_expected_and_the_interval_is_the_cameras():
+def test_without_points_the_interval_is_the_cameras_near_and_far():
     own = wall.cameras(2)
     own = replace(own, near_far=torch.tensor([[3.0, 10.0], [2.0, 8.0]]))
     expected, near, far = surface_prior(own[1], None, own)
@@ -92,7 +103,7 @@ def test_without_points_nothing_is_expected_and_the_interval_is_the_cameras():
     torch.testing.assert_close(read[2], torch.full((1, 2), 0.125))
 
 
-def test_a_new_camera_has_a_prior_though_it_observed_nothing():
+def test_a_new_camera_without_observations_has_a_prior():
     own = wall.cameras(5)
     points = wall.points(own[[0, 1, 3, 4]], tilt=TILT)
     prior = surface_prior(own[2], points, own[[0, 1, 3, 4]])
@@ -107,3 +118,38 @@ def test_a_scene_in_millimetres_has_the_same_prior_in_other_units():
     larger = replace(own, T_world_camera=pose, near_far=own.near_far * 1000)
     scaled = surface_prior(larger[0], replace(points, xyz_world=points.xyz_world * 1000), larger)
     torch.testing.assert_close(scaled * 1000, surface_prior(own[0], points, own), rtol=1e-3, atol=0)
+
+
+def test_the_interval_extends_beyond_the_nearest_points_by_the_margin():
+    """Against a plain search of each cell's nearest points."""
+    own = wall.cameras(3)
+    wide = replace(own, near_far=torch.tensor([[0.5, 100.0]]).repeat(3, 1))
+    points = wall.points(own, 60, (0.6, -0.5))
+    expected, near, far = surface_prior(wide[0], points, wide)
+    uv, inverse = trusted_points(wide[0].resized(12, 9), points, wide)
+    spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
+    margins = set()
+    for row in range(9):
+        for column in range(12):
+            distance = np.hypot(uv[:, 0] - column - 0.5, uv[:, 1] - row - 0.5)
+            around = inverse[np.argsort(distance)[:INTERVAL_POINTS]]
+            share = min(distance.min() / (SPARSE_DISTANCE * 12), 1)
+            margin = spread * (MARGIN * (1 - share) + SPARSE_MARGIN * share)
+            surface = float(expected[row, column])
+            assert float(near[row, column]) == pytest.approx(
+                max(around.max() + margin, surface * (1 + LEAST_MARGIN)), rel=1e-5
+            )
+            assert float(far[row, column]) == pytest.approx(
+                max(min(around.min() - margin, surface / (1 + LEAST_MARGIN)), 1 / 100), rel=1e-5
+            )
+            margins.add(round(margin / spread, 2))
+    assert max(margins) == SPARSE_MARGIN
+    assert min(margins) < 0.2
+
+
+def test_the_interval_contains_the_surface_with_the_least_margin_where_all_points_have_one_depth():
+    own = wall.cameras(3)
+    expected, near, far = surface_prior(own[1], wall.points(own), own)
+    torch.testing.assert_close(expected, torch.full_like(expected, 1 / wall.DEPTH))
+    torch.testing.assert_close(near, expected * (1 + LEAST_MARGIN))
+    torch.testing.assert_close(far, expected / (1 + LEAST_MARGIN))

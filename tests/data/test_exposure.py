@@ -1,4 +1,4 @@
-"""Exposure gains: what is planted is found, and held-out pixels play no part."""
+"""Exposure gains: planted gains are recovered, and held-out pixels have no influence."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ TRAIN, TEST = every_eighth(COUNT)
 
 
 class Watched(Photographs):
-    """Photographs that note which of them were asked for."""
+    """Photographs that record which of them were read."""
 
     asked: ClassVar[list[int]] = []
 
@@ -80,7 +80,7 @@ def test_planted_gains_are_recovered_within_one_percent():
     assert found[list(TRAIN)].log().mean(0).abs().max() < 1e-5
 
 
-def test_gains_take_away_what_photographs_disagreed_about():
+def test_gains_remove_the_disagreement_of_photographs():
     photographs, cameras, points = survey(planted())
     before = disagreement(photographs, points, TRAIN, torch.ones(COUNT, 3))
     after = disagreement(photographs, points, TRAIN, estimate_gains(photographs, cameras, points, TRAIN))
@@ -138,7 +138,7 @@ def test_windows_with_glints_are_ignored_although_their_mean_is_not_clipped():
     assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
 
 
-def test_photographs_that_share_nothing_lean_on_the_ones_before_and_after():
+def test_photographs_without_shared_points_follow_the_previous_and_next():
     truth = planted()
     photographs, cameras, points = survey(truth)
     lonely = 5
@@ -150,7 +150,7 @@ def test_photographs_that_share_nothing_lean_on_the_ones_before_and_after():
     assert (found / relative(truth)).log()[lonely].abs().max() < 0.08
 
 
-def test_the_exposure_of_a_held_out_photograph_counts():
+def test_the_exif_exposure_of_a_held_out_photograph_is_used():
     log_exposure = torch.zeros(COUNT, dtype=torch.float64)
     log_exposure[::2] = 0.6
     truth = torch.exp(0.5 * log_exposure)[:, None].float().expand(COUNT, 3)
@@ -162,7 +162,7 @@ def test_the_exposure_of_a_held_out_photograph_counts():
     assert without[list(TEST)].max() > 0.1
 
 
-def test_exposures_that_the_photographs_contradict_are_left_aside():
+def test_exposures_that_the_photographs_contradict_are_ignored():
     log_exposure = torch.linspace(-1, 1, COUNT, dtype=torch.float64).flip(0)[torch.arange(COUNT) * 5 % COUNT]
     photographs, cameras, points = survey(torch.ones(COUNT, 3))
     metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
@@ -170,7 +170,7 @@ def test_exposures_that_the_photographs_contradict_are_left_aside():
     assert found.log().abs().max() < 0.02
 
 
-def test_without_sparse_points_the_exposures_decide_and_else_gains_are_one():
+def test_without_sparse_points_gains_follow_exif_or_are_one():
     photographs, cameras, _ = survey(planted())
     log_exposure = torch.linspace(0, 1, COUNT, dtype=torch.float64)
     nothing = np.full(COUNT, math.nan)

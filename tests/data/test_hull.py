@@ -1,11 +1,13 @@
-"""A ball before a known background, seen from around it."""
+"""The visual hull of a ball before a uniform background, from cameras around it."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from tidefield.data.depth_prior import surface_prior
@@ -18,7 +20,7 @@ CENTRE, RADIUS = torch.tensor([5.0, -3.0, 2.0]), 0.8
 
 
 def around(count: int = 24, size: int = 80, distance: float = 4.0) -> Cameras:
-    """Cameras all around the ball, spread evenly over the directions, that look at its middle."""
+    """Cameras all around the ball, evenly distributed, pointing at its middle."""
     z = 1 - (2 * torch.arange(count) + 1) / count
     turn = torch.arange(count) * math.pi * (3 - math.sqrt(5))
     outwards = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
@@ -37,7 +39,7 @@ def around(count: int = 24, size: int = 80, distance: float = 4.0) -> Cameras:
 
 
 def front(camera: Cameras) -> Tensor:
-    """True z-depth of the ball in each pixel; nan beside it."""
+    """True z-depth of the ball in each pixel; NaN outside of it."""
     ray = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
     apart = CENTRE - camera.position_world[0]
     along, square = ray @ apart, ray.square().sum(-1)
@@ -77,12 +79,12 @@ def test_a_new_views_rays_meet_the_surface_within_the_range():
     assert ((near <= truth) & (truth <= far))[there].all()
     assert (truth - near)[there].median() < 0.15
     assert ((far - near)[there]).max() < 2.6 * RADIUS
-    # Beside it the range is that of all rays that meet it: nothing else is known, and nothing else is there.
+    # Rays that miss it get the range of all rays that meet it.
     torch.testing.assert_close(near[0, 0], near.min())
     torch.testing.assert_close(far[0, 0], far.max())
 
 
-def test_a_view_that_misses_the_hull_has_its_own_range():
+def test_a_view_that_misses_the_hull_keeps_its_near_and_far():
     cameras = around()
     hull = hull_of(cameras, range(24))
     away = replace(cameras[0], T_world_camera=cameras[0].T_world_camera * torch.tensor([-1.0, 1.0, -1.0, 1.0]))
@@ -92,7 +94,7 @@ def test_a_view_that_misses_the_hull_has_its_own_range():
     assert (far == away.near_far[0, 1]).all()
 
 
-def test_held_out_photographs_leave_no_trace():
+def test_alphas_of_held_out_photographs_do_not_change_the_hull():
     cameras = around()
     truth = pictures(cameras)
     blank = replace(truth, alphas=(*truth.alphas[:20], *(torch.zeros(80, 80, dtype=torch.uint8) for _ in range(4))))
@@ -102,7 +104,7 @@ def test_held_out_photographs_leave_no_trace():
     assert torch.equal(one.filled, other.filled)
 
 
-def test_nothing_is_known_without_outlines_or_where_they_contradict_each_other():
+def test_no_hull_without_silhouettes_or_if_they_contradict_each_other():
     cameras = around()
     truth = pictures(cameras)
     assert visual_hull(cameras, replace(truth, alphas=()), range(24)) is None
@@ -112,7 +114,7 @@ def test_nothing_is_known_without_outlines_or_where_they_contradict_each_other()
     assert visual_hull(cameras, replace(truth, alphas=nowhere), range(24)) is None
 
 
-def test_the_network_looks_first_within_the_hull():
+def test_the_depth_prior_lies_within_the_hull():
     cameras = around(25)
     hull, new = hull_of(cameras, range(24)), cameras[24]
     expected, near, far = surface_prior(new, None, cameras, hull)
@@ -125,27 +127,30 @@ def test_the_network_looks_first_within_the_hull():
     assert near[0, 0] <= near.max()
 
 
-def test_scenes_with_alpha_come_with_a_hull(tmp_path: Path):
-    import json
-
-    from PIL import Image
-
-    cameras = around()
-    (tmp_path / "train").mkdir()
+def write_blender_part(root: Path, part: str, cameras: Cameras, alphas: list[Tensor]) -> None:
+    """One part of a Blender scene of the ball, moved to the origin."""
+    (root / part).mkdir()
     frames = []
-    for i, alpha in enumerate(pictures(cameras).alphas):
-        assert alpha is not None
-        Image.fromarray(torch.stack([alpha, alpha // 2, alpha // 3, alpha], -1).numpy()).save(
-            tmp_path / "train" / f"{i}.png"
-        )
+    for i, alpha in enumerate(alphas):
+        pixels = torch.stack([alpha, alpha // 2, alpha // 3, alpha], -1).numpy()
+        Image.fromarray(pixels).save(root / part / f"{i}.png")
         pose = torch.eye(4)
         pose[:3] = cameras.T_world_camera[i] * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
         pose[:3, 3] -= CENTRE
-        frames.append({"file_path": f"./train/{i}", "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"./{part}/{i}", "transform_matrix": pose.tolist()})
     angle = 2 * math.atan(0.5 / 1.2)
-    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    scene = load_scene(tmp_path)
+    (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+
+
+def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(tmp_path: Path):
+    cameras = around()
+    alphas = [alpha for alpha in pictures(cameras).alphas if alpha is not None]
+    write_blender_part(tmp_path, "train", cameras, alphas)
+    # Held-out photographs of the background alone: they would carve away everything.
+    write_blender_part(tmp_path, "test", cameras[1:4], [torch.zeros_like(alpha) for alpha in alphas[1:4]])
+    scene = load_scene(tmp_path, cache=tmp_path / "cache")
     assert scene.points is None
+    assert len(scene.test) == 3
     assert scene.hull is not None
     middle = -scene.origin_world.float()
     assert scene.hull.contains(middle)

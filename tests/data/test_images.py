@@ -39,7 +39,7 @@ def refuse_to_decode(*_: object) -> np.ndarray:
     raise AssertionError("decoded again")
 
 
-def test_photographs_of_different_sizes_come_back_as_they_are(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+def test_photographs_of_different_sizes_are_read_unchanged(cache: Path, files: tuple[PhotographFile, ...]) -> None:
     photographs = open_photographs(files, WHITE)
     assert len(photographs) == 5
     for i, file in enumerate(files):
@@ -53,16 +53,16 @@ def test_photographs_of_different_sizes_come_back_as_they_are(cache: Path, files
 def test_a_scene_opened_again_is_not_decoded_again(
     cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[tuple[int, int]] = []
-    first = open_photographs(files, WHITE, lambda done, count: told.append((done, count)))
-    assert told == [(i, 5) for i in range(1, 6)]
+    calls: list[tuple[int, int]] = []
+    first = open_photographs(files, WHITE, lambda done, count: calls.append((done, count)))
+    assert calls == [(i, 5) for i in range(1, 6)]
     monkeypatch.setattr(images, "_decode", refuse_to_decode)
-    again = open_photographs(files, WHITE, lambda done, count: told.append((done, count)))
-    assert len(told) == 5
+    again = open_photographs(files, WHITE, lambda done, count: calls.append((done, count)))
+    assert len(calls) == 5
     assert all(torch.equal(first[i], again[i]) for i in range(5))
 
 
-def test_what_determines_the_pixels_determines_the_store(
+def test_the_cache_key_covers_everything_that_determines_the_pixels(
     cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     open_photographs(files, WHITE)
@@ -93,7 +93,7 @@ def test_a_store_that_was_cut_short_is_made_again(cache: Path, files: tuple[Phot
     assert torch.equal(open_photographs(files, WHITE)[4], before)
 
 
-def test_transparent_photographs_are_laid_on_the_background(cache: Path, tmp_path: Path) -> None:
+def test_transparent_photographs_are_composited_on_the_background(cache: Path, tmp_path: Path) -> None:
     pixels = np.zeros((2, 3, 4), np.uint8)
     pixels[0] = (200, 100, 0, 255)
     pixels[1] = (200, 100, 0, 51)  # a fifth
@@ -122,7 +122,7 @@ def test_grey_photographs_become_three_equal_channels(cache: Path, tmp_path: Pat
     assert (picture == picture[..., :1]).all()
 
 
-def test_a_truncated_jpeg_is_named_and_leaves_no_store(cache: Path, tmp_path: Path) -> None:
+def test_a_truncated_jpeg_is_named_and_not_cached(cache: Path, tmp_path: Path) -> None:
     whole = [save(tmp_path / f"{i}.jpg", 200, 150, seed=i) for i in range(3)]
     content = whole[1].path.read_bytes()
     whole[1].path.write_bytes(content[: len(content) // 2])
@@ -132,7 +132,7 @@ def test_a_truncated_jpeg_is_named_and_leaves_no_store(cache: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n" + bytes(40)])
-def test_what_is_no_picture_is_named(tmp_path: Path, content: bytes) -> None:
+def test_files_that_are_no_pictures_are_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "no.png").write_bytes(content)
     with pytest.raises(SceneError, match=r"no\.png cannot be read"):
         read_header(tmp_path / "no.png")
@@ -140,11 +140,11 @@ def test_what_is_no_picture_is_named(tmp_path: Path, content: bytes) -> None:
 
 def test_sixteen_bits_per_colour_are_refused(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((4, 5), np.uint16)).save(tmp_path / "deep.png")
-    with pytest.raises(SceneError, match=r"deep\.png has pixels of the kind I;16.*8 bits"):
+    with pytest.raises(SceneError, match=r"deep\.png has pixels of the mode I;16.*8 bits"):
         read_header(tmp_path / "deep.png")
 
 
-def test_a_full_disk_is_one_error_and_leaves_nothing_behind(
+def test_a_full_disk_is_one_error_and_leaves_no_files(
     cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_: int) -> None:
@@ -167,7 +167,7 @@ def test_without_a_writable_cache_photographs_are_held_in_memory(
     assert all(torch.equal(held[i], kept[i]) for i in range(5))
 
 
-def test_stores_that_nobody_opened_for_long_are_forgotten(cache: Path, files: tuple[PhotographFile, ...]) -> None:
+def test_unused_stores_are_deleted(cache: Path, files: tuple[PhotographFile, ...]) -> None:
     open_photographs(files, WHITE)
     open_photographs(files[:2], WHITE)
     old, young = sorted(cache.iterdir(), key=lambda store: -store.stat().st_size)
@@ -179,3 +179,16 @@ def test_stores_that_nobody_opened_for_long_are_forgotten(cache: Path, files: tu
     assert young.exists()
     assert not old.exists()
     assert not (cache / "killed.partial").exists()
+
+
+def test_without_a_chosen_cache_folder_the_systems_own_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
+    for value in ("", None):
+        if value is None:
+            monkeypatch.delenv("XDG_CACHE_HOME")
+        else:
+            monkeypatch.setenv("XDG_CACHE_HOME", value)
+        folder = images._cache_folder()
+        assert folder.is_relative_to(tmp_path)
+        assert "tidefield" in folder.parts

@@ -53,10 +53,10 @@ def assert_poses(scene: Scene, truth: Truth, flat: bool = False) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
-def test_a_colmap_model_is_read_with_its_lenses_removed(tmp_path: Path, text: bool, place: str) -> None:
+@pytest.mark.parametrize("folder", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_a_colmap_model_loads_as_an_undistorted_scene(tmp_path: Path, text: bool, folder: str) -> None:
     truth = survey(BARREL)
-    write_colmap(tmp_path, truth, text, place)
+    write_colmap(tmp_path, truth, text, folder)
     scene = load_scene(tmp_path)
     assert_poses(scene, truth)
     assert reprojection_px(scene).max() < 1e-3
@@ -66,6 +66,14 @@ def test_a_colmap_model_is_read_with_its_lenses_removed(tmp_path: Path, text: bo
     assert (scene.points.uv_px < torch.tensor([64, 48])).all()
     assert scene.test == (0, 8)
     assert scene.background_rgb is None
+
+
+def test_a_scenes_folder_may_be_a_string(tmp_path: Path) -> None:
+    write_colmap(tmp_path, survey(BARREL))
+    scene = load_scene(str(tmp_path))
+    assert scene.root == tmp_path
+    assert scene.cameras["photo_3"].names == ("strip_1/photo_3.png",)
+    assert repr(scene).startswith(f"Scene({tmp_path.name!r}, 9 photographs 64x48, 7 train, 2 test, ")
 
 
 def test_every_layout_gives_the_same_cameras(tmp_path: Path) -> None:
@@ -81,7 +89,7 @@ def test_every_layout_gives_the_same_cameras(tmp_path: Path) -> None:
             torch.testing.assert_close(getattr(scene.cameras, part), getattr(expected, part))
 
 
-def test_coordinates_as_large_as_a_map_projections_lose_nothing(tmp_path: Path) -> None:
+def test_coordinates_of_a_map_projection_keep_their_precision(tmp_path: Path) -> None:
     truth = survey(BARREL, offset=UTM)
     write_colmap(tmp_path, truth)
     scene = load_scene(tmp_path)
@@ -89,7 +97,7 @@ def test_coordinates_as_large_as_a_map_projections_lose_nothing(tmp_path: Path) 
     assert reprojection_px(scene).max() < 1e-3
 
 
-def test_photographs_of_different_sizes_and_cameras_live_in_one_scene(tmp_path: Path) -> None:
+def test_a_scene_may_have_several_sizes_and_lenses(tmp_path: Path) -> None:
     truth = with_one_larger(survey(BARREL))
     write_colmap(tmp_path, truth)
     scene = load_scene(tmp_path)
@@ -115,11 +123,11 @@ def test_a_width_scales_cameras_pictures_and_observations_together(tmp_path: Pat
     torch.testing.assert_close(half.points.uv_px * 2, full.points.uv_px)
     means = full.photographs[2].double().reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))
     assert (half.photographs[2] - means).abs().max() <= 2  # cubic, where the larger ones were made with Lanczos
-    with pytest.raises(SceneError, match="3 pixels wide"):
+    with pytest.raises(SceneError, match="width is 3 pixels"):
         load_scene(tmp_path, width=3)
 
 
-def test_photographs_reduced_beside_their_model_are_accepted_and_others_refused(tmp_path: Path) -> None:
+def test_photographs_of_another_size_need_the_aspect_of_their_lens(tmp_path: Path) -> None:
     truth = survey(BARREL)
     write_colmap(tmp_path, truth)
     for name in truth.names:
@@ -129,11 +137,11 @@ def test_photographs_reduced_beside_their_model_are_accepted_and_others_refused(
     assert scene.cameras.size_px[0].tolist() == [32, 24]
     assert reprojection_px(scene).max() < 1e-3
     Image.new("RGB", (48, 64)).save(tmp_path / "images" / truth.names[0])
-    with pytest.raises(SceneError, match=r"photo_8\.png has 48 x 64 pixels, but its camera has 64 x 48.*turned"):
+    with pytest.raises(SceneError, match=r"photo_8\.png has 48 x 64 pixels, but its camera has 64 x 48.*rotated"):
         load_scene(tmp_path)
 
 
-def test_ranges_hold_what_each_camera_sees_with_room_above_and_below(tmp_path: Path) -> None:
+def test_near_and_far_include_margins_above_and_below_the_ground(tmp_path: Path) -> None:
     write_colmap(tmp_path, survey(BARREL))
     scene = load_scene(tmp_path)
     near, far = scene.cameras.near_far.unbind(dim=1)
@@ -177,7 +185,7 @@ def test_llff_bounds_become_ranges_with_a_margin(tmp_path: Path) -> None:
     torch.testing.assert_close(near_far, torch.tensor([[6.0, 13.75]]).expand(9, 2))
 
 
-def test_photographs_missing_are_counted_and_named_and_can_be_left_out(tmp_path: Path) -> None:
+def test_missing_photographs_are_named_and_can_be_left_out(tmp_path: Path) -> None:
     truth = survey(BARREL)
     write_colmap(tmp_path, truth)
     gone = [truth.names[i] for i in (0, 4)]
@@ -202,9 +210,7 @@ def test_fewer_than_three_photographs_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [(), ("notes.txt",), ("images/a.png", "images/b.png")])
-def test_a_folder_that_is_no_scene_says_what_was_found_and_what_scenes_look_like(
-    tmp_path: Path, content: tuple[str, ...]
-) -> None:
+def test_a_folder_that_is_no_scene_lists_its_files_and_the_layouts(tmp_path: Path, content: tuple[str, ...]) -> None:
     root = tmp_path / "scene"
     root.mkdir()
     for name in content:
@@ -215,7 +221,7 @@ def test_a_folder_that_is_no_scene_says_what_was_found_and_what_scenes_look_like
     message = str(caught.value)
     assert f"found: {content[0].split('/')[0] if content else 'nothing'}" in message
     assert all(layout in message for layout in ("sparse/0", "transforms.json", "transforms_train", "poses_bounds"))
-    with pytest.raises(SceneError, match="not there"):
+    with pytest.raises(SceneError, match="nowhere is missing"):
         load_scene(root / "nowhere")
 
 
@@ -232,7 +238,7 @@ def _not_finite(matrix: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spoil", [_turned, _scaled, _not_finite])
-def test_poses_that_are_none_are_refused_and_named(tmp_path: Path, spoil: object) -> None:
+def test_invalid_poses_are_refused_and_named(tmp_path: Path, spoil: object) -> None:
     truth = survey(PINHOLE)
     file = write_transforms(tmp_path, truth)
     top = json.loads(file.read_text())
@@ -243,7 +249,7 @@ def test_poses_that_are_none_are_refused_and_named(tmp_path: Path, spoil: object
         load_scene(tmp_path)
 
 
-def test_rounding_noise_in_rotations_is_mended(tmp_path: Path) -> None:
+def test_rotations_are_orthonormalised(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     noise = np.random.default_rng(0).normal(0, 1e-5, (9, 3, 4))
     write_transforms(tmp_path, replace(truth, T_world_camera=truth.T_world_camera + noise))

@@ -25,7 +25,7 @@ def ground(count: int, extent: float = 150.0) -> np.ndarray:
     return np.c_[random.uniform(-extent, extent, (count, 2)), np.zeros(count)]
 
 
-def test_flat_ground_leaves_room_for_trees_and_holes() -> None:
+def test_ranges_over_flat_ground_include_trees_and_holes() -> None:
     poses = flat_survey()
     near_far = near_far_from_points(poses, (PINHOLE,) * 12, observations(poses, ground(4000)))
     np.testing.assert_allclose(near_far, np.tile([25.0, 70.0], (12, 1)))
@@ -54,13 +54,13 @@ def test_cameras_over_nothing_take_the_range_of_the_others() -> None:
     np.testing.assert_allclose(near_far, np.tile([25.0, 70.0], (12, 1)))
 
 
-def test_a_handful_of_points_is_as_good_as_none() -> None:
+def test_too_few_points_are_ignored() -> None:
     poses = survey(PINHOLE).T_world_camera
     near_far = near_far_from_cloud(poses, (PINHOLE,) * 9, ground(5))
     np.testing.assert_allclose(near_far, near_far_from_cameras(poses))
 
 
-def test_cameras_that_look_at_one_point_see_around_it() -> None:
+def test_ranges_of_cameras_with_a_common_focus_surround_it() -> None:
     around = np.linspace(0, 2 * np.pi, 10, endpoint=False)
     forward = -np.stack([np.cos(around), np.sin(around), 0 * around + 0.5], axis=1) / np.sqrt(1.25)
     right = np.cross(forward, [0, 0, 1.0])
@@ -69,13 +69,13 @@ def test_cameras_that_look_at_one_point_see_around_it() -> None:
     np.testing.assert_allclose(near_far_from_cameras(poses), np.tile([2.0, 80.0], (10, 1)))
 
 
-def test_a_strip_of_parallel_cameras_holds_any_plausible_ground() -> None:
+def test_ranges_of_parallel_cameras_follow_their_spacing() -> None:
     near_far = near_far_from_cameras(flat_survey())
     assert (near_far[:, 0] == 5.0).all()
     assert (near_far[:, 1] == 1000.0).all()
 
 
-def test_cameras_in_one_place_still_get_a_range() -> None:
+def test_cameras_at_one_position_get_a_range() -> None:
     poses = np.tile(np.c_[DOWN, np.zeros(3)], (4, 1, 1))
     near, far = near_far_from_cameras(poses).T
     assert (near > 0).all()

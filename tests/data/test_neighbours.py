@@ -1,24 +1,31 @@
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import textured_wall as wall
 import torch
 from torch import Tensor
 
+from tidefield.data import neighbours
+from tidefield.data.images import Photographs
 from tidefield.data.neighbours import (
     ANGLE_SCALE_RAD,
     BORDER,
     FADE,
+    PRESELECT_ABOVE,
+    choose_neighbours,
     from_border,
-    nearest,
     rank_by_direction,
     rank_by_view,
+    select_best,
 )
+from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 
 HEIGHT = 30.0
 NADIR = torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-"""Columns: right is east, down is south, forward is down to earth."""
+"""Columns: right is east, down is south, forward is down."""
 
 
 def flight(positions: Tensor, turn: Tensor | None = None) -> Cameras:
@@ -52,14 +59,14 @@ def tilted(angle: float) -> Tensor:
     return torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ NADIR
 
 
-def nobody(count: int) -> Tensor:
+def none_excluded(count: int) -> Tensor:
     return torch.zeros(1, count, dtype=torch.bool)
 
 
 def test_above_flat_ground_the_nearest_photograph_comes_first():
     own = nadir_grid()
     target = flight(torch.tensor([[1.0, 0.3, HEIGHT]]))
-    chosen = nearest(rank_by_view(target, ground(target), own), nobody(25), 9)[0][0]
+    chosen = select_best(rank_by_view(target, ground(target), own), none_excluded(25), 9)[0][0]
     distance = (own.position_world - target.position_world).norm(dim=-1)
     assert chosen[0] == distance.argmin()
     assert distance[chosen[:3]].tolist() == pytest.approx(distance.sort().values[:3].tolist())
@@ -69,13 +76,13 @@ def test_above_flat_ground_the_nearest_photograph_comes_first():
 def test_a_photograph_of_the_grid_has_its_four_neighbours_and_never_itself():
     own, middle = nadir_grid(), 12
     target = own[middle]
-    chosen = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 4)[0][0]
+    chosen = select_best(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 4)[0][0]
     assert set(chosen.tolist()) == {7, 11, 13, 17}
-    every = nearest(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 100)[0][0]
+    every = select_best(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 100)[0][0]
     assert sorted(every.tolist()) == [i for i in range(25) if i != middle]
 
 
-def test_the_rank_is_the_share_seen_times_how_close_the_angle_is():
+def test_rank_is_share_in_frame_times_angle_weight():
     own = nadir_grid()
     target = flight(torch.tensor([[3.0, -2.0, HEIGHT]]))
     surface = ground(target)
@@ -93,7 +100,7 @@ def test_the_rank_is_the_share_seen_times_how_close_the_angle_is():
         assert rank[v].item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_photograph_of_other_ground_or_of_the_sky_is_worth_nothing():
+def test_photographs_of_other_ground_or_of_the_sky_have_rank_zero():
     target = flight(torch.tensor([[0.0, 0.0, HEIGHT]]))
     away = flight(torch.tensor([[200.0, 0.0, HEIGHT], [0.0, 0.0, HEIGHT]]), torch.stack([NADIR, tilted(math.pi)]))
     assert rank_by_view(target, ground(target), away).tolist() == [[0.0, 0.0]]
@@ -103,55 +110,82 @@ def test_each_tile_has_its_own_neighbours():
     own = nadir_grid()
     targets = flight(torch.tensor([[-7.0, -7.0, HEIGHT], [7.0, 7.0, HEIGHT]]))
     surface = torch.cat([ground(targets[0]), ground(targets[1])])
-    first, _ = nearest(rank_by_view(targets, surface, own), torch.zeros(2, 25, dtype=torch.bool), 1)
+    first, _ = select_best(rank_by_view(targets, surface, own), torch.zeros(2, 25, dtype=torch.bool), 1)
     assert first.flatten().tolist() == [0, 24]
 
 
-def test_the_papers_strategy_ranks_by_the_angle_between_viewing_directions():
+def test_direction_strategy_ranks_by_angle_between_viewing_directions():
     angles = torch.tensor([0.9, 0.1, 0.5, math.pi, 0.3])
-    # The farther, the better aligned: position must play no part.
+    # The farther, the better aligned: position must have no influence.
     positions = torch.stack([1e3 / angles, torch.zeros(5), torch.full((5,), HEIGHT)], -1)
     own = flight(positions, torch.stack([tilted(float(a)) for a in angles]))
     target = flight(torch.tensor([[0.0, 0.0, HEIGHT]]))
     rank = rank_by_direction(target, own)
     torch.testing.assert_close(rank[0], (angles.cos() + 1) / 2)
-    assert nearest(rank, nobody(5), 5)[0][0].tolist() == [1, 4, 2, 0, 3]
+    assert select_best(rank, none_excluded(5), 5)[0][0].tolist() == [1, 4, 2, 0, 3]
 
 
-def test_the_direction_alone_cannot_tell_nadir_photographs_apart():
+def test_direction_strategy_does_not_distinguish_nadir_photographs():
     own = nadir_grid()
     torch.testing.assert_close(rank_by_direction(own[:2], own), torch.ones(2, 25))
 
 
-def test_excluded_photographs_never_serve_even_where_nothing_else_is_worth_anything():
+def test_excluded_photographs_are_not_selected_even_if_all_others_have_rank_zero():
     rank = torch.tensor([[0.9, 0.0, 0.0, 0.8]])
     excluded = torch.tensor([[True, False, False, True]])
-    assert set(nearest(rank, excluded, 3)[0][0].tolist()) == {1, 2}
+    assert set(select_best(rank, excluded, 3)[0][0].tolist()) == {1, 2}
 
 
-def test_the_textured_walls_neighbours_are_those_beside_it():
+def test_neighbours_of_a_camera_in_a_row_are_the_adjacent_ones():
     own = wall.cameras(7)
     surface = own[3].position_world[:, None] + torch.tensor([[[0.0, 0.0, wall.DEPTH], [0.5, 0.3, wall.DEPTH]]])
-    chosen = nearest(rank_by_view(own[3], surface, own), torch.arange(7)[None] == 3, 4)[0][0].tolist()
+    chosen = select_best(rank_by_view(own[3], surface, own), torch.arange(7)[None] == 3, 4)[0][0].tolist()
     assert set(chosen[:2]) == {2, 4}
     assert set(chosen[2:]) == {1, 5}
 
 
-def test_a_view_fades_before_it_is_left_out():
-    """As the last view's rank falls to that of the first one left out, its presence falls to nothing, evenly."""
+def test_blend_weight_falls_to_zero_before_a_view_is_replaced():
+    """As the last view's rank falls to that of the first one left out, its blend weight falls linearly to 0."""
     rank = torch.tensor([[0.5, 0.9, better, 0.8] for better in (0.7, 0.5 + FADE * 0.5 / 2, 0.5, 0.3)])
-    chosen, presence = nearest(rank, torch.zeros(4, 4, dtype=torch.bool), 3)
+    chosen, blend_weight = select_best(rank, torch.zeros(4, 4, dtype=torch.bool), 3)
     assert chosen[:, :2].tolist() == [[1, 3]] * 4
-    assert presence[:, :2].tolist() == [[1, 1]] * 4
-    assert presence[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 0, 1], abs=1e-4)
+    assert blend_weight[:, :2].tolist() == [[1, 1]] * 4
+    assert blend_weight[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 0, 1], abs=1e-4)
 
 
-def test_where_no_view_is_left_out_all_are_there():
-    chosen, presence = nearest(torch.tensor([[0.5, 0.2]]), torch.zeros(1, 2, dtype=torch.bool), 3)
-    assert (chosen.tolist(), presence.tolist()) == ([[0, 1]], [[1, 1]])
+def test_all_weights_are_one_if_no_view_is_left_out():
+    chosen, blend_weight = select_best(torch.tensor([[0.5, 0.2]]), torch.zeros(1, 2, dtype=torch.bool), 3)
+    assert (chosen.tolist(), blend_weight.tolist()) == ([[0, 1]], [[1, 1]])
 
 
-def test_views_fade_towards_the_border_of_their_frame():
+def test_weights_fall_towards_the_image_border():
     size = torch.tensor([400, 300])
     uv = torch.tensor([[200.0, 150.0], [20.0, 150.0], [5.0, 150.0], [398.0, 150.0], [200.0, 299.0], [-3.0, 20.0]])
     assert from_border(uv, size, 0.05).tolist() == pytest.approx([1, 1, 0.25, 0.1, 0.05, 0])
+
+
+def test_preselection_in_large_scenes_finds_the_neighbours_of_every_tile(monkeypatch: pytest.MonkeyPatch):
+    """A wide view along a row of 100 narrow photographs: every part of it has other neighbours."""
+    own = wall.cameras(101)
+    wide = replace(wall.cameras(1, 288, 36), focal_px=torch.full((1, 2), 48.0))
+    prior = torch.full((3, 9, 72), 1 / wall.DEPTH)
+    scene = Scene(
+        root=Path("row"),
+        names=tuple(f"{i:03d}.jpg" for i in range(101)),
+        cameras=own,
+        photographs=Photographs((torch.zeros(1, 1, 3, dtype=torch.uint8),) * 101),
+        points=None,
+        train=tuple(range(101)),
+        test=(),
+        origin_world=torch.zeros(3),
+    )
+    assert len(scene.train) > PRESELECT_ABOVE
+
+    def weights() -> Tensor:
+        found = choose_neighbours(wide, prior, torch.zeros(2), (36, 4), 8, scene, 3, "seen")
+        return torch.zeros(36 * 4, 101, 4).scatter_(1, found.index[..., None].expand(-1, -1, 4), found.blend_weight)
+
+    preselected = weights()
+    assert len((preselected > 0.5).any(-1).any(0).nonzero()) > 50
+    monkeypatch.setattr(neighbours, "PRESELECT_ABOVE", 1000)
+    torch.testing.assert_close(preselected, weights(), atol=2e-6, rtol=0)

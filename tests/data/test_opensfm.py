@@ -88,7 +88,7 @@ def test_observations_are_those_of_tracks_of_every_version(tmp_path: Path, versi
     assert points.rgb.tolist() == [point["color"] for point in top["points"].values()]
 
 
-def test_what_opensfm_took_for_outliers_is_left_out(tmp_path: Path) -> None:
+def test_outliers_of_opensfm_are_left_out(tmp_path: Path) -> None:
     top = reconstruction()
     write_opensfm(tmp_path, top)
     seen = tracks_of(top)
@@ -102,7 +102,7 @@ def test_what_opensfm_took_for_outliers_is_left_out(tmp_path: Path) -> None:
     assert len(points.uv_px) == len(seen) - len(seen[::10])
 
 
-def test_a_scene_comes_of_a_project_with_its_lenses_removed(tmp_path: Path) -> None:
+def test_a_project_loads_as_an_undistorted_scene(tmp_path: Path) -> None:
     top = reconstruction()
     write_opensfm(tmp_path, top)
     write_tracks(tmp_path / "tracks.csv", tracks_of(top))
@@ -119,7 +119,7 @@ def test_a_scene_comes_of_a_project_with_its_lenses_removed(tmp_path: Path) -> N
     )  # fmt: skip
 
 
-def test_points_without_tracks_still_tell_near_and_far(tmp_path: Path) -> None:
+def test_points_without_tracks_give_near_and_far(tmp_path: Path) -> None:
     top = reconstruction()
     top["points"]["7"]["coordinates"] = [float("nan"), 0.0, 0.0]
     del top["points"]["14"]["color"]
@@ -137,7 +137,7 @@ def test_points_without_tracks_still_tell_near_and_far(tmp_path: Path) -> None:
 
 
 def as_odm(root: Path, top: dict[str, Any]) -> Path:
-    """ODM's layout: photographs beside OpenSfM's folder, and a list of where they were on the machine it ran on."""
+    """ODM's layout: photographs next to OpenSfM's folder, and a list of their paths on the machine that ran it."""
     write_photographs(root / "images", top)
     file = write_opensfm(root / "opensfm", top, photographs=False)
     listed = [f"/datasets/code/images/{name}" for name in top["shots"]]
@@ -160,7 +160,7 @@ def test_odms_project_is_read_in_metres_and_not_in_its_map_projection(tmp_path: 
     assert posed.reference == Reference(44.5, -3.25, 0.0)
 
 
-def test_photographs_are_found_where_a_list_says(tmp_path: Path) -> None:
+def test_photographs_are_found_by_image_list(tmp_path: Path) -> None:
     top = reconstruction()
     write_opensfm(tmp_path, top, photographs=False)
     write_photographs(tmp_path / "flight one", top)
@@ -168,11 +168,11 @@ def test_photographs_are_found_where_a_list_says(tmp_path: Path) -> None:
     (tmp_path / "image_list.txt").write_text("\n".join(listed) + "\n\n")
     assert read(tmp_path).paths[0] == tmp_path / "flight one" / "DJI_0008.png"
     (tmp_path / "image_list.txt").write_bytes(b"\xff\xfe")
-    with pytest.raises(SceneError, match=r"image_list\.txt is no UTF-8"):
+    with pytest.raises(SceneError, match=r"image_list\.txt is not UTF-8"):
         read(tmp_path)
 
 
-def test_the_place_on_earth_is_told_only_where_it_is_certain(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_geographic_origin_is_read_only_if_certain(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     top = reconstruction()
     plain, odm = tmp_path / "plain", tmp_path / "odm"
     write_opensfm(plain, top)
@@ -202,7 +202,7 @@ def test_the_largest_of_several_reconstructions_is_read_and_the_others_are_named
     write_opensfm(tmp_path, small, large)
     with caplog.at_level(logging.WARNING, logger="tidefield"):
         assert read(tmp_path).names == tuple(large["shots"])
-    assert "2 reconstructions that do not hang together: the largest, of 9 photographs" in caplog.text
+    assert "2 reconstructions that are not connected: the largest, of 9 photographs" in caplog.text
     assert "other_0.png, other_1.png, other_2.png, other_3.png, other_4.png and 1 more" in caplog.text
 
 
@@ -222,7 +222,7 @@ def test_photographs_missing_are_named_and_can_be_left_out(tmp_path: Path) -> No
         np.testing.assert_allclose(pixels(posed, i, xyz), posed.points.uv_px[mine], atol=1e-6)
 
 
-def test_turning_often_is_still_turning(tmp_path: Path) -> None:
+def test_rotation_vectors_longer_than_a_turn_are_read(tmp_path: Path) -> None:
     top = reconstruction()
     once = read_opensfm(tmp_path, write_opensfm(tmp_path, top), False)
     for shot in top["shots"].values():
@@ -232,7 +232,7 @@ def test_turning_often_is_still_turning(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.T_world_camera, once.T_world_camera, atol=1e-9)
 
 
-def test_tracks_of_another_project_count_for_nothing(tmp_path: Path) -> None:
+def test_tracks_of_another_project_are_ignored(tmp_path: Path) -> None:
     write_opensfm(tmp_path, reconstruction())
     write_tracks(tmp_path / "tracks.csv", [("other.png", "3", (0.1, 0.2))])
     posed = read(tmp_path)

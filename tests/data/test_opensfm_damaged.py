@@ -1,4 +1,4 @@
-"""OpenSfM projects that are damaged, dishonest or beyond us: one clear error each."""
+"""OpenSfM projects that are damaged, malicious or not supported: one clear error each."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ def test_paths_that_leave_the_project_are_refused(tmp_path: Path, name: str) -> 
         read_posed(root, False)
 
 
-def test_lists_do_not_lead_out_of_a_project(tmp_path: Path) -> None:
+def test_image_lists_do_not_leave_a_project(tmp_path: Path) -> None:
     root = tmp_path / "project"
     write_opensfm(root, reconstruction())
     (root / "images" / "DJI_0004.png").rename(tmp_path / "DJI_0004.png")
@@ -34,7 +34,7 @@ def test_lists_do_not_lead_out_of_a_project(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual", "spherical", 7])
-def test_cameras_that_are_no_pinhole_cameras_are_refused_with_a_way_out(tmp_path: Path, kind: object) -> None:
+def test_cameras_that_are_no_pinhole_cameras_are_refused_with_advice(tmp_path: Path, kind: object) -> None:
     top = reconstruction()
     top["cameras"]["v2 make model"]["projection_type"] = kind
     write_opensfm(tmp_path, top)
@@ -60,8 +60,8 @@ def spoiled(path: str, value: object) -> dict[str, Any]:
         ("shots", {"a.png": 3}, "shots that are no table"),
         ("cameras", None, "cameras that are no table"),
         ("points", [[1, 2, 3]], "points that are no table"),
-        ("shots/*/camera", "another", "'another', a camera that it does not have"),
-        ("shots/*/camera", ["list"], "a camera that it does not have"),
+        ("shots/*/camera", "another", "'another', which it does not have"),
+        ("shots/*/camera", ["list"], "which it does not have"),
         ("shots/*/rotation", [0.1, 0.2], r"rotation of DJI_0008\.png is \[0\.1, 0\.2\]: expected three numbers"),
         ("shots/*/rotation", [0.1, float("nan"), 0.2], "rotation of .* = nan"),
         ("shots/*/rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "rotation of .* finite number"),
@@ -73,13 +73,13 @@ def spoiled(path: str, value: object) -> dict[str, Any]:
         ("cameras/*/k3", "much", "k3 = 'much'"),
         ("cameras/*/width", -64, "unusable calibration"),
         ("cameras/*/width", float("nan"), "width = nan"),
-        ("points/*/coordinates", [1.0, 2.0], "points that are none"),
-        ("points/*/coordinates", "here", "points that are none"),
+        ("points/*/coordinates", [1.0, 2.0], "invalid points"),
+        ("points/*/coordinates", "here", "invalid points"),
         ("points/*/color", [1.0, 2.0, 300.0], "colours outside of 0 to 255"),
         ("points/*/color", [1.0, 2.0, float("nan")], "colours outside of 0 to 255"),
     ],
 )
-def test_projects_that_cannot_be_used_say_why(tmp_path: Path, path: str, value: object, message: str) -> None:
+def test_unusable_projects_are_refused(tmp_path: Path, path: str, value: object, message: str) -> None:
     write_photographs(tmp_path / "images", reconstruction())
     (tmp_path / "images" / "a.png").touch()
     write_opensfm(tmp_path, spoiled(path, value), photographs=False)

@@ -6,12 +6,11 @@ import pycolmap
 import pytest
 from scenes_on_disk import BARREL, PINHOLE, survey, write_blender, write_colmap, write_llff, write_transforms
 
-from tidefield.data.readers.blender import read_blender
+from tidefield.data.ply import read_ply
 from tidefield.data.readers.colmap import find_colmap, read_colmap
+from tidefield.data.readers.files import bounded_bytes, inside
 from tidefield.data.readers.llff import read_llff
-from tidefield.data.readers.ply import read_ply
-from tidefield.data.readers.posed import bounded_bytes, inside
-from tidefield.data.readers.transforms import read_transforms
+from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.errors import SceneError
 
 
@@ -112,7 +111,7 @@ def test_names_with_spaces_and_images_that_saw_nothing_are_read_from_text(tmp_pa
     np.testing.assert_allclose(posed.T_world_camera[-1, :, 3], [-1, -2, -3])
 
 
-def test_the_same_lens_comes_from_angles_and_from_focal_lengths(tmp_path: Path) -> None:
+def test_angles_and_focal_lengths_give_the_same_lens(tmp_path: Path) -> None:
     file = write_transforms(tmp_path, survey(BARREL))
     top = json.loads(file.read_text())
     del top["frames"][1]["fl_x"], top["frames"][1]["fl_y"]
@@ -124,7 +123,7 @@ def test_the_same_lens_comes_from_angles_and_from_focal_lengths(tmp_path: Path) 
     assert second.fy == pytest.approx(51)
 
 
-def test_what_frames_leave_out_stands_at_the_top_or_in_the_photograph(tmp_path: Path) -> None:
+def test_values_missing_in_frames_come_from_the_top_or_the_photograph(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     file = write_transforms(tmp_path, truth, fl_x=60.0, k3=0.01)
     top = json.loads(file.read_text())
@@ -153,7 +152,7 @@ def test_what_frames_leave_out_stands_at_the_top_or_in_the_photograph(tmp_path: 
         ({"file_path": 7}, "file_path"),
     ],
 )
-def test_frames_that_cannot_be_used_say_why(tmp_path: Path, values: dict[str, object], message: str) -> None:
+def test_unusable_frames_are_refused(tmp_path: Path, values: dict[str, object], message: str) -> None:
     change(write_transforms(tmp_path, survey(PINHOLE)), **values)
     with pytest.raises(SceneError, match=message):
         read_transforms(tmp_path, False)
@@ -187,13 +186,13 @@ def test_links_may_lead_out_only_as_a_whole_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"frames": 3}', '{"frames": [3]}', "[" * 100_000])
-def test_json_that_is_no_description_is_refused(tmp_path: Path, content: str) -> None:
+def test_invalid_transforms_json_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(SceneError, match=r"transforms\.json .*export it again"):
         read_transforms(tmp_path, False)
 
 
-def test_files_larger_than_their_kind_can_be_are_refused(tmp_path: Path) -> None:
+def test_oversized_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "large").write_bytes(bytes(1_000_001))
     with pytest.raises(SceneError, match="at most 1 MB"):
         bounded_bytes(tmp_path / "large", 1)
@@ -216,7 +215,7 @@ def _binary_ply(xyz: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("write", [_ascii_ply, _binary_ply])
-def test_point_clouds_are_read_whole_or_refused(tmp_path: Path, write: object) -> None:
+def test_point_clouds_are_read_completely_or_refused(tmp_path: Path, write: object) -> None:
     assert callable(write)
     xyz = np.random.default_rng(0).normal(0, 5, (20, 3)).astype(np.float32).astype(np.float64)
     (tmp_path / "a.ply").write_bytes(write(xyz))
@@ -225,14 +224,14 @@ def test_point_clouds_are_read_whole_or_refused(tmp_path: Path, write: object) -
     np.testing.assert_allclose(cloud[0], xyz, rtol=1e-7)
     assert cloud[1] is None  # red alone is no colour
     (tmp_path / "a.ply").write_bytes(write(xyz)[:-30])
-    with pytest.raises(SceneError, match="no whole PLY"):
+    with pytest.raises(SceneError, match="not a complete PLY"):
         read_ply(tmp_path / "a.ply")
 
 
-def test_the_cloud_of_a_transforms_json_is_read_or_missed(tmp_path: Path) -> None:
+def test_the_cloud_of_a_transforms_json_is_read(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     write_transforms(tmp_path, truth, ply_file_path="points.ply")
-    with pytest.raises(SceneError, match=r"points\.ply, which are not there"):
+    with pytest.raises(SceneError, match=r"points\.ply, which are missing"):
         read_transforms(tmp_path, False)
     assert read_transforms(tmp_path, True).cloud_world is None
     (tmp_path / "points.ply").write_bytes(_binary_ply(truth.ground))
@@ -255,15 +254,15 @@ def test_llff_poses_need_one_photograph_each(tmp_path: Path) -> None:
         read_llff(tmp_path)
 
 
-def test_llff_arrays_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_invalid_llff_arrays_are_refused(tmp_path: Path) -> None:
     file = write_llff(tmp_path, survey(PINHOLE))
     content, rows = file.read_bytes(), np.load(file)
     for damaged in (b"", content[:40], content[:-8], b"\x80\x04N."):
         file.write_bytes(damaged)
-        with pytest.raises(SceneError, match="no whole array"):
+        with pytest.raises(SceneError, match="no complete array"):
             read_llff(tmp_path)
     np.save(file, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(SceneError, match="no whole array"):
+    with pytest.raises(SceneError, match="no complete array"):
         read_llff(tmp_path)
     np.save(file, rows[:, :12])
     with pytest.raises(SceneError, match=r"shape \(9, 12\)"):

@@ -22,7 +22,7 @@ def joined(first: SparsePoints, xyz: torch.Tensor, observer: int) -> SparsePoint
     )
 
 
-def test_depth_is_exact_on_a_tilted_plane_also_for_a_camera_that_observed_nothing():
+def test_depth_is_exact_on_a_tilted_plane_for_a_camera_without_observations():
     own = wall.cameras(3)
     points = wall.points(own, tilt=TILT)
     new = wall.cameras(1, width=40, height=20)
@@ -43,7 +43,7 @@ def test_a_plane_continues_exactly_outside_the_hull_of_its_points():
     torch.testing.assert_close(surface_depth(own, some, own), wall.true_depth(own, TILT), rtol=1e-4, atol=0)
 
 
-def test_outliers_before_and_behind_the_surface_change_nothing():
+def test_outliers_before_and_behind_the_surface_have_no_influence():
     own = wall.cameras(3)
     wrong = torch.tensor([[0.1, 0.2, 2.0], [-0.7, 0.3, 60.0], [0.8, -0.5, 9.0], [0.0, 0.0, 0.5]])
     points = joined(wall.points(own, tilt=TILT), wrong, observer=0)
@@ -73,7 +73,7 @@ def test_few_points_still_give_a_depth_everywhere(count: int):
     torch.testing.assert_close(surface_depth(own, some, own), torch.full((36, 48), middle), rtol=1e-4, atol=0)
 
 
-def test_without_points_the_surface_is_the_plane_at_the_harmonic_middle_of_near_and_far():
+def test_without_points_the_surface_is_the_plane_at_the_harmonic_mean_of_near_and_far():
     own = wall.cameras(1)
     torch.testing.assert_close(surface_depth(own, None, own), torch.full((36, 48), 2 / (1 / 3.0 + 1 / 10.0)))
 
@@ -97,7 +97,7 @@ def test_a_point_behind_a_camera_is_not_seen_by_it():
     assert torch.equal(count, torch.ones_like(count))
 
 
-def test_doubly_seen_asks_training_photographs_only():
+def test_doubly_seen_counts_training_photographs_only():
     scene = wall.scene(wall.cameras(3), test=(1,))
     seen = doubly_seen(scene, scene.cameras[1])
     # Each of the two training photographs misses the three outermost columns of one side.

@@ -116,8 +116,8 @@ def test_indexing_gives_batches_in_the_order_asked_for():
     assert (own[1].width, own[1].height) == (80, 60)
     for index, expected in [([2, 0], [2, 0]), (slice(1, 3), [1, 2]), (torch.tensor([1, 1]), [1, 1])]:
         picked = own[index]
-        for f in fields(Cameras):
-            assert torch.equal(getattr(picked, f.name), getattr(own, f.name)[expected])
+        for name in {f.name for f in fields(Cameras)} - {"names"}:
+            assert torch.equal(getattr(picked, name), getattr(own, name)[expected])
 
 
 def test_the_pixel_grid_goes_row_by_row_through_pixel_centres():

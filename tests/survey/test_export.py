@@ -12,7 +12,7 @@ import pytest
 from scenes_on_disk import BARREL, PINHOLE, UTM, Truth, survey, with_one_larger, write_colmap
 
 from tidefield.data.load import load_scene
-from tidefield.data.readers.ply import read_ply
+from tidefield.data.ply import read_ply
 from tidefield.data.readers.transforms import read_transforms
 from tidefield.errors import RunError, SceneError
 from tidefield.geometry.lenses import Lens

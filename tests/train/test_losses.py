@@ -34,7 +34,7 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         inverse_depth=known * (0.2 + 0.01 * uniform(TILES, pixels)),
         depth_weight=known * uniform(TILES, pixels),
         neighbours=torch.zeros(TILES, 0, dtype=torch.long),
-        presence=torch.zeros(TILES, 0, 4),
+        blend_weight=torch.zeros(TILES, 0, 4),
         which=torch.zeros(TILES, 0, dtype=torch.long),
         images=(),
         image_corner_px=(),

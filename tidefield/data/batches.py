@@ -22,21 +22,21 @@ from tidefield.geometry.cameras import Cameras, pixel_grid, project
 
 @dataclass(frozen=True)
 class Batch:
-    """Tiles to learn from. All colours are at the common exposure.
+    """Training tiles. All colours are at the common exposure.
 
     Attributes:
         targets: the tiles' photographs.
         corner_px: the tiles' upper left pixel corners.
-        colours: the truth.
+        colours: the ground truth.
         weight: of each pixel in the loss: 0 outside its photograph, which may be smaller than a tile, and
             `TrainConfig.unseen_weight` where fewer than two other training photographs see the surface.
         inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
-        depth_weight: how far to trust these, 0 to 1; 0 where there is none.
+        depth_weight: confidence in these depths, 0 to 1; 0 where there is none.
         neighbours: photographs serving as the tiles' neighbouring views.
-        presence: of these, how far each is there at the tiles' corners.
+        blend_weight: of each neighbour at the tile's four corners.
         which: for each neighbour, the image of `images` to read.
-        images: what to encode, in groups of one size: crops of, or whole, photographs.
-        image_corner_px: where in their photographs the images' upper left corners lie.
+        images: what to encode, in groups of one size: crops of photographs, or whole ones.
+        image_corner_px: upper left corners of the images in their photographs.
     """
 
     targets: Int[Tensor, " T"]
@@ -46,19 +46,19 @@ class Batch:
     inverse_depth: Float[Tensor, "T R"]
     depth_weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
-    presence: Float[Tensor, "T N 4"]
+    blend_weight: Float[Tensor, "T N 4"]
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
 
     def to(self, device: torch.device) -> Batch:
-        def moved(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
+        def move(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
             return tuple(v.to(device) for v in value) if isinstance(value, tuple) else value.to(device)
 
-        return Batch(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+        return Batch(**{f.name: move(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
 
     def parts(self, count: int) -> list[Batch]:
-        """At most so many, of some of the tiles each; one where tiles share images."""
+        """Split into at most `count` batches of some of the tiles each; into one where tiles share images."""
         tiles, views = self.which.shape
         if len(self.images) != 1 or len(self.images[0]) != tiles * views:
             return [self]
@@ -78,17 +78,19 @@ class Batch:
 def tile_doubly_seen(
     camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "2"], side_px: int, others: Cameras
 ) -> Bool[Tensor, " R"]:
-    """Which pixels of a tile show surface that two or more other cameras see, as the prior's cells tell it."""
+    """Decide which pixels of a tile show surface that at least two other cameras see, at the prior's resolution."""
     cells = max(1, side_px // STRIDE)
     middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
     uv, z = others.project(unproject_to_surface(camera, prior, middles))
     seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
-    near = torch.arange(side_px) * cells // side_px
-    return seen[near][:, near].reshape(-1)
+    cell = torch.arange(side_px) * cells // side_px
+    return seen[cell][:, cell].reshape(-1)
 
 
-def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
-    """Inverse depths of a tile's pixels that show a sparse point, and how far to trust them; both 0 elsewhere."""
+def _sparse_depth(
+    observed: Observed, corner_px: Float[Tensor, "2"], side: int
+) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"]]:
+    """Inverse depths of a tile's pixels that show a sparse point, and the confidence in them; both 0 elsewhere."""
     u, v = (observed.uv_px - corner_px).floor().long().unbind(-1)
     inside = (u >= 0) & (u < side) & (v >= 0) & (v < side)
     pixel, weight = (v * side + u)[inside], observed.weight[inside]
@@ -97,35 +99,36 @@ def _sparse_depth(observed: Observed, corner_px: Float[Tensor, "2"], side: int) 
     return inverse / total.clamp(min=1e-12), total.clamp(max=1)
 
 
-def draw_batch(
-    scene: Scene, surfaces: DepthPriors, config: TrainConfig, views: int, generator: torch.Generator
-) -> Batch:
-    """Random tiles of random training photographs."""
+def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: int, generator: torch.Generator) -> Batch:
+    """Draw random tiles of random training photographs.
+
+    Args:
+        priors: of the scene.
+        views: neighbouring views at each corner of a tile; 0 encodes nothing.
+    """
     side = config.tile_px
     train = torch.tensor(scene.train)
     per_photograph = config.tiles if config.crop_px is None else 1
     picks = torch.randint(len(train), (config.tiles // per_photograph,), generator=generator)
     targets = train[picks].repeat_interleave(per_photograph)
-    size = scene.cameras.size_px[targets]
-    room = (size - side + 1).clamp(min=1)
-    corner = (torch.rand(len(targets), 2, generator=generator) * room).floor()
-    middles_world, neighbours, presences, weights, depths = [], [], [], [], []
+    free = (scene.cameras.size_px[targets] - side + 1).clamp(min=1)
+    corner = (torch.rand(len(targets), 2, generator=generator) * free).floor()
+    middles_world, neighbours, blend_weights, weights, depths = [], [], [], [], []
     for target, at in zip(targets.tolist(), corner, strict=True):
-        camera, prior = scene.cameras[target], surfaces[target]
+        camera, prior = scene.cameras[target], priors[target]
         middles_world.append(unproject_to_surface(camera, prior, at[None] + side / 2)[0])
         found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours, target)
         neighbours.append(found.index[0])
-        presences.append(found.presence[0])
+        blend_weights.append(found.blend_weight[0])
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
             others = scene.cameras[train[train != target]]
             weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
         weights.append(weight)
-        depths.append(_sparse_depth(surfaces.observed(target), at, side))
-    chosen, present = torch.stack(neighbours), torch.stack(presences)
+        depths.append(_sparse_depth(priors.observed(target), at, side))
+    chosen = torch.stack(neighbours)
     tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
     colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
-    weight = torch.stack(weights) * inside
     inverse_depth, depth_weight = (torch.stack(parts) for parts in zip(*depths, strict=True))
     if not views:
         which, images, corners = chosen, (), ()
@@ -133,11 +136,25 @@ def draw_batch(
         which, images, corners = _whole(scene, chosen)
     else:
         which, images, corners = _crops(scene, chosen, torch.stack(middles_world), config.crop_px)
-    return Batch(targets, corner, colours, weight, inverse_depth, depth_weight, chosen, present, which, images, corners)
+    return Batch(
+        targets=targets,
+        corner_px=corner,
+        colours=colours,
+        weight=torch.stack(weights) * inside,
+        inverse_depth=inverse_depth,
+        depth_weight=depth_weight,
+        neighbours=chosen,
+        blend_weight=torch.stack(blend_weights),
+        which=which,
+        images=images,
+        image_corner_px=corners,
+    )
 
 
-def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tuple[Tensor, Tensor]:
-    """Colours of a tile's pixels, and which of them the photograph has."""
+def _tile(
+    scene: Scene, index: int, corner: Int[Tensor, "2"], side: int
+) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, " R"]]:
+    """Colours of a tile's pixels, and which of them lie in the photograph."""
     u, v = corner.tolist()
     pixels = to_common_exposure(scene, index, slice(v, v + side), slice(u, u + side))
     height, width = pixels.shape[:2]
@@ -147,7 +164,7 @@ def _tile(scene: Scene, index: int, corner: Int[Tensor, "2"], side: int) -> tupl
 
 
 def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Every neighbour once, in groups of one size."""
+    """Every neighbour once, whole, in groups of one size."""
     photographs, which = neighbours.unique(return_inverse=True)
     sizes, group = scene.cameras.size_px[photographs].unique(dim=0, return_inverse=True)
     order = group.argsort(stable=True)
@@ -161,7 +178,7 @@ def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> tuple[Tensor, tuple[
 def _crops(
     scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"], side: int
 ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """A crop of each tile's every neighbour around where the tile's middle is seen."""
+    """A crop of every neighbour of each tile, around the projection of the tile's middle."""
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
     points = middle_world.repeat_interleave(neighbours.shape[1], 0)

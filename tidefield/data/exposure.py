@@ -1,27 +1,28 @@
 """Exposure gains: one factor per photograph and colour channel that relates it to the scene's common exposure.
 
-Method.md, section 12. The model is multiplicative on display-referred values, log I_ip = g_i + a_p: what photograph i
-shows around sparse point p is the point's own colour times the photograph's gain. Three sources are solved as one
-sparse least-squares problem, so that each photograph leans on what is known of it:
+docs/method.md, section 12. The model is multiplicative on display-referred values, log I_ip = g_i + a_p: photograph i
+shows sparse point p in the point's own colour times the photograph's gain. Three sources enter one sparse least-squares
+problem:
 
-- training photographs that see the same points (robustly: water moves, shine wanders);
-- photographs taken one after the other, whose gains differ little beyond what their EXIF exposures say;
+- training photographs that see the same points (robustly: water moves, and so do reflections);
+- consecutive photographs, whose gains differ little beyond the difference of their EXIF exposures;
 - photographs taken close to each other, likewise.
 
-The last two are weighted by how well they hold among the training photographs. Held-out photographs take part in them
+The weights of the last two are estimated from the training photographs. Held-out photographs enter through these two
 only: their gains come from their metadata and their neighbours, never from their pixels.
+
+Alphabet: V photographs, O observations of sparse points, N pairs of photographs, C values per observation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
@@ -33,25 +34,21 @@ from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras
 
 DISPLAY_SLOPE = 0.45
-"""Log display value per log exposure where the photographs cannot tell: sRGB's overall exponent of 1 / 2.2."""
-SLOPE_TRUST = 0.01
+"""Log display value per log exposure in the absence of evidence: sRGB's overall exponent of 1 / 2.2."""
+SLOPE_WEIGHT = 0.01
 """Weight of `DISPLAY_SLOPE` against the measured slope: that of one pair whose log exposures differ by 0.1."""
-DARK, BRIGHT, CLIPPED = 8.0, 247.0, 252
-"""8-bit window means outside DARK..BRIGHT say nothing of a gain (noise and black borders, clipping); a pixel of
-CLIPPED or more has lost its value, and a window may hold a tenth of such."""
+DARK, BRIGHT, CLIPPED, CLIPPED_SHARE = 8.0, 247.0, 252, 0.1
+"""Windows are used if their 8-bit mean lies in DARK..BRIGHT (not noise, black borders or clipping) and at most this
+share of their pixels is clipped, that is CLIPPED or more in a channel."""
 HUBER = 1.345
 """Huber's threshold in standard deviations: 95% as efficient as least squares on clean Gaussian residuals."""
 ITERATIONS = 15
-SMALLEST_NOISE = 0.01
-"""Of a log window mean: rounding to 8 bits and resampling are never better, and weights need a positive scale."""
+LEAST_NOISE = 0.01
+"""Least standard deviation of a log window mean: rounding to 8 bits and resampling; weights need a positive scale."""
 LOOSE = 1e-6
-"""Weight of a photograph's prior gain. It holds the overall level, which nothing else does, and photographs that
-nothing connects."""
+"""Weight of a photograph's prior gain. It determines the overall level, and photographs without any connection."""
 SUPPORT = 10
-"""Observations that a training photograph needs before it takes part in judging the neighbours' likeness."""
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+"""Fewest observations of a training photograph that takes part in the estimate of the pairs' weights."""
 
 
 def estimate_gains(
@@ -61,15 +58,15 @@ def estimate_gains(
     train: Sequence[int],
     metadata: Exposures | None = None,
 ) -> Float[Tensor, "V 3"]:
-    """Gain of every photograph and channel; its geometric mean over the training photographs is 1 in each channel.
+    """Estimate the gain of every photograph and channel, with geometric mean 1 over the training photographs.
 
     Args:
         photographs: the pixels; only training photographs' are read, and used only around sparse points.
         cameras: one per photograph, for their positions; their own gains are ignored.
-        points: which photograph sees which point; without points the gains are what the EXIF exposures say,
-            and 1 where these say nothing.
+        points: with their observations; without points the gains follow from the EXIF exposures, and are 1 without
+            these.
         train: indices of the training photographs; all others are held out.
-        metadata: what the files say (`exif.read_exposures`); None means nothing.
+        metadata: exposures and times (`exif.read_exposures`), if any.
     """
     count, learned = len(cameras), np.asarray(train, dtype=np.int64)
     exposure, clock = _exposure_and_clock(metadata, count)
@@ -84,7 +81,7 @@ def estimate_gains(
 def disagreement(
     photographs: Photographs, points: SparsePoints, which: Sequence[int], gains: Float[Tensor, "V 3"]
 ) -> tuple[float, float]:
-    """How much photographs disagree about the colour of the points they share, after division by their gains.
+    """Measure how much photographs differ in the colour of the points they share, after division by their gains.
 
     Returns:
         Root-mean-square of the log residuals (0.05 is 5% of a pixel's value), and 1.4826 times the median of their
@@ -105,19 +102,21 @@ class Seen:
     """O usable observations of points that at least two photographs share.
 
     Attributes:
-        value: log mean colour around the point, O x 3.
-        point: the point, O.
-        photograph: the photograph, O.
-        row: which of the sparse points' observations each is, O.
+        value: log mean colour around the point.
+        point: the point.
+        photograph: the photograph.
+        row: the index among the sparse points' observations.
     """
 
-    value: Array
-    point: Index
-    photograph: Index
-    row: Index
+    value: Float64[np.ndarray, "O 3"]
+    point: Int64[np.ndarray, " O"]
+    photograph: Int64[np.ndarray, " O"]
+    row: Int64[np.ndarray, " O"]
 
-    def centred(self, value: Array, weight: Array | None = None) -> Array:
-        """Values (O x 3) less the weighted mean of all values of the same point."""
+    def centred(
+        self, value: Float64[np.ndarray, "O C"], weight: Float64[np.ndarray, " O"] | None = None
+    ) -> Float64[np.ndarray, "O C"]:
+        """Subtract the weighted mean of all values of the same point."""
         weight = np.ones(len(value)) if weight is None else weight
         total = np.bincount(self.point, weight)
         mean = np.stack([np.bincount(self.point, weight * c) for c in value.T], 1) / np.maximum(total, 1e-12)[:, None]
@@ -126,23 +125,24 @@ class Seen:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Photographs whose gains are expected to be alike, and how far apart they are in time or space (1 = usual)."""
+    """N pairs a, b of photographs with similar gains, and their distances in time or space, relative to the median."""
 
-    a: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    b: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    apart: Array = field(default_factory=lambda: np.zeros(0))
+    a: Int64[np.ndarray, " N"]
+    b: Int64[np.ndarray, " N"]
+    distance: Float64[np.ndarray, " N"]
 
-    def difference(self, value: Array) -> Array:
+    def difference(self, value: Float64[np.ndarray, "V *C"]) -> Float64[np.ndarray, "N *C"]:
         return value[self.b] - value[self.a]
 
 
-_NOBODY = _Pairs()
+_NO_INDEX = np.zeros(0, dtype=np.int64)
+_NO_PAIRS = _Pairs(_NO_INDEX, _NO_INDEX, np.zeros(0))
 
 
 def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> Seen:
-    """Mean log colours of a small window around every sparse point seen in the given photographs."""
+    """Measure the mean log colour of a small window around every observation in the given photographs."""
     camera, uv = points.camera_index.cpu().numpy(), points.uv_px.double().cpu().numpy()
-    values, rows = [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
+    values, rows = [np.zeros((0, 3))], [_NO_INDEX]
     for i in which:
         row = np.flatnonzero(camera == i)
         if len(row):
@@ -155,49 +155,59 @@ def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]
     return Seen(np.concatenate(values)[shared], point[shared], camera[row][shared].astype(np.int64), row[shared])
 
 
-def _window_means(pixels: NDArray[np.uint8], uv_px: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Mean 8-bit colours around pixels, and which of them lie inside and are neither black nor clipped."""
+def _window_means(
+    pixels: UInt8[np.ndarray, "H W 3"], uv_px: Float64[np.ndarray, "P 2"]
+) -> tuple[Float64[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+    """Mean 8-bit colours around pixels, and which of them lie inside and are neither dark nor clipped."""
     height, width = pixels.shape[:2]
     side = max(3, 2 * round(width / 160) + 1)
-    lost = (pixels >= CLIPPED).any(-1)
     mean = cv2.blur(np.asarray(pixels, dtype=np.float32), (side, side))
-    clipped = cv2.blur(np.asarray(lost, dtype=np.float32), (side, side))
+    clipped = cv2.blur(np.asarray((pixels >= CLIPPED).any(-1), dtype=np.float32), (side, side))
     column, row = np.floor(uv_px).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
     value = mean[row, column].astype(np.float64)
-    return value, inside & ((value > DARK) & (value < BRIGHT)).all(1) & (clipped[row, column] <= 0.1)
+    return value, inside & ((value > DARK) & (value < BRIGHT)).all(1) & (clipped[row, column] <= CLIPPED_SHARE)
 
 
-def _solve(seen: Seen, exposure: Array, clock: Array, position: Array, train: Index) -> Array:
-    """Log gains from the observations alone, then again with the neighbours as far as these were alike."""
+def _solve(
+    seen: Seen,
+    exposure: Float64[np.ndarray, " V"],
+    clock: Float64[np.ndarray, " V"],
+    position: Float64[np.ndarray, "V 3"],
+    train: Int64[np.ndarray, " T"],
+) -> Float64[np.ndarray, "V 3"]:
+    """Log gains from the observations alone, then again with pairs, weighted by how similar their gains were."""
     count = len(exposure)
     first, noise = robust_gains(seen, np.zeros(count))
     supported = train[np.bincount(seen.photograph, minlength=count)[train] >= SUPPORT]
     sequence = _in_sequence(clock, supported)
-    slope = _exposure_slope(sequence.difference(first), sequence.difference(exposure), sequence.apart)
+    slope = _exposure_slope(sequence.difference(first), sequence.difference(exposure), sequence.distance)
     prior = slope * exposure
     pairs, weights = [], []
-    for known, everyone in (
+    for supporting, everyone in (
         (sequence, _in_sequence(clock, np.arange(count))),
         (_nearby(position, supported), _nearby(position, np.arange(count))),
     ):
         # A random walk: the variance of a difference grows with the distance.
-        rest = known.difference(first - prior[:, None])
-        variance = max(((rest**2).mean(1) / known.apart).mean(), 1e-6) if len(rest) else 1.0
+        rest = supporting.difference(first - prior[:, None])
+        variance = max(((rest**2).mean(1) / supporting.distance).mean(), 1e-6) if len(rest) else 1.0
         pairs.append(everyone)
-        weights.append(noise**2 / (variance * everyone.apart))
-    both = _Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "apart")))
+        weights.append(noise**2 / (variance * everyone.distance))
+    both = _Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "distance")))
     gains, _ = robust_gains(seen, prior, both, np.concatenate(weights))
     return gains
 
 
 def robust_gains(
-    seen: Seen, prior: Array, pairs: _Pairs = _NOBODY, pair_weight: Array | None = None
-) -> tuple[Array, float]:
-    """Log gains (V x 3) by iteratively reweighted least squares, and the residuals' standard deviation.
+    seen: Seen,
+    prior: Float64[np.ndarray, " V"],
+    pairs: _Pairs = _NO_PAIRS,
+    pair_weight: Float64[np.ndarray, " N"] | None = None,
+) -> tuple[Float64[np.ndarray, "V 3"], float]:
+    """Estimate log gains by iteratively reweighted least squares, and the residuals' standard deviation.
 
-    Minimises sum_o w_o |y_o - g - a|^2 + sum_pairs w |(g_b - g_a) - (prior_b - prior_a)|^2 + tiny |g - prior|^2
+    Minimises sum_o w_o |y_o - g - a|^2 + sum_pairs w |(g_b - g_a) - (prior_b - prior_a)|^2 + LOOSE |g - prior|^2
     with Huber's weights w_o over observations. The points' colours a are eliminated in closed form.
     """
     count, rows = len(prior), np.arange(len(pairs.a))
@@ -213,8 +223,14 @@ def robust_gains(
     return gains, noise
 
 
-def weighted_gains(seen: Seen, value: Array, weight: Array, fixed: sparse.sparray, pull: Array) -> Array:
-    """Least-squares gains (V x C) of values (O x C), beside the quadratic form `fixed` with right side `pull` (V)."""
+def weighted_gains(
+    seen: Seen,
+    value: Float64[np.ndarray, "O C"],
+    weight: Float64[np.ndarray, " O"],
+    fixed: sparse.sparray,
+    pull: Float64[np.ndarray, " V"],
+) -> Float64[np.ndarray, "V C"]:
+    """Solve for the least-squares gains of values, with the quadratic form `fixed` and its right side `pull` added."""
     count = len(pull)
     of_point, of_photograph = np.bincount(seen.point, weight), np.bincount(seen.photograph, weight, count)
     table = sparse.csr_array((weight, (seen.point, seen.photograph)), shape=(len(of_point), count))
@@ -225,58 +241,64 @@ def weighted_gains(seen: Seen, value: Array, weight: Array, fixed: sparse.sparra
     return np.asarray(spsolve(system, right + pull[:, None])).reshape(right.shape)
 
 
-def huber_weights(residual: Array) -> tuple[Array, float]:
-    """Weights of observations by their residuals (O x 3), and these residuals' standard deviation."""
-    # One weight for the three channels: what moved or shone did so in all of them.
+def huber_weights(residual: Float64[np.ndarray, "O 3"]) -> tuple[Float64[np.ndarray, " O"], float]:
+    """Weight observations by their residuals; return the weights and the residuals' standard deviation."""
+    # One weight for the three channels: motion and reflections affect all of them.
     size = np.sqrt((residual**2).mean(1))
-    noise = max(float(1.4826 * np.median(size)), SMALLEST_NOISE)
+    noise = max(float(1.4826 * np.median(size)), LEAST_NOISE)
     return np.minimum(1.0, HUBER * noise / np.maximum(size, 1e-12)), noise
 
 
-def _exposure_slope(gain_change: Array, exposure_change: Array, apart: Array) -> float:
-    """Log gain per log exposure, from photographs taken one after the other.
+def _exposure_slope(
+    gain_change: Float64[np.ndarray, "N 3"],
+    exposure_change: Float64[np.ndarray, " N"],
+    distance: Float64[np.ndarray, " N"],
+) -> float:
+    """Log gain per log exposure, from consecutive photographs.
 
-    Successive photographs, because over a longer time automatic exposure follows the light of the day, and both cancel.
+    Over a longer time automatic exposure follows the daylight, and both cancel.
     """
-    held = (exposure_change**2 / apart).sum() + SLOPE_TRUST
-    slope = ((gain_change.mean(1) * exposure_change / apart).sum() + SLOPE_TRUST * DISPLAY_SLOPE) / held
+    total = (exposure_change**2 / distance).sum() + SLOPE_WEIGHT
+    slope = ((gain_change.mean(1) * exposure_change / distance).sum() + SLOPE_WEIGHT * DISPLAY_SLOPE) / total
     return float(np.clip(slope, 0.0, 1.0))
 
 
-def _exposure_and_clock(metadata: Exposures | None, count: int) -> tuple[Array, Array]:
-    """Centred log exposures (0 where unknown), and a clock: seconds, or the photographs' order where times lack."""
+def _exposure_and_clock(
+    metadata: Exposures | None, count: int
+) -> tuple[Float64[np.ndarray, " V"], Float64[np.ndarray, " V"]]:
+    """Centred log exposures (0 where missing), and times in seconds, or the photographs' order without times."""
     order = np.arange(count, dtype=np.float64)
     if metadata is None:
         return np.zeros(count), order
     exposure = metadata.log_exposure
-    known = np.isfinite(exposure)
-    centred = np.where(known, exposure - exposure[known].mean() if known.any() else 0.0, 0.0)
+    valid = np.isfinite(exposure)
+    centred = np.where(valid, exposure - exposure[valid].mean() if valid.any() else 0.0, 0.0)
     time = metadata.time_s
-    # EXIF counts whole seconds: the order breaks ties. Equal times everywhere tell nothing.
+    # EXIF has whole seconds: the order breaks ties. Mostly equal times carry no information.
     usable = np.isfinite(time).all() and np.unique(time).size > count / 2
     return centred, time - time.min() + 1e-3 * order if usable else order
 
 
-def _in_sequence(clock: Array, which: Index) -> _Pairs:
-    """Each of the given photographs with the next one."""
+def _in_sequence(clock: Float64[np.ndarray, " V"], which: Int64[np.ndarray, " S"]) -> _Pairs:
+    """Pair each of the given photographs with the next one."""
     order = which[np.argsort(clock[which], kind="stable")]
-    usual = np.median(np.diff(np.sort(clock))) if len(clock) > 1 else 1.0
-    apart = np.maximum(np.diff(clock[order]) / max(usual, 1e-9), 0.1)
-    return _Pairs(order[:-1], order[1:], apart)
+    median = np.median(np.diff(np.sort(clock))) if len(clock) > 1 else 1.0
+    distance = np.maximum(np.diff(clock[order]) / max(median, 1e-9), 0.1)
+    return _Pairs(order[:-1], order[1:], distance)
 
 
-def _nearby(position: Array, which: Index) -> _Pairs:
-    """Each of the given photographs with the two taken closest to it."""
+def _nearby(position: Float64[np.ndarray, "V 3"], which: Int64[np.ndarray, " S"]) -> _Pairs:
+    """Pair each of the given photographs with the two taken closest to it."""
     if len(which) < 3:
-        return _NOBODY
-    usual = np.median(KDTree(position).query(position, k=2)[0][:, 1])
+        return _NO_PAIRS
+    median = np.median(KDTree(position).query(position, k=2)[0][:, 1])
     found = KDTree(position[which]).query(position[which], k=3)
     distance, neighbour = (np.asarray(column)[:, 1:].ravel() for column in found)
-    return _Pairs(np.repeat(which, 2), which[neighbour], np.maximum(distance / max(usual, 1e-9), 0.1))
+    return _Pairs(np.repeat(which, 2), which[neighbour], np.maximum(distance / max(median, 1e-9), 0.1))
 
 
 def to_common_exposure(
     scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)
 ) -> Float[Tensor, "h w 3"]:
-    """A part of a photograph at the common exposure: divided by its gain (method.md, section 12)."""
+    """Read a part of a photograph at the common exposure: divided by its gain (docs/method.md, section 12)."""
     return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])

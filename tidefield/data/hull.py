@@ -1,7 +1,7 @@
-"""The visual hull of what stands before a known background: the places that no photograph sees past (Laurentini, 1994).
+"""Carve the visual hull of an object: the largest shape that agrees with all silhouettes (Laurentini, 1994).
 
-Photographs with alpha come without sparse points as a rule. Their outlines then tell where to look: what a photograph
-shows as background is empty all along the ray.
+Photographs with alpha usually come without sparse points. Their silhouettes then bound the samples: a pixel of the
+background is empty all along its ray.
 
 Alphabet: P voxels, h x w cells of a camera's pixels.
 """
@@ -20,25 +20,25 @@ from torch.nn import functional as F
 from tidefield.data.images import Photographs
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
-ROUGH, ROUNDS = 32, 3
-"""Voxels along the sides of the box while it closes in on the hull, and how often it does."""
+RESOLUTION, ROUNDS = 32, 3
+"""Voxels along the sides of the box while it is fitted to the hull, and how many times it is."""
 HALVINGS = 2
-"""Of the sides of the voxels that are left."""
-OUTLINE_PX, MOST = 400, 100
-"""Longest side of the outlines that are looked at, and how many are: larger and more ones change the hull little."""
+"""Subdivisions of the remaining voxels afterwards."""
+SILHOUETTE_PX, MOST_SILHOUETTES = 400, 100
+"""Longest side and number of the silhouettes used: larger and more ones change the hull little."""
 LEAST_SEEN, LEAST_SHARE = 3, 0.5
-"""Photographs that must have a voxel in their frame, and of how many: about what few see, outlines say little."""
+"""A voxel must lie in the frames of so many silhouettes, and of this share of them: others are hardly constrained."""
 STEPS_PER_VOXEL = 1.5
 
 
 @dataclass(frozen=True)
 class Hull:
-    """Voxels of a box.
+    """An occupancy grid of X^3 voxels.
 
     Attributes:
-        corner_world: where the first voxel begins.
-        voxel_world: its sides.
-        filled: whether no photograph sees past it.
+        corner_world: lowest corner of the first voxel.
+        voxel_world: side lengths of a voxel.
+        filled: occupied voxels.
     """
 
     corner_world: Float[Tensor, "3"]
@@ -46,7 +46,7 @@ class Hull:
     filled: Bool[Tensor, "X X X"]
 
     def contains(self, points_world: Float[Tensor, "*P 3"]) -> Bool[Tensor, "*P"]:
-        """Whether points lie in the hull."""
+        """Decide which points lie in the hull."""
         size = torch.tensor(self.filled.shape)
         index = ((points_world - self.corner_world) / self.voxel_world).floor().long()
         inside = ((index >= 0) & (index < size)).all(-1)
@@ -55,82 +55,82 @@ class Hull:
 
 
 def visual_hull(cameras: Cameras, photographs: Photographs, train: Sequence[int]) -> Hull | None:
-    """The hull that the training photographs' alphas leave; None where they leave nothing, or one has none.
+    """Carve the hull from the alphas of the training photographs; None if it is empty or an alpha is missing.
 
     Args:
         cameras: of all photographs, with near and far.
-        photographs: whose alphas are read.
-        train: those that may be learned from.
+        photographs: with alphas; only the training photographs' are read.
+        train: indices of the training photographs.
     """
-    some = train[:: -(-len(train) // MOST)]
+    some = train[:: -(-len(train) // MOST_SILHOUETTES)]
     alphas = [photographs.alpha(i) for i in some]
-    outlines = [_outline(alpha) for alpha in alphas if alpha is not None]
-    if len(outlines) < max(len(alphas), LEAST_SEEN):
+    silhouettes = [_silhouette(alpha) for alpha in alphas if alpha is not None]
+    if len(silhouettes) < max(len(alphas), LEAST_SEEN):
         return None
     views = cameras[list(some)]
     middle = views.position_world + views.forward_world * views.near_far.mean(1, keepdim=True)
     widest = views.near_far.amax()
-    corner, side = middle.mean(0) - widest, (2 * widest / ROUGH).expand(3)
-    whole = _subdivided(torch.zeros(1, 3, dtype=torch.long), ROUGH)
-    kept = _left(whole, corner, side, views, outlines)
+    corner, side = middle.mean(0) - widest, (2 * widest / RESOLUTION).expand(3)
+    whole = _subdivide(torch.zeros(1, 3, dtype=torch.long), RESOLUTION)
+    kept = _carve(whole, corner, side, views, silhouettes)
     for _ in range(ROUNDS):
         if not len(kept):
             return None
         low, high = kept.amin(0) - 1, kept.amax(0) + 2
-        corner, side = corner + low * side, side * (high - low) / ROUGH
-        kept = _left(whole, corner, side, views, outlines)
+        corner, side = corner + low * side, side * (high - low) / RESOLUTION
+        kept = _carve(whole, corner, side, views, silhouettes)
     for _ in range(HALVINGS):
         side = side / 2
-        kept = _left(_subdivided(kept, 2), corner, side, views, outlines)
-    filled = torch.zeros([ROUGH * 2**HALVINGS] * 3, dtype=torch.bool)
+        kept = _carve(_subdivide(kept, 2), corner, side, views, silhouettes)
+    filled = torch.zeros([RESOLUTION * 2**HALVINGS] * 3, dtype=torch.bool)
     filled[kept.unbind(-1)] = True
     return Hull(corner, side, filled) if len(kept) else None
 
 
-def _subdivided(voxels: Int[Tensor, "P 3"], parts: int) -> Int[Tensor, "Q 3"]:
-    """The voxels that voxels fall into when each of their sides is cut into parts."""
+def _subdivide(voxels: Int[Tensor, "P 3"], parts: int) -> Int[Tensor, "Q 3"]:
+    """Divide each side of voxels into parts; return the indices of the smaller voxels."""
     within = torch.cartesian_prod(*[torch.arange(parts)] * 3)
     return (parts * voxels[:, None] + within).flatten(0, 1)
 
 
-def _outline(alpha: UInt8[Tensor, "H W"]) -> Float[Tensor, "h w"]:
-    """1 where a photograph shows anything but background, on squares of as many pixels as `OUTLINE_PX` asks for."""
-    side = -(-max(alpha.shape) // OUTLINE_PX)
+def _silhouette(alpha: UInt8[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+    """1 where a photograph shows any foreground, reduced to at most `SILHOUETTE_PX` squares along its longer side."""
+    side = -(-max(alpha.shape) // SILHOUETTE_PX)
     return F.max_pool2d((alpha > 0).float()[None], side, ceil_mode=True)[0]
 
 
-def _left(
+def _carve(
     voxels: Int[Tensor, "P 3"],
     corner: Float[Tensor, "3"],
     side: Float[Tensor, "3"],
     views: Cameras,
-    outlines: Sequence[Float[Tensor, "_ _"]],
+    silhouettes: Sequence[Float[Tensor, "_ _"]],
 ) -> Int[Tensor, "Q 3"]:
-    """The voxels that no photograph shows as background, of those in enough frames."""
+    """Keep the voxels that lie in enough frames, and that no photograph shows as background."""
     points = corner + (voxels + 0.5) * side
     left, seen = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.long)
-    for k, outline in enumerate(outlines):
+    for k, silhouette in enumerate(silhouettes):
         view = views[k]
         uv, z = (x[0] for x in view.project(points[left]))
-        near, square = view.near_far[0, 0], -(-max(view.width, view.height) // OUTLINE_PX)
+        near, square = view.near_far[0, 0], -(-max(view.width, view.height) // SILHOUETTE_PX)
         inside = (z > near) & (uv >= 0).all(-1) & (uv < view.size_px).all(-1)
-        # A voxel may show anywhere in a square as wide as its diagonal.
-        reach = (view.focal_px.amax() * side.norm() / 2 / near / square).clamp(max=OUTLINE_PX).item()
+        # A voxel projects into a square as wide as its diagonal.
+        reach = (view.focal_px.amax() * side.norm() / 2 / near / square).clamp(max=SILHOUETTE_PX).item()
         coarser = max(1, int(reach) // 3)
         around = math.ceil(reach / coarser)
-        wide = F.max_pool2d(outline[None], coarser, ceil_mode=True)
+        wide = F.max_pool2d(silhouette[None], coarser, ceil_mode=True)
         for across, down in ((around, 0), (0, around)):
             wide = F.max_pool2d(wide, (2 * down + 1, 2 * across + 1), 1, (down, across))
         column, row = (uv.masked_fill(~inside[:, None], 0) / (square * coarser)).long().unbind(-1)
         seen[left] += inside
         left = left[~inside | (wide[0, row, column] > 0)]
-    return voxels[left[seen[left] >= max(LEAST_SEEN, LEAST_SHARE * len(outlines))]]
+    return voxels[left[seen[left] >= max(LEAST_SEEN, LEAST_SHARE * len(silhouettes))]]
 
 
 def hull_range(camera: Cameras, hull: Hull) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """z-depths between which the rays of a camera's pixels pass the hull, and whether they do.
+    """Intersect the rays of a camera's pixels with the hull: nearest and farthest z-depth, and whether they meet it.
 
-    Pixels whose rays miss it have the range of all the others; if all do, the camera's own.
+    Pixels whose rays miss the hull get the range of all others; if all miss it, the camera's near and far.
     """
     width, height = camera.width, camera.height
     near, far = camera.near_far[0]
@@ -147,7 +147,7 @@ def hull_range(camera: Cameras, hull: Hull) -> tuple[Float[Tensor, "h w"], Float
     meets = (highest > 0).reshape(height, width)
     if not meets.any():
         return near.expand(height, width), far.expand(height, width), meets
-    # Rays between the cells' middles pass where those beside them do.
+    # Rays between the cells' centres get the range of the adjacent cells.
     shallow = -F.max_pool2d(-lowest.reshape(1, 1, height, width), 3, 1, 1)[0, 0] - step
     deep = F.max_pool2d(highest.reshape(1, 1, height, width), 3, 1, 1)[0, 0] + step
     around = shallow.isfinite()

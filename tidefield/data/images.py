@@ -1,7 +1,7 @@
-"""Photographs: undistorted and resized once, then kept as raw bytes in one memory-mapped file.
+"""Read photographs: undistorted and resized once, then cached as raw bytes in one memory-mapped file.
 
-The file lies in the user's cache folder under a hash of everything that its pixels depend on, so a scene that is opened
-again at the same width is not decoded again.
+The file lies in the user's cache folder, named by a hash of everything that its pixels depend on, so a scene that is
+opened again at the same width is not decoded again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import secrets
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
+from platformdirs import user_cache_path
 from torch import Tensor
 
 from tidefield.errors import SceneError
@@ -32,9 +32,9 @@ from tidefield.geometry.lenses import Lens, rectify
 from tidefield.machine import cores
 
 Progress = Callable[[int, int], None]
-"""Called with how many photographs are ready, and of how many."""
+"""Called with the number of photographs that are ready, and the number of all."""
 
-# Part of every key: raise it when the same photograph would give other pixels.
+# Part of every key: to be raised when the same photograph would give other pixels.
 _PIXELS_VERSION = 1
 _DAYS_KEPT_UNUSED = 60
 _MODES_WITH_ALPHA = ("RGBA", "LA", "PA")
@@ -70,12 +70,12 @@ class Photographs:
 
 @dataclass(frozen=True)
 class PhotographFile:
-    """A photograph on disk and what is wanted of it.
+    """A photograph on disk, and the size to read it at.
 
     Attributes:
         path: the file.
         lens: the camera that took it, for exactly the file's pixels.
-        width: of the result; height likewise.
+        width, height: of the result.
         has_alpha: whether the file has an opacity channel.
     """
 
@@ -95,14 +95,14 @@ class PhotographFile:
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether there is an alpha channel, without decoding; EXIF orientation is not applied.
+    """Read the width, the height and the presence of alpha without decoding; EXIF orientation is not applied.
 
     Raises:
-        SceneError: when the file is no picture that we read.
+        SceneError: the file is not a supported picture.
     """
     with _naming(path), Image.open(path) as picture:
         if picture.mode not in _MODES:
-            raise SceneError(f"{path} has pixels of the kind {picture.mode}: expected 8 bits per colour; convert it")
+            raise SceneError(f"{path} has pixels of the mode {picture.mode}: expected 8 bits per colour; convert it")
         return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
 
 
@@ -112,16 +112,16 @@ def open_photographs(
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Photographs:
-    """All photographs, undistorted and resized: from the cache, or decoded into it.
+    """Open photographs, undistorted and resized: from the cache, or decoded into it.
 
     Args:
         files: the photographs.
-        background_rgb: what photographs with alpha are composited on, in [0, 1].
-        progress: told of every photograph that is decoded.
+        background_rgb: colour on which photographs with alpha are composited, in [0, 1].
+        progress: called for every photograph that is decoded.
         cache: a folder; the user's if not given.
 
     Raises:
-        SceneError: for a photograph that cannot be decoded whole, or a full disk.
+        SceneError: a photograph cannot be decoded completely, or the disk is full.
     """
     store = (cache or _cache_folder()) / f"{_key(files, background_rgb)}.photographs"
     expected = sum(file.bytes for file in files)
@@ -129,16 +129,16 @@ def open_photographs(
         if store.is_file() and store.stat().st_size == expected:
             os.utime(store)
         else:
-            _forget_unused(store.parent)
+            _delete_unused(store.parent)
             _write(store, _decoded(files, background_rgb, progress), expected)
-        # Copy-on-write: nothing that a caller does to a view reaches the file.
+        # Copy-on-write: changes to a view do not reach the file.
         return _views(np.memmap(store, dtype=np.uint8, mode="c"), files)
     except OSError as error:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
             raise
         _log.warning(
-            "the cache folder %s cannot be written (%s): photographs are held in memory and will be decoded again next "
-            "time; set XDG_CACHE_HOME to a folder of yours",
+            "the cache folder %s cannot be written (%s): photographs are held in memory and decoded again next time; "
+            "set XDG_CACHE_HOME to a writable folder",
             store.parent,
             error.strerror,
         )
@@ -146,14 +146,9 @@ def open_photographs(
 
 
 def _cache_folder() -> Path:
-    """$XDG_CACHE_HOME/tidefield, or what the platform has in its place."""
-    if "XDG_CACHE_HOME" in os.environ:
-        return Path(os.environ["XDG_CACHE_HOME"]) / "tidefield"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "tidefield" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "tidefield"
-    return Path.home() / ".cache" / "tidefield"
+    """$XDG_CACHE_HOME/tidefield on every system, or else the system's own folder for caches."""
+    chosen = os.environ.get("XDG_CACHE_HOME")
+    return Path(chosen) / "tidefield" if chosen else user_cache_path("tidefield", appauthor=False)
 
 
 def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
@@ -166,18 +161,18 @@ def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, fl
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-def _forget_unused(folder: Path) -> None:
-    """Remove stores, and leftovers of killed programs, that nobody has opened for a long time."""
+def _delete_unused(folder: Path) -> None:
+    """Delete stores, and partial files of killed programs, that were not opened for `_DAYS_KEPT_UNUSED` days."""
     limit = time.time() - _DAYS_KEPT_UNUSED * 86400
     for store in [*folder.glob("*.photographs"), *folder.glob("*.partial")]:
-        # Another program may be quicker, or (on Windows) hold it open: then it stays until the next time.
+        # Another program may have deleted it, or (on Windows) have it open: then it stays until the next time.
         with suppress(FileNotFoundError, PermissionError):
             if store.stat().st_mtime < limit:
                 store.unlink()
 
 
 def _write(store: Path, pictures: Iterator[np.ndarray], expected: int) -> None:
-    """Write beside the store and put it in place only when it is complete."""
+    """Write a partial file and rename it to the store when it is complete."""
     partial = store.with_name(f"{store.stem}-{secrets.token_hex(4)}.partial")
     try:
         store.parent.mkdir(parents=True, exist_ok=True)
@@ -195,11 +190,12 @@ def _write(store: Path, pictures: Iterator[np.ndarray], expected: int) -> None:
             "some space, choose a smaller --width, or set XDG_CACHE_HOME to a folder on another disk"
         ) from error
     finally:
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has been put in place
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has been renamed
             partial.unlink()
 
 
 def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
+    """Photographs as views of a store's bytes."""
     colours, alphas, start = [], [], 0
     for file in files:
         pixels = file.width * file.height
@@ -215,7 +211,7 @@ def _decoded(
 ) -> Iterator[UInt8[np.ndarray, " bytes"]]:
     """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha if there is any."""
     largest = max(file.lens.width * file.lens.height for file in files)
-    # A photograph in the works takes some 12 bytes per pixel; together they stay around a gigabyte.
+    # Decoding takes some 12 bytes per pixel; all workers together stay around a gigabyte.
     workers = max(1, min(cores(), 8, 1_000_000_000 // (12 * largest)))
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[np.ndarray]] = deque()
@@ -237,7 +233,7 @@ def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) ->
         pixels = np.asarray(picture.convert("RGBA" if file.has_alpha else "RGB"))
     if not file.has_alpha:
         return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
-    # Composited before it is resampled: the colour of a transparent pixel means nothing.
+    # Composited before it is resampled: the colour of a transparent pixel is arbitrary.
     alpha = pixels[..., 3:].astype(np.float32) / 255
     flat = pixels[..., :3] * alpha + 255 * np.array(background_rgb, np.float32) * (1 - alpha)
     pixels = np.concatenate([np.round(flat).astype(np.uint8), pixels[..., 3:]], axis=-1)
@@ -247,12 +243,12 @@ def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) ->
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while a photograph is read into one SceneError that names it."""
+    """Turn errors of reading a photograph into one SceneError that names the file."""
     try:
         yield
-    # Pillow has SyntaxError for broken PNGs and a plain Exception of its own for decompression bombs.
+    # Pillow raises SyntaxError for broken PNGs, and a plain Exception for decompression bombs.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise SceneError(
-            f"{path} cannot be read as a photograph ({error}): expected a whole JPEG or PNG; copy it again from the "
-            "camera, or take it away and go on with --allow-missing"
+            f"{path} cannot be read as a photograph ({error}): expected a complete JPEG or PNG; copy it again from the "
+            "camera, or remove it and use --allow-missing"
         ) from error

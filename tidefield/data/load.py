@@ -1,4 +1,4 @@
-"""From a folder on disk to a Scene."""
+"""Load a Scene from a folder in one of five layouts."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from tidefield.data.exposure import estimate_gains
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
 from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
-from tidefield.data.readers.blender import read_blender
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.llff import read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import PosedPhotographs, proper_rotations
-from tidefield.data.readers.transforms import read_transforms
+from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
-from tidefield.errors import SceneError
+from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 
@@ -33,45 +32,46 @@ _LAYOUTS = """expected one of
   transforms_train.json, transforms_test.json and their pictures         a Blender scene
   images/ and poses_bounds.npy                                           LLFF
   reconstruction.json or opensfm/reconstruction.json, and images/        OpenSfM, ODM
-; make poses for the photographs first (COLMAP does it), or name the folder that holds these"""
+; estimate poses of the photographs first (`tidefield prepare` or COLMAP), or give the folder that holds these"""
 _FEWEST = 3
 _SMALLEST_WIDTH = 16
+_WHITE = (1.0, 1.0, 1.0)
 
 
 def load_scene(
-    root: Path,
+    root: str | Path,
     *,
     width: int | None = None,
     allow_missing: bool = False,
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Scene:
-    """Read a scene: poses, sparse points, and photographs without distortion at the working resolution.
+    """Load a scene: poses, sparse points, and undistorted photographs at the working resolution.
 
     Args:
-        root: a folder in one of the five layouts; which of them is told from what lies in it.
-        width: of every photograph in pixels, its aspect kept; None and what is wider than a photograph mean its own.
-        allow_missing: go on without photographs that are named but not there.
-        progress: called with (ready, of how many) while photographs are decoded; not at all when they are cached.
+        root: a folder in one of the five layouts, which is recognised by its files.
+        width: of every photograph in pixels, with its aspect kept; photographs are never enlarged. None keeps their
+            own widths.
+        allow_missing: leave out photographs whose files are missing, instead of raising an error.
+        progress: called with (ready, all) while photographs are decoded; not called when they are cached.
         cache: folder for decoded photographs; the user's if not given.
 
     Raises:
-        SceneError: when the folder is no scene or a damaged one.
+        SceneError: the folder is not a scene, or is damaged.
     """
+    root = Path(root)
     if width is not None and width < _SMALLEST_WIDTH:
-        raise SceneError(f"photographs {width} pixels wide were asked for: expected at least {_SMALLEST_WIDTH}")
+        raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
     posed = read_posed(root, allow_missing)
-    files = tuple(map(_photograph_file, posed.paths, posed.lenses, [width] * len(posed.paths)))
+    files = [_photograph_file(path, lens, width) for path, lens in zip(posed.paths, posed.lenses, strict=True)]
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
-    posed = _moved(posed, origin)
+    posed = _relative_to(posed, origin)
     pinholes = tuple(file.lens.pinhole().resized(file.width, file.height) for file in files)
     cameras = _cameras(posed.T_world_camera, pinholes, _near_far(posed, pinholes))
     points = _sparse_points(posed, pinholes)
 
-    white = (1.0, 1.0, 1.0)
-    photographs = open_photographs(files, posed.background_rgb or white, progress, cache)
-    alphas = (photographs.alpha(i) for i in range(len(photographs)))
-    see_through = any(alpha is not None and bool((alpha < 255).any()) for alpha in alphas)
+    photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
+    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     train, test = _split(posed)
     gain = estimate_gains(photographs, cameras, points, train, read_exposures(posed.paths))
     return Scene(
@@ -83,20 +83,20 @@ def load_scene(
         train=train,
         test=test,
         origin_world=torch.from_numpy(origin),
-        background_rgb=posed.background_rgb or (white if see_through else None),
-        hull=visual_hull(cameras, photographs, train) if points is None and see_through else None,
+        background_rgb=posed.background_rgb or (_WHITE if transparent else None),
+        hull=visual_hull(cameras, photographs, train) if points is None and transparent else None,
     )
 
 
 def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
-    """What a folder says of its photographs, sorted by their names; none of them is decoded.
+    """Read the poses and lenses of a folder's photographs, sorted by their names, without decoding them.
 
     Args:
-        root: a folder in one of the five layouts; COLMAP's model is read where there is another description, too.
-        allow_missing: go on without photographs that are named but not there.
+        root: a folder in one of the five layouts; a COLMAP model is preferred where there are several.
+        allow_missing: leave out photographs whose files are missing, instead of raising an error.
 
     Raises:
-        SceneError: when the folder is no scene, a damaged one, or one of fewer than three photographs.
+        SceneError: the folder is not a scene, is damaged, or has fewer than three photographs.
     """
     posed = _read(root, allow_missing)
     if len(posed.names) < _FEWEST:
@@ -107,25 +107,25 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
 
 
 def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
-    """The lens at its photograph's own size, and whether the photograph has an opacity channel.
+    """Resize a lens to its photograph's own size; also return whether the photograph has alpha.
 
     Raises:
-        SceneError: when the file cannot be read, or has another aspect than its lens.
+        SceneError: the file cannot be read, or its aspect differs from the lens's.
     """
     own_width, own_height, has_alpha = read_header(path)
-    if abs(own_height - lens.height * own_width / lens.width) > 1:  # one pixel: an odd size was halved
-        turned = " (is it stored turned? EXIF orientation is not applied)" if own_width < own_height else ""
+    if abs(own_height - lens.height * own_width / lens.width) > 1:  # one pixel: halves of odd sizes are rounded
+        turned = " (is it stored rotated? EXIF orientation is not applied)" if own_width < own_height else ""
         raise SceneError(
             f"{path} has {own_width} x {own_height} pixels, but its camera has {lens.width} x {lens.height}: expected "
-            f"the same size or the same aspect{turned}; use the photographs that the poses were made with"
+            f"the same size or the same aspect{turned}; use the photographs that the poses were estimated from"
         )
     return lens.resized(own_width, own_height), has_alpha
 
 
 def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
-    """Choose the layout by what is in the folder."""
+    """Read the layout that the folder's files show."""
     if not root.is_dir():
-        raise SceneError(f"{root} is {'a file' if root.exists() else 'not there'}: {_LAYOUTS}")
+        raise SceneError(f"{root} is {'a file' if root.exists() else 'missing'}: {_LAYOUTS}")
     if model := find_colmap(root, "sparse/0", "sparse"):
         return read_colmap(root, model, allow_missing)
     if (root / "transforms.json").is_file():
@@ -139,8 +139,7 @@ def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     if model := find_colmap(root, "colmap/sparse/0"):
         return read_colmap(root, model, allow_missing)
     found = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
-    more = f" and {len(found) - 8} more" if len(found) > 8 else ""
-    raise SceneError(f"{root} has no posed photographs (found: {', '.join(found[:8]) or 'nothing'}{more}): {_LAYOUTS}")
+    raise SceneError(f"{root} has no posed photographs (found: {list_names(found, 8) or 'nothing'}): {_LAYOUTS}")
 
 
 def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
@@ -148,9 +147,7 @@ def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
     order = sorted(range(len(posed.names)), key=lambda i: posed.names[i])
     points = posed.points
     if points is not None:
-        place = np.empty(len(order), dtype=np.int64)
-        place[order] = np.arange(len(order))
-        points = replace(points, photograph_index=place[points.photograph_index])
+        points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
     return replace(
         posed,
         names=tuple(posed.names[i] for i in order),
@@ -163,15 +160,15 @@ def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
 
 
 def _photograph_file(path: Path, lens: Lens, width: int | None) -> PhotographFile:
-    """What to make of a photograph; its file may have another size than its lens, of the same aspect."""
+    """Choose the size of a photograph; its file may differ in size from its lens, but not in aspect."""
     own, has_alpha = own_lens(path, lens)
     new_width = min(width or own.width, own.width)
     new_height = max(1, round(own.height * new_width / own.width))
     return PhotographFile(path, own, new_width, new_height, has_alpha)
 
 
-def _moved(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedPhotographs:
-    """The same in coordinates relative to a new origin."""
+def _relative_to(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedPhotographs:
+    """Subtract a new origin from all coordinates."""
     T_world_camera = posed.T_world_camera.copy()
     T_world_camera[:, :, 3] -= origin
     points, cloud = posed.points, posed.cloud_world
@@ -184,6 +181,7 @@ def _moved(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedP
 
 
 def _near_far(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Float64[np.ndarray, "V 2"]:
+    """The layout's own ranges, or estimates from the best data available."""
     if posed.near_far is not None:
         return posed.near_far
     if posed.points is not None:
@@ -209,7 +207,7 @@ def _cameras(
 
 
 def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> SparsePoints | None:
-    """Sparse points with their observations undistorted, without those that this puts outside of the photographs."""
+    """Undistort the observations of sparse points; leave out those that then lie outside their photographs."""
     points = posed.points
     if points is None:
         return None
@@ -220,7 +218,7 @@ def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Spars
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
         xy = lens.unproject(points.uv_px[mine])
         uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
-        with np.errstate(all="ignore"):  # points in the camera's plane; they are left out
+        with np.errstate(all="ignore"):  # points in the camera's plane, which are left out
             off = np.linalg.norm(pinhole.project(xyz) - uv, axis=1)
         inside = (uv >= 0).all(axis=1) & (uv < (pinhole.width, pinhole.height)).all(axis=1)
         good = inside & (xyz[:, 2] > 0) & np.isfinite(off)
@@ -240,11 +238,11 @@ def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Spars
 
 
 def _split(posed: PosedPhotographs) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The layout's own split, or every eighth photograph held out."""
+    """The layout's own split, or else every eighth photograph is held out."""
     if posed.split is None:
         return every_eighth(len(posed.names))
     train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
-    assert not set(train) & set(test), "readers give disjoint parts"
+    assert not set(train) & set(test), "readers return disjoint parts"
     return train, test
 
 

@@ -1,9 +1,9 @@
-"""Which photographs are a tile's neighbouring views (paper, "System overview"; method.md, section 1).
+"""Choose the neighbouring views of tiles (the paper, "System overview"; docs/method.md, section 1).
 
-They are chosen where tiles meet, at their corners, and fade in between: tiles side by side, which may read different
-photographs, then show the same along their border.
+Views are chosen at the corners of tiles and their weights are interpolated in between: adjacent tiles, which may read
+different photographs, then show the same along their border.
 
-Alphabet: K places, T tiles, V candidate photographs, S points of the visible surface per place, N neighbours.
+Alphabet: K tile corners, T tiles, V candidate photographs, S surface points per corner, N neighbours.
 """
 
 from __future__ import annotations
@@ -20,106 +20,90 @@ from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
 FADE = 0.04
-"""Share of its rank by which a view must be better than the first one left out to count in full."""
+"""A view has the full weight when its rank exceeds that of the first view left out by this share of its own rank."""
 BORDER = 0.05
-"""Share of its width over which a view fades out of its frame."""
+"""Share of the image width over which a view's weight falls to 0 at the border."""
 ANGLE_SCALE_RAD = 0.35
-"""Angle at which a view that sees the whole tile is worth as much as one straight on that sees 1 / e of it."""
+"""Angle at which the rank of a view falls to 1 / e."""
 
-FEW = 64
-"""Photographs that are ranked for every place; of more, only those that every so many places see best."""
-EVERY = 7
+PRESELECT_ABOVE, PRESELECT_STEP = 64, 7
+"""With more training photographs than this, only the best of every so many corners are ranked for all corners."""
 EXTRA_VIEWS = 1
-"""Views that a tile has beyond those of each corner: room for others to take over within the tile."""
-SPOTS = ((0.0, 0.0), (-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4))
-"""Around each corner of a tile, in its sides, where it is asked who sees the surface."""
+"""Views of a tile beyond those of each corner, so that the views can change from one corner to another."""
+SURFACE_OFFSETS = ((0.0, 0.0), (-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4))
+"""Where around a tile corner the surface is sampled, in tile sides."""
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The views of T tiles, best first.
+    """The neighbouring views of T tiles, best first.
 
     Attributes:
         index: photographs.
-        presence: how far each is there, 0 to 1, at the tile's corners: upper left and right, then lower left and right.
+        blend_weight: of each, 0 to 1, at the tile's corners: upper left and right, then lower left and right.
     """
 
     index: Int[Tensor, "T N"]
-    presence: Float[Tensor, "T N 4"]
+    blend_weight: Float[Tensor, "T N 4"]
 
     def __getitem__(self, tiles: Tensor | slice) -> Neighbours:
-        return Neighbours(self.index[tiles], self.presence[tiles])
+        return Neighbours(self.index[tiles], self.blend_weight[tiles])
 
 
 def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "K S 3"], candidates: Cameras) -> Float[Tensor, "K V"]:
-    """How well each candidate shows what a target sees: share of the surface points in its frame times closeness.
+    """Rank candidates by the share of a target's surface points in their frames, times exp(-angle / scale).
 
-    Closeness falls with the mean angle subtended at the points between the target's and the candidate's rays, so it
-    tells nadir photographs apart, which all look in the same direction.
+    The angle is the mean one at the surface points between the target's and the candidate's rays. Unlike the viewing
+    directions, it distinguishes nadir photographs.
     """
-    places, points = surface_world.shape[:2]
+    corners, points = surface_world.shape[:2]
     uv, z = candidates.project(surface_world.reshape(-1, 3))
-    share = (from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)).reshape(-1, places, points).mean(-1).T
+    share = (from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)).reshape(-1, corners, points).mean(-1).T
     ours = F.normalize(surface_world - targets.position_world[:, None], dim=-1)
     theirs = F.normalize(surface_world[:, None] - candidates.position_world[None, :, None], dim=-1)
-    # From the chord: unlike the cosine it keeps small angles.
+    # From the chord, which is accurate for small angles; the cosine is not.
     angle = 2 * torch.asin(((theirs - ours[:, None]).norm(dim=-1) / 2).clamp(max=1))
     return share * torch.exp(-angle.mean(-1) / ANGLE_SCALE_RAD)
 
 
 def from_border(uv_px: Float[Tensor, "*B 2"], size_px: Tensor, share: float) -> Float[Tensor, "*B"]:
-    """Where a view shows something: 1 inside, and falling to 0 towards the border of its frame and beyond.
+    """Weight pixels by their distance from the image border: 0 at and beyond it, 1 inside, linear in between.
 
-    Views come and go gently: otherwise pictures jump when they do, and show where a photograph ends.
+    With this weight views appear and disappear continuously, and borders of photographs leave no edges.
 
     Args:
         size_px: width and height, to go with `uv_px`.
-        share: of its width over which it falls.
+        share: of the image width over which the weight falls.
     """
     return (torch.minimum(uv_px, size_px - uv_px).amin(-1) / (share * size_px[..., 0])).clamp(0, 1)
 
 
 def rank_by_direction(targets: Cameras, candidates: Cameras) -> Float[Tensor, "K V"]:
-    """The paper's ranking: cosine between the viewing directions, moved to [0, 1]."""
+    """Rank candidates as the paper does: by the cosine between the viewing directions, mapped to [0, 1]."""
     return (targets.forward_world @ candidates.forward_world.T + 1) / 2
 
 
-def nearest(
+def select_best(
     rank: Float[Tensor, "K V"], excluded: Bool[Tensor, "K V"], count: int, spare: int = 0
 ) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
-    """The best-ranked candidates of each place, best first; fewer where there are not as many.
+    """Select the best-ranked candidates at each corner, best first; fewer where there are not as many.
 
     Args:
-        excluded: candidates that may not serve, such as the target photograph itself.
-        count: of them that are there.
-        spare: how many follow that are not there, but may be nearby.
+        excluded: candidates that must not serve, such as the target photograph itself.
+        count: of candidates with a weight above 0.
+        spare: how many more follow with the weight 0.
 
     Returns:
-        The candidates, and how far each is there, 0 to 1: one that is about to be left out for a better one does not
-        count any more, so that nothing jumps when it is.
+        The candidates and their blend weights, 0 to 1. The weight of a candidate falls to 0 before a better one takes
+        its place, so that the views change continuously.
     """
     allowed = int((~excluded).sum(1).min())
     found = rank.masked_fill(excluded, -1.0).topk(min(count + max(spare, 1), allowed), dim=1)
     if allowed <= count:
         return found.indices, torch.ones_like(found.values)
     chosen, best, left_out = found.indices[:, : count + spare], found.values[:, : count + spare], found.values[:, count]
-    presence = (best - left_out[:, None].clamp(min=0)) / (FADE * best).clamp(min=1e-9)
-    return chosen, presence.clamp(0, 1)
-
-
-def of_tiles(chosen: Int[Tensor, "K N"], presence: Float[Tensor, "K N"], corners: Int[Tensor, "T 4"]) -> Neighbours:
-    """The neighbours of tiles from those of their corners, as many: those that are there most.
-
-    Args:
-        chosen, presence: as `nearest` gives them.
-        corners: each tile's, among the K places.
-    """
-    photographs, which = chosen.unique(return_inverse=True)
-    # A hardly visible presence of all that were chosen, so that they go before those that were not.
-    everyone = presence.new_zeros(len(chosen), len(photographs)).scatter_(1, which, presence.clamp(min=1e-6))
-    everyone = everyone[corners].transpose(1, 2)
-    best = everyone.sum(-1).topk(chosen.shape[1], dim=1).indices
-    return Neighbours(photographs[best], everyone.gather(1, best[..., None].expand(-1, -1, 4)))
+    blend_weight = (best - left_out[:, None].clamp(min=0)) / (FADE * best).clamp(min=1e-9)
+    return chosen, blend_weight.clamp(0, 1)
 
 
 def choose_neighbours(
@@ -133,31 +117,30 @@ def choose_neighbours(
     strategy: str,
     excluded: int | None = None,
 ) -> Neighbours:
-    """Training photographs that serve as neighbouring views of a grid of tiles, row by row.
+    """Choose training photographs as the neighbouring views of a grid of tiles, row by row.
 
     Args:
-        camera: that shows the tiles.
-        prior: its surface.
+        camera: of the tiles.
+        prior: the camera's depth prior.
         corner_px: the grid's upper left corner.
         grid: columns and rows of tiles.
         side_px: of a tile.
-        scene: whose photographs.
-        count: of views at each corner; the tiles have `EXTRA_VIEWS` more, unless all places have the same.
+        scene: of the photographs.
+        count: of views at each corner; the tiles have `EXTRA_VIEWS` more, unless all corners have the same.
         strategy: `TrainConfig.neighbours`.
-        excluded: a photograph that may not serve.
+        excluded: a photograph that must not serve.
     """
     columns, rows = grid
-    places = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
-    uv = places[:, None] + corner_px.new_tensor(SPOTS) * side_px
+    corners_px = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
+    uv = corners_px[:, None] + corner_px.new_tensor(SURFACE_OFFSETS) * side_px
     surface = unproject_to_surface(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
     spare = EXTRA_VIEWS if count and strategy != "direction" else 0
-    chosen, presence = _ranked(camera, surface, scene, count, spare, strategy, excluded)
+    chosen, blend_weight = _choose_at_corners(camera, surface, scene, count, spare, strategy, excluded)
     first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
-    corners = first + torch.tensor([0, 1, columns + 1, columns + 2])
-    return of_tiles(chosen, presence, corners)
+    return _combine_corners(chosen, blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))
 
 
-def _ranked(
+def _choose_at_corners(
     camera: Cameras,
     surface_world: Float[Tensor, "K S 3"],
     scene: Scene,
@@ -166,12 +149,11 @@ def _ranked(
     strategy: str,
     excluded: int | None,
 ) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
-    """Training photographs that show some places best, and how far each is there (`nearest`)."""
+    """The best training photographs at each corner, and their blend weights (`select_best`)."""
     train = torch.tensor(scene.train)
-    if strategy != "direction" and len(train) > FEW and len(surface_world) > EVERY:
-        # What is best at some places is best at all that lie between: the work of ranking stays small, however many
-        # photographs there are.
-        some = rank_by_view(camera, surface_world[::EVERY], scene.cameras[train])
+    if strategy != "direction" and len(train) > PRESELECT_ABOVE and len(surface_world) > PRESELECT_STEP:
+        # The best at some corners are the best at those in between: the cost stays bounded in large scenes.
+        some = rank_by_view(camera, surface_world[::PRESELECT_STEP], scene.cameras[train])
         train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
     candidates = scene.cameras[train]
     if strategy == "direction":
@@ -179,5 +161,17 @@ def _ranked(
     else:
         rank = rank_by_view(camera, surface_world, candidates)
     out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
-    chosen, presence = nearest(rank, out, count, spare)
-    return train[chosen], presence
+    chosen, blend_weight = select_best(rank, out, count, spare)
+    return train[chosen], blend_weight
+
+
+def _combine_corners(
+    chosen: Int[Tensor, "K N"], blend_weight: Float[Tensor, "K N"], corners: Int[Tensor, "T 4"]
+) -> Neighbours:
+    """As many neighbours of each tile as of a corner: those with the largest sum of weights at its four corners."""
+    photographs, which = chosen.unique(return_inverse=True)
+    # A negligible weight for all that were chosen, so that they precede those that were not.
+    table = blend_weight.new_zeros(len(chosen), len(photographs)).scatter_(1, which, blend_weight.clamp(min=1e-6))
+    table = table[corners].transpose(1, 2)
+    best = table.sum(-1).topk(chosen.shape[1], dim=1).indices
+    return Neighbours(photographs[best], table.gather(1, best[..., None].expand(-1, -1, 4)))

@@ -1,8 +1,8 @@
-"""A Scene: posed photographs, what is known of their surface, and which of them are held out."""
+"""The Scene: posed photographs, sparse points of their surface, and which photographs are held out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxtyping import Bool, Float, Int
@@ -10,13 +10,12 @@ from torch import Tensor
 
 from tidefield.data.hull import Hull
 from tidefield.data.images import Photographs
-from tidefield.errors import SceneError
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, describe_sizes, find_name
 
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Triangulated points of structure-from-motion, and which photograph saw which of them where.
+    """P points triangulated by structure-from-motion, and their O observations in photographs.
 
     Attributes:
         xyz_world: positions, world units.
@@ -33,7 +32,7 @@ class SparsePoints:
     uv_px: Float[Tensor, "O 2"]
 
     def subset(self, kept: Bool[Tensor, " P"]) -> SparsePoints:
-        """Some of the points, and what observed them."""
+        """Select points together with their observations."""
         seen = kept[self.point_index.long()]
         number = kept.cumsum(0) - 1
         return SparsePoints(
@@ -52,15 +51,15 @@ class Scene:
     Attributes:
         root: the folder that was read.
         names: photograph names, relative to the scene's image folder, sorted; index i means the same everywhere.
-        cameras: one pinhole camera per photograph, exactly that photograph's size. World coordinates are relative
-            to `origin_world`.
+        cameras: one pinhole camera per photograph, of exactly that photograph's size, with the photographs' names.
+            World coordinates are relative to `origin_world`.
         photographs: the pixels.
         points: sparse points, or None where the format has none.
-        train: indices of the photographs that may be learned from and used as neighbours.
+        train: indices of the training photographs, which also serve as neighbours.
         test: indices of the held-out photographs.
         origin_world: what was subtracted, once and in float64, from the coordinates on disk.
-        background_rgb: the colour behind the scene for photographs with alpha; None for real photographs.
-        hull: where what stands before it can be; None where there are sparse points, or nothing is known.
+        background_rgb: the background colour of photographs with alpha; None for real photographs.
+        hull: the visual hull of the object; None with sparse points, or without alpha.
     """
 
     root: Path
@@ -74,17 +73,27 @@ class Scene:
     background_rgb: tuple[float, float, float] | None = None
     hull: Hull | None = None
 
+    def __post_init__(self) -> None:
+        if self.cameras.names != self.names:
+            object.__setattr__(self, "cameras", replace(self.cameras, names=self.names))
+
+    def __repr__(self) -> str:
+        parts = [f"{len(self.names)} photographs {describe_sizes(self.cameras)}"]
+        parts += [f"{len(self.train)} train", f"{len(self.test)} test"]
+        parts += [f"{len(self.points.xyz_world):,} points"] if self.points is not None else ["no points"]
+        return f"Scene({self.root.name!r}, {', '.join(parts)})"
+
     def index(self, name: str) -> int:
-        """Index of a photograph by its name, with or without its suffix."""
-        for i, own in enumerate(self.names):
-            if name in (own, Path(own).stem, Path(own).name):
-                return i
-        close = ", ".join(self.names[:3])
-        raise SceneError(f"no photograph named {name!r} in {self.root}: names look like {close}; choose one of these")
+        """Find a photograph's index by its name, with or without its folder and suffix.
+
+        Raises:
+            SceneError: no photograph has this name.
+        """
+        return find_name(name, self.names, str(self.root))
 
 
 def every_eighth(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The field's usual split: photographs 0, 8, 16, ... of the sorted names are held out."""
+    """Split photographs as LLFF and NeRF do: 0, 8, 16, ... of the sorted names are held out. Returns train and test."""
     test = tuple(range(0, count, 8))
     train = tuple(i for i in range(count) if i % 8)
     return train, test

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from tidefield.data.cloud import write_cloud
+from tidefield.data.ply import write_ply
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens
 
@@ -61,7 +61,7 @@ def write_transforms_file(
     train, test = ([files[i] for i in part] for part in split)
     top: dict[str, Any] = {"camera_model": "OPENCV", **(calibrations[0] if is_shared else {}), **(header or {})}
     if len(xyz_world):
-        write_cloud(folder / CLOUD_FILE, xyz_world, rgb, overwrite)
+        write_ply(folder / CLOUD_FILE, xyz_world, rgb, overwrite)
         top["ply_file_path"] = CLOUD_FILE
     top |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
     top["frames"] = [

@@ -7,11 +7,15 @@ a `Cameras` exists (see `geometry.lenses`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import PurePath
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from tidefield.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,8 @@ class Cameras:
         size_px: (width, height).
         near_far: nearest and farthest z-depth (along +z) at which this camera may meet the scene, world units.
         gain: colour gain of the photograph, per channel, relative to the scene's common exposure; 1 where unknown.
-            A photograph divided by its gain is at the common exposure (method.md, section 12).
+            A photograph divided by its gain is at the common exposure (docs/method.md, section 12).
+        names: of the photographs, to index by; empty where the cameras have none.
     """
 
     T_world_camera: Float[Tensor, "V 3 4"]
@@ -34,18 +39,33 @@ class Cameras:
     size_px: Int[Tensor, "V 2"]
     near_far: Float[Tensor, "V 2"]
     gain: Float[Tensor, "V 3"]
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return self.T_world_camera.shape[0]
 
-    def __getitem__(self, index: int | slice | list[int] | Tensor) -> Cameras:
-        """A sub-batch; an integer gives a batch of one."""
+    def __repr__(self) -> str:
+        return f"Cameras({len(self)} of {describe_sizes(self)})"
+
+    def __getitem__(self, index: int | slice | list[int] | str | Tensor) -> Cameras:
+        """Select cameras; an integer or a photograph's name gives a batch of one. A tensor's selection has no names.
+
+        Raises:
+            SceneError: no photograph has this name.
+        """
+        if isinstance(index, str):
+            index = find_name(index, self.names, "these cameras")
         if isinstance(index, int):
             index = [index]
-        return Cameras(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        names: tuple[str, ...] = ()
+        if self.names and isinstance(index, slice):
+            names = self.names[index]
+        elif self.names and isinstance(index, list):
+            names = tuple(self.names[i] for i in index)
+        return Cameras(**{name: getattr(self, name)[index] for name in _TENSORS}, names=names)
 
     def to(self, device: torch.device | str) -> Cameras:
-        return Cameras(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return Cameras(**{name: getattr(self, name).to(device) for name in _TENSORS}, names=self.names)
 
     @property
     def width(self) -> int:
@@ -96,6 +116,30 @@ class Cameras:
     def cropped(self, width: int, height: int) -> Cameras:
         """The same pixels, cut or continued at the right and the bottom."""
         return replace(self, size_px=self.size_px.new_tensor([width, height]).expand_as(self.size_px))
+
+
+_TENSORS = tuple(f.name for f in fields(Cameras) if f.name != "names")
+
+
+def find_name(name: str, names: Sequence[str], where: str) -> int:
+    """Find a photograph by its path in the scene, its file name, or its path without the folder and the suffix.
+
+    Raises:
+        SceneError: none of the names matches.
+    """
+    for i, own in enumerate(names):
+        if name in (own, PurePath(own).stem, PurePath(own).name):
+            return i
+    looks = (
+        f"names look like {', '.join(names[:3])}; choose one of these" if names else "they have no names; use indices"
+    )
+    raise SceneError(f"no photograph named {name!r} in {where}: {looks}")
+
+
+def describe_sizes(cameras: Cameras) -> str:
+    """Describe the cameras' image sizes in short: `320x240`, or `2 sizes`."""
+    sizes = cameras.size_px.unique(dim=0).tolist() if len(cameras) else []
+    return "x".join(map(str, sizes[0])) if len(sizes) == 1 else f"{len(sizes)} sizes"
 
 
 def project(

@@ -78,7 +78,7 @@ class FeatureCache:
                 self._encode(key)
         which = torch.tensor([self._slots[key] for key in keys], device=self.device).reshape(neighbours.index.shape)
         cameras = self.cameras[neighbours.index.reshape(-1).to(self.device)]
-        return Views(cameras, which, neighbours.presence.to(self.device), self._encoded)
+        return Views(cameras, which, neighbours.blend_weight.to(self.device), self._encoded)
 
     def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
         """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""

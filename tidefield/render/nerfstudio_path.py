@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tidefield.data.readers.transforms import read_json
+from tidefield.data.readers.files import read_json
 from tidefield.errors import TidefieldError
 
 NORMALISATION_FILE = "dataparser_transforms.json"

@@ -82,7 +82,7 @@ class BatchLoss(nn.Module):
         with mixed_precision(priors.device):
             encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
         neighbours = cameras[batch.neighbours.reshape(-1)]
-        views = Views(neighbours, batch.which, batch.presence, Encoded.concatenate(encoded))
+        views = Views(neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
         tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)
         return network(tiles, views, network.start_intervals(tiles, priors), opaque, generator)
 

@@ -1,1 +1,1 @@
-"""Readers of the layouts in which posed photographs come: one module each, all giving `PosedPhotographs`."""
+"""Readers of five layouts of posed photographs; all of them return `PosedPhotographs`."""

@@ -1,8 +1,8 @@
-"""COLMAP models, binary and text: cameras, images and points3D (https://colmap.github.io/format.html).
+"""Read COLMAP models, binary and text: cameras, images and points3D (https://colmap.github.io/format.html).
 
-The files are read here and not by pycolmap, because a model may come from anywhere: pycolmap 4.2 takes a truncated
-cameras.bin for a good one, with whatever its memory held as the calibration, and does not come back from a truncated
-frames.bin. The poses of images in rigs are complete in the images file, so rigs and frames are not needed.
+The files are not read by pycolmap, because a model may be damaged: pycolmap 4.2 accepts a truncated cameras.bin, with
+uninitialised memory as the calibration, and hangs on a truncated frames.bin. The poses of images in rigs are complete
+in the images file, so rigs and frames are not needed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
-from tidefield.data.readers.posed import Observations, PosedPhotographs, bounded_bytes, inside, keep_present
+from tidefield.data.readers.files import bounded_bytes, inside, keep_present
+from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens, lens_from_colmap
 
-# Model number in cameras.bin -> name and number of parameters, of those that can be read; names of the others.
+# Model number in cameras.bin -> name and number of parameters of the supported models; names of the others.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -51,7 +52,7 @@ _MEGABYTES = 20_000
 
 @dataclass(frozen=True)
 class _Image:
-    """One record of the images file: world-to-camera quaternion (w, x, y, z) and translation, and what it saw."""
+    """One record of the images file: world-to-camera quaternion (w, x, y, z), translation, and observations."""
 
     name: str
     camera: int
@@ -61,32 +62,32 @@ class _Image:
     point: Int[np.ndarray, " O"]
 
 
-def find_colmap(root: Path, *places: str) -> Path | None:
-    """The first of these folders of a scene that holds a COLMAP model, or None."""
-    return next((root / place for place in places if _suffix(root / place)), None)
+def find_colmap(root: Path, *folders: str) -> Path | None:
+    """Find the first of these folders of a scene that holds a COLMAP model."""
+    return next((root / folder for folder in folders if _suffix(root / folder)), None)
 
 
 def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotographs:
-    """A COLMAP model and its photographs in `root/images`.
+    """Read a COLMAP model with photographs in `root/images`.
 
     Raises:
-        SceneError: for a damaged file, an unsupported camera model, or missing photographs.
+        SceneError: a file is damaged, a camera model is not supported, or photographs are missing.
     """
     suffix = _suffix(model)
     assert suffix is not None, "find_colmap found no model here"
     cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
     binary = suffix == ".bin"
-    with _naming(cameras_file):
+    with _name_errors(cameras_file):
         lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
-    with _naming(images_file):
+    with _name_errors(images_file):
         images = list((_binary_images if binary else _text_images)(images_file))
-    with _naming(points_file):
+    with _name_errors(points_file):
         point_ids, xyz_world, rgb = (_binary_points if binary else _text_points)(points_file)
     unknown = next((image for image in images if image.camera not in lenses), None)
     if unknown:
         raise SceneError(
-            f"{images_file} says that {unknown.name} was taken by camera {unknown.camera}, which {cameras_file.name} "
-            "does not have; export the model again"
+            f"{images_file} assigns {unknown.name} to camera {unknown.camera}, which {cameras_file.name} does not "
+            "have: expected one of its cameras; export the model again"
         )
     paths = [inside(root / "images", image.name, images_file) for image in images]
     present = keep_present(paths, images_file, allow_missing)
@@ -101,25 +102,25 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
 
 
 def _suffix(model: Path) -> str | None:
-    """Which of COLMAP's two formats is in a folder; the binary one, where both are, as COLMAP has it."""
+    """The suffix of the format in a folder; with both formats the binary one, as in COLMAP."""
     return next((suffix for suffix in (".bin", ".txt") if (model / f"cameras{suffix}").is_file()), None)
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while a file is parsed into a SceneError that names it."""
+def _name_errors(path: Path) -> Iterator[None]:
+    """Turn errors of parsing a file into a SceneError that names it."""
     try:
         yield
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise SceneError(
-            f"{path} is damaged ({error}): expected a whole file of a COLMAP model; copy or export the model again"
+            f"{path} is damaged ({error}): expected a complete file of a COLMAP model; copy or export the model again"
         ) from error
 
 
 def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
     quaternion = np.array([image.quaternion for image in images]).reshape(-1, 4)
     translation = np.array([image.translation for image in images]).reshape(-1, 3)
-    with np.errstate(invalid="ignore", divide="ignore"):  # a quaternion of zeros becomes NaN, which is refused later
+    with np.errstate(invalid="ignore", divide="ignore"):  # a quaternion of zeros becomes NaN, which is an error later
         w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     R_world_camera = np.array(  # the transpose of the quaternion's R_camera_world
         [
@@ -143,13 +144,13 @@ def _observations(
     seen = np.concatenate([image.point for image in images])
     uv_px = np.concatenate([image.uv_px for image in images])
     photograph = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
-    place = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
-    known = (point_ids[place] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[place]).all(axis=1)
-    return Observations(xyz_world, place[known], photograph[known], uv_px[known], rgb)
+    row = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
+    valid = (point_ids[row] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[row]).all(axis=1)
+    return Observations(xyz_world, row[valid], photograph[valid], uv_px[valid], rgb)
 
 
 class _Reader:
-    """Little-endian numbers out of a file, one after the other; struct.error where the file ends too early."""
+    """Read little-endian numbers from a file in sequence; struct.error where the file ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.bytes, self.at = bounded_bytes(path, _MEGABYTES), 0
@@ -160,7 +161,7 @@ class _Reader:
         return values
 
     def count(self, smallest: int) -> int:
-        """A number of records of at least `smallest` bytes each, which must fit into what is left of the file."""
+        """Read a number of records of at least `smallest` bytes each, which must fit into the rest of the file."""
         (count,) = self.take("Q")
         if count * smallest > len(self.bytes) - self.at:
             raise ValueError(f"it ends before the {count} records that it announces")
@@ -204,7 +205,7 @@ def _binary_points(path: Path) -> _Points:
         point, *position = reader.take("Q3d")
         *colour, _ = reader.take("3Bd")  # and the error
         track = reader.count(8)
-        reader.at += 8 * track  # the images file says the same
+        reader.at += 8 * track  # the images file has the same observations
         ids.append(point)
         xyz.append(position)
         rgb.append(colour)
@@ -229,7 +230,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
     for line in lines:
         if not line:
             continue
-        # Two lines per image; the second is empty where nothing was seen. A name may have spaces.
+        # Two lines per image; the second is empty without observations. A name may have spaces.
         _, *pose, camera, name = line.split(maxsplit=9)
         seen = np.array((next(lines, "")).split(), dtype=np.float64).reshape(-1, 3)
         seen = seen[seen[:, 2] != _NO_POINT]

@@ -1,8 +1,8 @@
-"""LLFF scenes: `images/` and `poses_bounds.npy` (https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap).
+"""Read LLFF scenes: `images/` and `poses_bounds.npy` (https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap).
 
 Each row of the array is a 3 x 5 matrix (the camera's down, right and backward axes in the world, its position, and
 height, width, focal length in pixels) and the nearest and farthest depth of the photograph's sparse points. Rows belong
-to the photographs in the order of their names; principal points are in the middle.
+to the photographs in the order of their names; principal points are the middles.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from tidefield.geometry.lenses import Lens
 
 _FOLDERS = ("images", "images_4", "images_8")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
-# Stated bounds are the 0.1th and 99.9th percentile of the sparse points' depths; surfaces without points lie around.
+# The bounds are the 0.1th and 99.9th percentile of the sparse points' depths; the margins are for surfaces without.
 _NEAREST, _FARTHEST = 0.75, 1.25
 
 
 def read_llff(root: Path) -> PosedPhotographs:
-    """An LLFF scene, with the photographs of `images`, or else of `images_4` or `images_8`.
+    """Read an LLFF scene with the photographs of `images`, or else of `images_4` or `images_8`.
 
     Raises:
-        SceneError: when the array is damaged, or the photographs are not one per row.
+        SceneError: the array is damaged, or there is not one photograph per row.
     """
     file = root / "poses_bounds.npy"
     try:
-        # Mapped, so that a header that announces terabytes is refused instead of allocated.
+        # Memory-mapped, so that nothing is allocated for a header that announces terabytes.
         rows = np.array(np.load(file, allow_pickle=False, mmap_mode="r"))
     except (ValueError, OSError, EOFError) as error:
-        raise SceneError(f"{file} is no whole array ({error}): expected N x 17 numbers; export it again") from error
+        raise SceneError(f"{file} is no complete array ({error}): expected N x 17 numbers; export it again") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} of shape {rows.shape}: expected N x 17 numbers; export it again")
     folder = next((root / name for name in _FOLDERS if (root / name).is_dir()), root / "images")
@@ -40,7 +40,7 @@ def read_llff(root: Path) -> PosedPhotographs:
     if len(paths) != len(rows):
         raise SceneError(
             f"{folder} has {len(paths)} photographs, but {file} has {len(rows)} poses: expected one photograph per "
-            "pose, in the order of their names; put back what is missing"
+            "pose, in the order of their names; add the missing ones"
         )
     matrix = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
     bounds = rows[:, 15:].astype(np.float64)

@@ -1,70 +1,83 @@
-"""Projects of OpenSfM and OpenDroneMap (ODM): `reconstruction.json`, its photographs and, if there, its tracks.
+"""Read projects of OpenSfM and OpenDroneMap (ODM): `reconstruction.json`, photographs and, if present, tracks.
 
 OpenSfM measures photographs from their middle, in units of their longer side s. With pixel corners at integers
 
     u = s (f_x x_d + c_x) + width / 2,   v = s (f_y y_d + c_y) + height / 2
 
-where x_d, y_d are distorted as in `tidefield.geometry.lenses`. Photographs are meant as they are stored, not as EXIF's
-orientation turns them. A shot's rotation (an angle-axis vector) and translation take the world into the camera, whose
-axes are OpenCV's. (https://opensfm.org/docs/geometry.html; that page lacks two squares in Brown's tangential terms,
-which OpenSfM's code has.)
+where x_d, y_d are distorted as in `tidefield.geometry.lenses`. EXIF orientation is not applied. A shot's
+rotation (an angle-axis vector) and translation take the world into the camera, whose axes are OpenCV's.
+(https://opensfm.org/docs/geometry.html; that page lacks two squares in Brown's tangential terms, which OpenSfM's code
+has.)
 
-ODM keeps OpenSfM's project in the folder opensfm and the photographs beside it. Where there is GPS it rewrites
-reconstruction.json in a map projection, which shears and scales it a little, and keeps the original, in metres east,
-north and up of reference_lla.json, as reconstruction.topocentric.json: then that is read.
+ODM keeps OpenSfM's project in the folder opensfm, next to the photographs. With GPS it rewrites reconstruction.json in
+a map projection, which shears and scales it a little, and keeps the original, in metres east, north and up of
+reference_lla.json, as reconstruction.topocentric.json: then that is read.
+
+A line of `tracks.csv` has a photograph's name, a track's (a point's) name, a feature's number and a position, separated
+by tabs, and then columns that are not needed, of which later versions have more. The first line names the version; the
+oldest version has no such line.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import posixpath
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from tidefield.data.images import read_header
-from tidefield.data.readers.opensfm_tracks import Tracks, read_tracks
-from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference, bounded_bytes, inside, keep_present
-from tidefield.data.readers.transforms import number, read_json
-from tidefield.errors import SceneError
+from tidefield.data.readers.files import (
+    bounded_bytes,
+    bounded_lines,
+    inside,
+    keep_present,
+    number,
+    read_json,
+    read_json_value,
+)
+from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
+from tidefield.errors import SceneError, list_names
 from tidefield.geometry.lenses import Lens
 
 Object = dict[str, Any]
 
-_MEGABYTES, _LIST_MEGABYTES = 2_000, 64
+_MEGABYTES, _LIST_MEGABYTES, _TRACKS_MEGABYTES = 2_000, 64, 8_000
 _TOPOCENTRIC = "reconstruction.topocentric.json"
-# Projection type -> its terms of distortion, of those that are pinhole cameras.
+_TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
+_TRACKS_COLUMNS = {"0": 8, "1": 9, "2": 11}
+# Projection type -> its distortion terms, for the pinhole cameras.
 _TERMS = {
     "perspective": ("k1", "k2"),
     "simple_radial": ("k1",),
     "radial": ("k1", "k2"),
     "brown": ("k1", "k2", "p1", "p2", "k3"),
 }
-# Share of a photograph's longer side: OpenSfM leaves out what lies farther from where its point projects (its
-# bundle_outlier_fixed_threshold), but not from tracks.csv.
+# Reprojection error as a share of the photograph's longer side above which OpenSfM rejects an observation (its
+# bundle_outlier_fixed_threshold), but keeps it in tracks.csv.
 _OUTLIER = 0.006
-_NAMED_AT_MOST = 5
 
 _log = logging.getLogger(__name__)
 
 
 def find_opensfm(root: Path) -> Path | None:
-    """The reconstruction to read of an ODM project or of an OpenSfM data set, or None."""
-    places = [root / folder / name for folder in ("opensfm", "") for name in (_TOPOCENTRIC, "reconstruction.json")]
-    return next((place for place in places if place.is_file()), None)
+    """Find the reconstruction to read in an ODM project or an OpenSfM data set; None without any."""
+    files = [root / folder / name for folder in ("opensfm", "") for name in (_TOPOCENTRIC, "reconstruction.json")]
+    return next((file for file in files if file.is_file()), None)
 
 
 def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotographs:
-    """The largest reconstruction of a project.
+    """Read the largest reconstruction of a project.
 
     Raises:
-        SceneError: for damaged files, lenses that are no pinhole cameras with Brown's distortion, missing photographs.
+        SceneError: a file is damaged, a lens is not a pinhole camera with Brown's distortion, or photographs are
+            missing.
     """
     reconstruction = _largest(file)
     shots, cameras = _objects(reconstruction, "shots", file), _objects(reconstruction, "cameras", file)
@@ -76,7 +89,7 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
     ids, xyz_world, rgb = _points(_objects(reconstruction, "points", file), file)
     points = None
     if (tracks_file := file.with_name("tracks.csv")).is_file():
-        points = _observations(read_tracks(tracks_file, names, ids), lenses, T_world_camera, xyz_world, rgb)
+        points = _observations(_read_tracks(tracks_file, names, ids), lenses, T_world_camera, xyz_world, rgb)
     only_cloud = points is None and len(ids) > 0
     return PosedPhotographs(
         names=tuple(names),
@@ -91,20 +104,16 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
 
 
 def _largest(file: Path) -> Object:
-    """The reconstruction of the most photographs; those of the others are named."""
-    try:
-        reconstructions = json.loads(bounded_bytes(file, _MEGABYTES))
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file} is not whole JSON ({error}); copy or export it again") from error
+    """The reconstruction of the most photographs; a warning names the photographs of the others."""
+    reconstructions = read_json_value(file, _MEGABYTES)
     if not isinstance(reconstructions, list) or not reconstructions or not all(map(_is_object, reconstructions)):
-        raise SceneError(f"{file} holds no list of reconstructions: expected what OpenSfM writes; run it again")
+        raise SceneError(f"{file} holds no list of reconstructions: expected the format of OpenSfM; run it again")
     largest, *others = sorted(reconstructions, key=lambda r: len(_objects(r, "shots", file)), reverse=True)
     left = [name for other in others for name in other["shots"]]
     if left:
-        more = f" and {len(left) - _NAMED_AT_MOST} more" if len(left) > _NAMED_AT_MOST else ""
         _log.warning(
-            f"{file} has {len(reconstructions)} reconstructions that do not hang together: the largest, of "
-            f"{len(largest['shots'])} photographs, is used; left out: {', '.join(left[:_NAMED_AT_MOST])}{more}"
+            f"{file} has {len(reconstructions)} reconstructions that are not connected: the largest, of "
+            f"{len(largest['shots'])} photographs, is used; left out: {list_names(left)}"
         )
     return largest
 
@@ -116,12 +125,12 @@ def _is_object(value: object) -> bool:
 def _objects(reconstruction: Mapping[str, Any], key: str, file: Path) -> dict[str, Object]:
     objects = reconstruction.get(key, {})
     if not isinstance(objects, dict) or not all(map(_is_object, objects.values())):
-        raise SceneError(f"{file} has {key} that are no table of objects: expected what OpenSfM writes; run it again")
+        raise SceneError(f"{file} has {key} that are no table of objects: expected the format of OpenSfM; run it again")
     return objects
 
 
 def _photographs(root: Path, file: Path, names: Sequence[str]) -> list[Path]:
-    """Where each photograph is, or should be: in a folder images, or where image_list.txt says."""
+    """Paths of the photographs: in a folder images, or as listed in image_list.txt; the first if none exists."""
     folders = list(dict.fromkeys((root / "images", file.parent / "images")))
     image_list = file.with_name("image_list.txt")
     listed = _listed(root, image_list) if image_list.is_file() else {}
@@ -135,11 +144,11 @@ def _photographs(root: Path, file: Path, names: Sequence[str]) -> list[Path]:
 
 
 def _listed(root: Path, image_list: Path) -> dict[str, str]:
-    """Paths relative to `root` by photographs' names. Absolute ones are of the machine that ODM ran on, and skipped."""
+    """Paths relative to `root` by photographs' names. Absolute ones belong to the machine that ran ODM: skipped."""
     try:
         lines = bounded_bytes(image_list, _LIST_MEGABYTES).decode().splitlines()
     except UnicodeDecodeError as error:
-        raise SceneError(f"{image_list} is no UTF-8 text ({error}): expected a path per line; correct it") from error
+        raise SceneError(f"{image_list} is not UTF-8 text ({error}): expected a path per line; correct it") from error
     here = image_list.parent.relative_to(root).as_posix()
     paths = [PurePosixPath(line.strip()) for line in lines if line.strip()]
     return {path.name: posixpath.join(here, path) for path in paths if not path.is_absolute()}
@@ -148,20 +157,22 @@ def _listed(root: Path, image_list: Path) -> dict[str, str]:
 def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, file: Path) -> Lens:
     camera = cameras.get(str(shot.get("camera")))
     if camera is None:
-        raise SceneError(f"{file} says that {name} was taken by {shot.get('camera')!r}, a camera that it does not have")
+        raise SceneError(
+            f"{file} assigns {name} to the camera {shot.get('camera')!r}, which it does not have; run OpenSfM again"
+        )
     kind = camera.get("projection_type", "perspective")
     if kind not in _TERMS:
         raise SceneError(
             f"{file} has a camera of the projection type {kind!r}: supported are {', '.join(_TERMS)}; open the folder "
-            "undistorted instead, which `opensfm undistort` makes (ODM has it in opensfm/undistorted)"
+            "undistorted instead, which `opensfm undistort` writes (ODM: opensfm/undistorted)"
         )
     width, height = (int(number(camera, key, file, 0.0)) for key in ("width", "height"))
     if not (width and height):
         width, height, _ = read_header(path)
     longer = max(width, height)
     focal = ("focal", "focal") if kind == "perspective" else ("focal_x", "focal_y")
-    fx, fy = (number({key: camera.get(key)}, key, file, 0.0) for key in focal)
-    # A perspective camera's principal point is in the middle, whatever else stands there.
+    fx, fy = (number(camera, key, file) for key in focal)
+    # A perspective camera's principal point is the middle; other values are ignored.
     cx, cy = (0.0 if kind == "perspective" else number(camera, key, file, 0.0) for key in ("c_x", "c_y"))
     return Lens(
         width,
@@ -186,7 +197,7 @@ def _poses(shots: Sequence[Object], names: Sequence[str], file: Path) -> Float64
 def _vector(value: object, what: str, file: Path) -> list[float]:
     if not isinstance(value, list) or len(value) != 3:
         raise SceneError(f"{file}: the {what} is {value!r}: expected three numbers; run OpenSfM again")
-    return [number({what: element}, what, file, 0.0) for element in value]
+    return [number({what: element}, what, file) for element in value]
 
 
 def _points(
@@ -202,21 +213,78 @@ def _points(
             raise ValueError("colours outside of 0 to 255")
     except (KeyError, TypeError, ValueError) as error:
         raise SceneError(
-            f"{file} has points that are none ({error}): expected coordinates and a color of three numbers each; run "
-            "OpenSfM again"
+            f"{file} has invalid points ({error}): expected coordinates and a color of three numbers each; run OpenSfM "
+            "again"
         ) from error
     names, finite = list(points), np.flatnonzero(np.isfinite(xyz).all(axis=1))
     return [names[i] for i in finite], xyz[finite], rgb[finite].astype(np.uint8)
 
 
+@dataclass(frozen=True)
+class _Tracks:
+    """Observations in OpenSfM's coordinates.
+
+    Attributes:
+        photograph_index: for each observation, the photograph.
+        point_index: for each observation, the point.
+        xy: for each observation, its position from the photograph's middle, in units of the longer side.
+    """
+
+    photograph_index: Int[np.ndarray, " O"]
+    point_index: Int[np.ndarray, " O"]
+    xy: Float64[np.ndarray, "O 2"]
+
+
+def _read_tracks(file: Path, names: Sequence[str], points: Sequence[str]) -> _Tracks:
+    """Read the observations of these points in these photographs; other tracks are skipped."""
+    photograph_of = {name: i for i, name in enumerate(names)}
+    point_of = {name: i for i, name in enumerate(points)}
+    photograph_index, point_index, xy = array("q"), array("q"), array("d")
+    try:
+        for photograph, point, _, x, y, *_ in _records(file):
+            if photograph in photograph_of and point in point_of:
+                photograph_index.append(photograph_of[photograph])
+                point_index.append(point_of[point])
+                xy.extend((float(x), float(y)))
+    except ValueError as error:
+        raise SceneError(
+            f"{file} is damaged after {len(point_index)} observations ({error}): expected complete lines of OpenSfM's "
+            "tracks; copy it again, or remove it to use no observations"
+        ) from error
+    return _Tracks(
+        np.array(photograph_index, dtype=np.int64),
+        np.array(point_index, dtype=np.int64),
+        np.array(xy, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _records(file: Path) -> Iterator[list[str]]:
+    """The columns of each line; ValueError where their number does not fit the version."""
+    columns = _TRACKS_COLUMNS["0"]
+    for row, line in enumerate(bounded_lines(file, _TRACKS_MEGABYTES)):
+        if row == 0 and line.startswith(_TRACKS_HEADER):
+            version = line.removeprefix(_TRACKS_HEADER).strip()
+            if version not in _TRACKS_COLUMNS:
+                raise SceneError(
+                    f"{file} has the version {version!r} of OpenSfM's tracks: expected {', '.join(_TRACKS_COLUMNS)}; "
+                    "remove the file to use no observations"
+                )
+            columns = _TRACKS_COLUMNS[version]
+            continue
+        record = line.rstrip("\r\n").split("\t")
+        if len(record) != columns:
+            raise ValueError(f"a line has {len(record)} columns, not {columns}")
+        yield record
+
+
 def _observations(
-    tracks: Tracks,
+    tracks: _Tracks,
     lenses: Sequence[Lens],
     T_world_camera: Float64[np.ndarray, "V 3 4"],
     xyz_world: Float64[np.ndarray, "P 3"],
     rgb: UInt8[np.ndarray, "P 3"],
 ) -> Observations | None:
-    """What OpenSfM's reconstruction counts among the observations of its points; None without any."""
+    """The observations that OpenSfM accepted as inliers; None without any."""
     sizes = np.array([(lens.width, lens.height) for lens in lenses], dtype=np.float64).reshape(-1, 2)
     size = sizes[tracks.photograph_index]
     uv_px = tracks.xy * size.max(axis=1, keepdims=True, initial=0) + size / 2
@@ -224,7 +292,7 @@ def _observations(
     good = np.zeros(len(uv_px), dtype=bool)
     for lens, pose, mine in zip(lenses, T_world_camera, all_seen.by_photograph(len(lenses)), strict=True):
         xyz_camera = (xyz_world[tracks.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
-        with np.errstate(all="ignore"):  # points in the camera's plane; they are left out
+        with np.errstate(all="ignore"):  # points in the camera's plane, which are left out
             off_px = np.linalg.norm(lens.project(xyz_camera) - uv_px[mine], axis=1)
         good[mine] = (xyz_camera[:, 2] > 0) & (off_px <= _OUTLIER * max(lens.width, lens.height))
     if not good.any():
@@ -238,8 +306,8 @@ def _observations(
 
 
 def _reference(file: Path, reconstruction: Mapping[str, Any]) -> Reference | None:
-    """Where the origin is, if that is said and the reconstruction is in metres east, north and up of it."""
-    # ODM's reconstruction.json is in a map projection once it is moved, and says so nowhere.
+    """The geographic origin, if it is stated and the reconstruction is in metres east, north and up of it."""
+    # ODM moves reconstruction.json into a map projection without a mark in the file.
     folder = file.resolve().parent
     moved = folder.name == "opensfm" or (folder.parent / "odm_georeferencing").is_dir()
     original = file.name == _TOPOCENTRIC or (folder / "reconstruction.geocoords.json").is_file()
@@ -250,9 +318,7 @@ def _reference(file: Path, reconstruction: Mapping[str, Any]) -> Reference | Non
         source, where = file, reconstruction.get("reference_lla")
     if not isinstance(where, dict):
         return None
-    latitude, longitude, height = (
-        number({key: where.get(key)}, key, source, 0.0) for key in ("latitude", "longitude", "altitude")
-    )
+    latitude, longitude, height = (number(where, key, source) for key in ("latitude", "longitude", "altitude"))
     if not (abs(latitude) <= 90 and abs(longitude) <= 180):
         raise SceneError(
             f"{source} has the latitude {latitude} and the longitude {longitude}: expected degrees of WGS 84; correct "
@@ -262,8 +328,8 @@ def _reference(file: Path, reconstruction: Mapping[str, Any]) -> Reference | Non
         return None
     if moved and not original:
         _log.warning(
-            f"{file} may be in a map projection or not, as {_TOPOCENTRIC} is not beside it: where on Earth its origin "
-            "is stays unknown"
+            f"{file} may be in a map projection, as there is no {_TOPOCENTRIC} next to it: the scene has no geographic "
+            "origin"
         )
         return None
     return Reference(latitude, longitude, height)

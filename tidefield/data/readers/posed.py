@@ -1,10 +1,8 @@
-"""What every reader gives, and the checks that all of them share."""
+"""The result of every reader: posed photographs with lenses and, if the format has them, sparse points."""
 
 from __future__ import annotations
 
-import posixpath
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,18 +12,16 @@ from jaxtyping import Float, Float64, Int, UInt8
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
 
-_NAMED_AT_MOST = 5
-
 
 @dataclass(frozen=True)
 class Observations:
-    """Sparse points as they are on disk.
+    """Sparse points and their observations, as on disk.
 
     Attributes:
         xyz_world: positions.
         point_index: for each observation, the point.
         photograph_index: for each observation, the photograph.
-        uv_px: for each observation, the pixel in the photograph as it was taken (distorted), at the lens's size.
+        uv_px: for each observation, the pixel in the original (distorted) photograph, at the lens's size.
         rgb: the points' colours, where the format has them.
     """
 
@@ -36,7 +32,7 @@ class Observations:
     rgb: UInt8[np.ndarray, "P 3"] | None = None
 
     def by_photograph(self, photographs: int) -> list[Int[np.ndarray, " _"]]:
-        """For each photograph, the indices of its observations."""
+        """Group the indices of the observations by photograph."""
         order = np.argsort(self.photograph_index, kind="stable")
         starts = np.searchsorted(self.photograph_index[order], np.arange(1, photographs))
         return np.split(order, starts)
@@ -44,11 +40,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Reference:
-    """Where on Earth the origin of a world is whose axes are east, north and up there, in metres.
+    """Geographic origin of a world whose axes are east, north and up there, in metres.
 
     Attributes:
         latitude_deg, longitude_deg: WGS 84.
-        height_m: above whatever the heights of the project's cameras count from; projects do not say.
+        height_m: in the vertical datum of the project's cameras, which projects do not state.
     """
 
     latitude_deg: float
@@ -65,13 +61,13 @@ class PosedPhotographs:
         paths: the files; all exist.
         lenses: one per photograph. A photograph's file may have another size of the same aspect.
         T_world_camera: OpenCV axes (+x right, +y down, +z forward).
-        points: sparse points and who saw them, where the format has them.
+        points: sparse points with observations, where the format has them.
         cloud_world: points without observations, where the format has only those.
         cloud_rgb: their colours, where the format has them.
         near_far: z-depths, where the format states them.
-        split: names of the photographs to learn from and of those held out, where the format has a split.
-        background_rgb: what photographs with alpha are meant to be seen against, where the format says so.
-        reference: where the world is, where the format says so.
+        split: names of the training and the held-out photographs, where the format has a split.
+        background_rgb: the background of photographs with alpha, where the format states it.
+        reference: the geographic origin, where the format states it.
     """
 
     names: tuple[str, ...]
@@ -87,80 +83,13 @@ class PosedPhotographs:
     reference: Reference | None = None
 
 
-def bounded_bytes(path: Path, megabytes: int) -> bytes:
-    """A file's content, refused when it is larger than what it claims to be could be."""
-    with _readable(path, megabytes):
-        return path.read_bytes()
-
-
-def bounded_lines(path: Path, megabytes: int) -> Iterator[str]:
-    """A text's lines, one after the other, refused like `bounded_bytes`; UnicodeDecodeError where it is not UTF-8."""
-    with _readable(path, megabytes), path.open(encoding="utf-8") as lines:
-        yield from lines
-
-
-@contextmanager
-def _readable(path: Path, megabytes: int) -> Iterator[None]:
-    try:
-        if path.stat().st_size > megabytes * 1_000_000:
-            raise SceneError(
-                f"{path} has {path.stat().st_size / 1e6:.0f} MB: expected at most {megabytes} MB of a file of this kind"
-            )
-        yield
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read: {error.strerror}; make it a readable file") from error
-
-
-def inside(root: Path, name: str, named_by: Path) -> Path:
-    """The path of a file that a scene's description names, held inside the scene.
-
-    `name` must be relative, must not lead out of `root` by "..", and must not do so by links either, except that a
-    folder directly in `root` may itself be a link (photographs kept on another disk): then the file must lie inside
-    the folder that it links to.
-    """
-    relative = Path(posixpath.normpath(name.replace("\\", "/")))
-    path = root / relative
-    lexically = not relative.anchor and ".." not in relative.parts and "\0" not in name and relative.parts
-    homes = [(root / first).resolve() for first in ("", *relative.parts[:-1][:1])] if lexically else []
-    try:
-        real = path.resolve() if homes else path
-        outside = not any(real.is_relative_to(home) for home in homes)
-        path.is_file()
-    except (OSError, RuntimeError):  # a name too long for the system; links in a circle
-        outside = True
-    if outside:
-        raise SceneError(
-            f"{named_by} names the file {name!r}, which is outside of the scene's folder {root}: expected paths "
-            "relative to that folder; move the photographs into it and correct the paths"
-        )
-    return path
-
-
-def keep_present(paths: Sequence[Path], named_by: Path, allow_missing: bool) -> list[int]:
-    """Indices of the files that exist.
-
-    Raises:
-        SceneError: when some are missing and that is not allowed.
-    """
-    present = [i for i, path in enumerate(paths) if path.is_file()]
-    missing = [path for path in paths if not path.is_file()]
-    if missing and not allow_missing:
-        some = ", ".join(str(path) for path in missing[:_NAMED_AT_MOST])
-        more = f" and {len(missing) - _NAMED_AT_MOST} more" if len(missing) > _NAMED_AT_MOST else ""
-        raise SceneError(
-            f"{len(missing)} of the {len(paths)} photographs that {named_by} names are missing: {some}{more}; put them "
-            "there, or go on without them with --allow-missing"
-        )
-    return present
-
-
 def proper_rotations(
     T_world_camera: Float[np.ndarray, "V 3 4"], names: Sequence[str], named_by: Path
 ) -> Float64[np.ndarray, "V 3 4"]:
-    """Poses with their rotations made orthonormal to float64's precision.
+    """Orthonormalise the rotations of poses to float64's precision.
 
     Raises:
-        SceneError: for a pose that is not finite, or whose rotation is none (R^T R = I within 1e-3, det R = +1).
+        SceneError: a pose is not finite, or not a rotation (R^T R = I within 1e-3, det R = +1).
     """
     rotation = T_world_camera[:, :, :3]
     finite = np.isfinite(T_world_camera.reshape(-1, 12)).all(axis=1)
@@ -183,5 +112,5 @@ def _refuse(wrong: Int[np.ndarray, " W"], names: Sequence[str], named_by: Path, 
     others = f" (and {count - 1} more)" if count > 1 else ""
     raise SceneError(
         f"{named_by}: {what.format(first + others)}: expected a finite position and a right-handed rotation, "
-        "R^T R = I within 0.001; make the poses again, or take the photograph out"
+        "R^T R = I within 0.001; estimate the poses again, or remove the photograph"
     )

@@ -1,0 +1,51 @@
+"""Read and write point clouds with colours as PLY files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from tidefield.data.readers.files import check_size
+from tidefield.errors import SceneError
+from tidefield.files import completed_file
+
+_MEGABYTES = 4_000
+_COLOURS = ("red", "green", "blue")
+
+
+def read_ply(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None] | None:
+    """Read the finite positions of a cloud's vertices, and their colours if they are 8-bit; None without vertices.
+
+    Raises:
+        SceneError: the file is damaged, or has no element `vertex` with x, y, z.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    check_size(path, _MEGABYTES)
+    try:
+        vertex = PlyData.read(path)["vertex"].data
+        xyz = np.stack([vertex[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        coloured = all(c in vertex.dtype.names and vertex.dtype[c] == np.uint8 for c in _COLOURS)
+        rgb = np.stack([vertex[c] for c in _COLOURS], axis=-1) if coloured else None
+    except (PlyParseError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as error:
+        raise SceneError(f"{path} is not a complete PLY file of points ({error}); export it again") from error
+    finite = np.isfinite(xyz).all(axis=1)
+    return (xyz[finite], None if rgb is None else rgb[finite]) if finite.any() else None
+
+
+def write_ply(path: Path, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], overwrite: bool) -> None:
+    """Write a cloud as a binary PLY file, in the form that Open3D and nerfstudio read.
+
+    Raises:
+        RunError: the file exists and must not be overwritten, or its folder cannot be written to.
+    """
+    from plyfile import PlyData, PlyElement
+
+    vertex = np.empty(len(xyz), [*((axis, "<f4") for axis in "xyz"), *((colour, "u1") for colour in _COLOURS)])
+    for names, values in (("xyz", xyz), (_COLOURS, rgb)):
+        for name, column in zip(names, values.T, strict=True):
+            vertex[name] = column
+    with completed_file(path, overwrite=overwrite) as partial:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(partial)
