@@ -4,7 +4,14 @@ import pycolmap
 import pytest
 
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import Lens, lens_from_colmap, rectify
+from tidefield.geometry.lenses import (
+    COLMAP_MODELS,
+    COLMAP_PARAMETERS,
+    Lens,
+    colmap_parameters,
+    lens_from_colmap,
+    rectify,
+)
 
 CAMERAS = {
     "SIMPLE_PINHOLE": [210.0, 160.5, 119.0],
@@ -143,3 +150,24 @@ def test_reduction_is_the_mean_of_the_pixels_that_are_covered() -> None:
 def test_a_resized_lens_projects_to_resized_pixels() -> None:
     xyz = np.array([[0.2, -0.3, 1.0]])
     np.testing.assert_allclose(lens("OPENCV").resized(160, 60).project(xyz), lens("OPENCV").project(xyz) * (0.5, 0.25))
+
+
+def test_the_table_of_camera_models_is_colmaps() -> None:
+    """The smallest pycolmap that is promised lacks the last models."""
+    for number, model in enumerate(COLMAP_MODELS):
+        if model in pycolmap.CameraModelId.__members__:
+            assert int(pycolmap.CameraModelId.__members__[model]) == number
+    for model, names in COLMAP_PARAMETERS.items():
+        camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 320, 240)
+        names = ["k" if (model, name) == ("SIMPLE_RADIAL", "k1") else name for name in names]
+        assert camera.params_info.split(", ") == names
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_parameters_come_back_in_colmaps_order(model: str) -> None:
+    assert colmap_parameters(lens(model), model) == CAMERAS[model]
+
+
+def test_parameters_of_a_simpler_model_drop_terms_and_average_the_focal_lengths() -> None:
+    assert colmap_parameters(lens("OPENCV"), "RADIAL") == [215.0, 163.0, 116.0, -0.2, 0.05]
+    assert colmap_parameters(lens("RADIAL"), "FULL_OPENCV") == [280.0, 280.0, 160.0, 120.0, -0.32, 0.15] + [0.0] * 6

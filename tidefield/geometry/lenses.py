@@ -14,7 +14,7 @@ With x, y on the plane z = 1 of the camera and r^2 = x^2 + y^2 (Brown 1971, as i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -23,8 +23,7 @@ from jaxtyping import Float, UInt8
 
 from tidefield.errors import SceneError
 
-# COLMAP's camera models that are pinhole cameras with this distortion, and the meaning of their parameters.
-_COLMAP_MODELS = {
+COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -32,6 +31,13 @@ _COLMAP_MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+"""COLMAP's camera models that are pinhole cameras with Brown's distortion, and their parameters in order."""
+COLMAP_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
+"""All of COLMAP's camera models, each at the index that stands for it in cameras.bin (src/colmap/sensor/models.h)."""
 
 Points = Float[np.ndarray, "P 2"]
 
@@ -180,18 +186,20 @@ class Lens:
         return bool(inside and self._is_unfolded(border).all())
 
 
-def lens_from_colmap(model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
+def lens_from_colmap(
+    model: str, width: int, height: int, parameters: Sequence[float] | Float[np.ndarray, " K"]
+) -> Lens:
     """The lens of a COLMAP camera.
 
     Raises:
         SceneError: for fisheye and other models, for FULL_OPENCV's k4, k5, k6, and for a wrong number of parameters.
     """
-    if model not in _COLMAP_MODELS:
+    if model not in COLMAP_PARAMETERS:
         raise SceneError(
-            f"a camera has COLMAP's model {model}: supported are {', '.join(_COLMAP_MODELS)}; run COLMAP's "
+            f"a camera has COLMAP's model {model}: supported are {', '.join(COLMAP_PARAMETERS)}; run COLMAP's "
             "image_undistorter and open its output, or reconstruct again with --ImageReader.camera_model OPENCV"
         )
-    names = _COLMAP_MODELS[model]
+    names = COLMAP_PARAMETERS[model]
     if len(names) != len(parameters):
         raise SceneError(f"a {model} camera has {len(parameters)} parameters, expected {len(names)}: {names}")
     values = dict(zip(names, map(float, parameters), strict=True))
@@ -203,6 +211,12 @@ def lens_from_colmap(model: str, width: int, height: int, parameters: Sequence[f
             "image_undistorter and open its output, or reconstruct again with --ImageReader.camera_model OPENCV"
         )
     return Lens(width, height, **values)
+
+
+def colmap_parameters(lens: Lens, model: str) -> list[float]:
+    """List a lens's parameters in the order of a COLMAP model; terms that this model lacks are dropped."""
+    values = {**asdict(lens), "f": (lens.fx + lens.fy) / 2}
+    return [values.get(name, 0.0) for name in COLMAP_PARAMETERS[model]]
 
 
 def rectify(

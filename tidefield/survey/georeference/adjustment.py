@@ -16,6 +16,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from tidefield.data.georeference import Residuals
+from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.ground_control import on_one_line
 from tidefield.survey.georeference.marks import Marks, triangulate, triangulate_points
 
@@ -33,6 +34,7 @@ _IMAGES_OF_A_LENS = 8
 """A lens that took fewer photographs stays as it is."""
 _MISMATCH = 2.0
 """Observations are left out whose error is so many times that of the middle point."""
+_SIMPLER = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _STEPS = 200
 _TOLERANCE = 1e-7
 
@@ -181,15 +183,10 @@ def _add_control(model: pycolmap.Reconstruction, marks: Marks, surveyed: Float64
 
 def _generalise(camera: pycolmap.Camera) -> None:
     """The same lens as OpenCV's model with two radial and two tangential terms, if it is a simpler one."""
-    ids = pycolmap.CameraModelId
-    simpler = {ids.SIMPLE_PINHOLE: 0, ids.PINHOLE: 0, ids.SIMPLE_RADIAL: 1, ids.RADIAL: 2}
-    if camera.model not in simpler:
-        return
-    terms = camera.params[len(camera.params) - simpler[camera.model] :]
-    focal = camera.focal_length_x, camera.focal_length_y
-    centre = camera.principal_point_x, camera.principal_point_y
-    camera.model = ids.OPENCV
-    camera.params = [*focal, *centre, *np.pad(terms, (0, 4 - len(terms)))]
+    if camera.model.name in _SIMPLER:
+        lens = lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = colmap_parameters(lens, "OPENCV")
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

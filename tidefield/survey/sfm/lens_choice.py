@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 
+from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.adjustment import adjustment_options, all_images, thinned
 from tidefield.survey.georeference.alignment import PositionFit, camera_centres, find_down, fit_positions
 from tidefield.survey.georeference.gps import given_positions
@@ -235,11 +236,10 @@ def _trial(model: pycolmap.Reconstruction, lens: str, photographs: Sequence[Phot
 
 def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
     for camera in model.cameras.values():
-        mean = (camera.focal_length_x + camera.focal_length_y) / 2
-        centre = camera.principal_point_x, camera.principal_point_y
-        terms = np.pad(camera.params[len(camera.focal_length_idxs()) + 2 :], (0, 4))[: TERMS[lens]]
+        current = lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
+        mean = (current.fx + current.fy) / 2
         camera.model = getattr(pycolmap.CameraModelId, lens)
-        camera.params = [*([mean, mean] if lens == "OPENCV" else [mean]), *centre, *terms]
+        camera.params = colmap_parameters(replace(current, fx=mean, fy=mean), lens)
     options = adjustment_options()
     options.refine_focal_length, options.refine_principal_point = focal, False
     config = all_images(model)
