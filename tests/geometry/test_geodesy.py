@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from tidefield.geometry.geodesy import LocalFrame, parse_crs, utm_zone
+from tidefield.geometry.geodesy import LocalFrame, metres_per_degree, parse_crs, utm_zone
 
 BNG_PROJ4 = (
     "+proj=tmerc +lat_0=49 +lon_0=-2 +k=0.9996012717 +x_0=400000 +y_0=-100000 +ellps=airy "
@@ -95,6 +95,14 @@ def test_grid_north_is_turned_from_true_north():
     north = frame.from_crs(np.array([[351000.0, 513000.0, 0.0]]))[0]
     convergence_deg = -np.rad2deg((2.0 - 2.756) / 57.2958 * np.sin(np.deg2rad(54.5)) * -1)  # grid lies west of 2 W
     assert np.rad2deg(np.arctan2(north[0], north[1])) == pytest.approx(convergence_deg, abs=0.05)
+
+
+@pytest.mark.parametrize("latitude", [0.0, 54.0, -54.0, 80.0])
+def test_the_length_of_a_degree_is_the_ellipsoids_within_0_7_per_cent(latitude):
+    earth = Geod(ellps="WGS84")
+    east = earth.inv(10.0, latitude, 11.0, latitude)[2]
+    north = earth.inv(10.0, latitude - 0.5, 10.0, latitude + 0.5)[2]
+    np.testing.assert_allclose(metres_per_degree(latitude), (east, north), rtol=0.007)
 
 
 @pytest.mark.parametrize(

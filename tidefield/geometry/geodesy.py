@@ -26,6 +26,8 @@ from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 WGS84 = "EPSG:4326"
+EARTH_RADIUS_M = 6_371_000.0
+"""Mean radius, for distances on a sphere that may be wrong by half a per cent."""
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
 
@@ -238,6 +240,12 @@ def parse_crs(text: str) -> CRS:
     if not (base.is_projected or base.is_geographic) or base.geodetic_crs is None:
         raise ValueError(f"{text!r} ({crs.name}) is neither projected nor geographic")
     return crs
+
+
+def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
+    """Compute the length of a degree of longitude and of latitude on a sphere, within 0.7% of the ellipsoid's."""
+    north = float(np.deg2rad(EARTH_RADIUS_M))
+    return float(np.cos(np.deg2rad(latitude_deg))) * north, north
 
 
 def utm_zone(longitude_deg: float, latitude_deg: float) -> str:

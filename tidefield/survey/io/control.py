@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import parse_crs
+from tidefield.geometry.geodesy import metres_per_degree, parse_crs
 from tidefield.survey.io.crs import read_crs
 from tidefield.survey.io.gps_files import split_name
 from tidefield.survey.io.names import Names, read_text
@@ -28,7 +28,6 @@ CONTROL_FILES = ("gcp_list.txt",)
 
 _EXPECTED_LINE = "expected `x y z px py image [point]`"
 _SAME_POINT_M = 0.001
-_METRES_PER_DEGREE = 111_000.0
 _OUTSIDE_AT_MOST = 0.5
 
 
@@ -94,7 +93,7 @@ def _lines(path: Path, text: str, header: str) -> Iterator[_Line]:
 
 def _same_place(crs: str) -> tuple[float, float, float]:
     """How much two places of one point may differ: what is lost when a list is printed."""
-    across = _SAME_POINT_M / (_METRES_PER_DEGREE if parse_crs(crs).is_geographic else 1.0)
+    across = _SAME_POINT_M / (metres_per_degree(0.0)[1] if parse_crs(crs).is_geographic else 1.0)
     return across, across, _SAME_POINT_M
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from tidefield.errors import list_names
+from tidefield.geometry.geodesy import EARTH_RADIUS_M, metres_per_degree
 from tidefield.survey.survey import Photograph, Position
 
-_EARTH_M = 6_371_000.0
 # A position this far from the middle of the others is wrong: no single flight is so long.
 _FAR_M = 10_000.0
 _FAR_TIMES_MEDIAN = 20.0
@@ -84,8 +84,7 @@ def metres_around(positions: Sequence[Position]) -> Float64[np.ndarray, "N 2"]:
     """East and north of the middle of some positions; on a sphere, good to some per cent over tens of kilometres."""
     degrees = np.array([(position.longitude_deg, position.latitude_deg) for position in positions]).reshape(-1, 2)
     east = (degrees[:, 0] - degrees[:1, 0] + 180) % 360 - 180  # also across the date line
-    scale = np.deg2rad(_EARTH_M) * np.array([np.cos(np.deg2rad(np.median(degrees[:, 1]))), 1.0])
-    metres = np.column_stack([east, degrees[:, 1]]) * scale
+    metres = np.column_stack([east, degrees[:, 1]]) * metres_per_degree(float(np.median(degrees[:, 1])))
     return metres - np.median(metres, axis=0)
 
 
@@ -97,7 +96,7 @@ def _geocentric_m(position: Position) -> Float64[np.ndarray, "1 3"]:
     """On a sphere: for distances that need not be exact, but must not jump where the longitude does."""
     latitude, longitude = np.deg2rad([position.latitude_deg, position.longitude_deg])
     around = np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude)])
-    return _EARTH_M * np.array([[*around, np.sin(latitude)]])
+    return EARTH_RADIUS_M * np.array([[*around, np.sin(latitude)]])
 
 
 def _remark(photographs: Sequence[Photograph], what: str) -> str:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from tidefield.survey.io.positions import metres_around
 from tidefield.survey.survey import Photograph
 
 Pair = tuple[int, int]
@@ -46,10 +47,11 @@ def candidates(photographs: Sequence[Photograph]) -> list[Pair]:
     count = len(photographs)
     if count <= FEW:
         return list(combinations(range(count), 2))
-    placed = [k for k, p in enumerate(photographs) if p.position is not None]
+    located = {k: p.position for k, p in enumerate(photographs) if p.position is not None}
+    placed = list(located)
     pairs: set[Pair] = set()
     if len(placed) > NEARBY:
-        xy = _metres([photographs[k] for k in placed])
+        xy = metres_around(list(located.values()))
         apart, near = KDTree(xy).query(xy, k=NEARBY + 1)
         # Where a field has fewer photographs than that, the next are those of another field, far away.
         far = FAR * np.median(np.asarray(apart)[:, NEARBY // 2])
@@ -112,13 +114,6 @@ def promising(
     for own in ranked.values():
         kept |= set(own[:BEST]) | {pair for pair in own[:MOST] if score[pair] >= PROMISING}
     return sorted(kept)
-
-
-def _metres(photographs: Sequence[Photograph]) -> np.ndarray:
-    """Positions on a plane, in metres: good enough to tell who is near."""
-    degrees = np.array([[p.position.longitude_deg, p.position.latitude_deg] for p in photographs if p.position])
-    east = np.cos(np.radians(np.median(degrees[:, 1])))
-    return degrees * [111_320 * east, 110_574]
 
 
 def _pair(i: int, j: int) -> Pair:
