@@ -9,7 +9,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from tidefield.errors import SurveyError
-from tidefield.geometry.similarity import ON_ONE_LINE, Similarity, hypotheses, refine_similarity
+from tidefield.geometry.similarity import COLLINEAR, Similarity, hypotheses, refine_similarity
 from tidefield.survey.georeference.alignment import Down, PositionFit
 from tidefield.survey.georeference.marks import Marks, reprojection_px, triangulate_points
 
@@ -74,7 +74,7 @@ def on_one_line(points: Float64[np.ndarray, "N 3"]) -> bool:
     if len(points) < 3:
         return True
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return bool(spread[1] <= ON_ONE_LINE * spread[0])
+    return bool(spread[1] <= COLLINEAR * spread[0])
 
 
 def _pairs(
