@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
 
-from tidefield.survey.georeference.adjustment import adjustment_options
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options
 from tidefield.survey.sfm.lens_choice import SPREAD_DEG, TERMS, Choice, Trial, best_of, choose_lens, told
 from tidefield.survey.survey import LensPrior
 

@@ -16,7 +16,7 @@ from tidefield import __version__
 from tidefield.data.georeference import Georeference
 from tidefield.survey import report
 from tidefield.survey.colour import Evening
-from tidefield.survey.georeference.alignment import camera_centres
+from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.pictures import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.report.page import MOST_THUMBNAILS

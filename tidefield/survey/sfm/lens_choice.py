@@ -22,9 +22,14 @@ import numpy as np
 import pycolmap
 
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
-from tidefield.survey.georeference.adjustment import adjustment_options, all_images, thinned
-from tidefield.survey.georeference.alignment import PositionFit, camera_centres, find_down, fit_positions
-from tidefield.survey.georeference.gps import given_positions
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, thinned
+from tidefield.survey.georeference.gps_alignment import (
+    PositionFit,
+    camera_centres,
+    find_down,
+    fit_positions,
+    given_positions,
+)
 from tidefield.survey.survey import Photograph
 
 TERMS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
