@@ -131,8 +131,8 @@ def triangulate(model: pycolmap.Reconstruction, marks: Marks) -> Float64[np.ndar
     if len(rays) < len(images):  # a mark where the lens images nothing
         return None
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    start = pycolmap.triangulate_multi_view_point([image.cam_from_world().matrix() for image in images], rays)
-    if start is None:
+    start = _triangulate_linearly(np.array([image.cam_from_world().matrix() for image in images]), rays)
+    if not np.isfinite(start).all():
         return None
 
     def error(point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " K"]:
@@ -141,6 +141,16 @@ def triangulate(model: pycolmap.Reconstruction, marks: Marks) -> Float64[np.ndar
         return np.concatenate([np.full(2, 1e6) if uv is None else uv for uv in projected]) - marks.uv_px.ravel()
 
     return least_squares(error, start, x_scale=np.maximum(np.abs(start), 1e-3)).x
+
+
+def _triangulate_linearly(
+    T_camera_world: Float64[np.ndarray, "K 3 4"], rays_camera: Float64[np.ndarray, "K 3"]
+) -> Float64[np.ndarray, " 3"]:
+    """Triangulate unit rays by the smallest algebraic distance; pycolmap 4.0 has no such function."""
+    across = T_camera_world - rays_camera[:, :, None] * np.einsum("ki,kij->kj", rays_camera, T_camera_world)[:, None]
+    _, vectors = np.linalg.eigh(np.einsum("kij,kil->jl", across, across))
+    with np.errstate(divide="ignore", invalid="ignore"):  # parallel rays meet at infinity
+        return vectors[:3, 0] / vectors[3, 0]
 
 
 def triangulate_points(
