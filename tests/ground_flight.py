@@ -1,4 +1,4 @@
-"""Photograph files of a small flight straight down over hilly, textured ground: a survey whose truth is known."""
+"""Photograph files of a small simulated nadir flight over hilly, textured ground, with ground truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ FOCAL_MM, EQUIVALENT_MM = 8.0, 27.69  # 320 px of a diagonal of 500, on the 43.2
 
 @dataclass(frozen=True)
 class Flight:
-    """Where the files are, and where their cameras were."""
+    """Folder and names of the files, and true camera positions."""
 
     folder: Path
     position_world: np.ndarray
@@ -32,7 +32,7 @@ def hills(xy: np.ndarray) -> np.ndarray:
 
 
 def picture(ground: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """What a camera looking straight down, its top to the north, sees."""
+    """Render a nadir photograph with north at the top."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     slope = np.stack([(u - WIDTH / 2) / FOCAL, -(v - HEIGHT / 2) / FOCAL], -1)
     xy = position[:2] + slope * position[2]
@@ -52,7 +52,7 @@ def fly(
     first: int = 0,
     east_m: float = 0.0,
 ) -> Flight:
-    """Photographs 12 m apart, with EXIF of lens, time and place; numbers begin with `first`."""
+    """Write photographs 12 m apart with EXIF of lens, time and position; numbers start at `first`."""
     ground = camera_files.texture((SIDE, SIDE), seed)
     x, y = np.meshgrid((np.arange(columns) - (columns - 1) / 2) * 12.0, (np.arange(rows) - (rows - 1) / 2) * 12.0)
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Surveys whose truth is known: photographs straight down over rolling ground, their positions and ground control."""
+"""Simulated surveys with ground truth: nadir photographs of rolling ground, positions and ground control."""
 
 import math
 from dataclasses import dataclass, replace
@@ -19,12 +19,12 @@ CONTROL = np.array([[-38, -30], [37, -29], [-36, 31], [39, 28], [2, 3], [-20, 12
 
 @dataclass(frozen=True)
 class Flight:
-    """A survey as it was flown.
+    """A simulated survey.
 
     Attributes:
-        model: in world metres, with exact points, and noise on what shows of them.
-        survey: with positions, and without control.
-        centres_world: where the cameras were.
+        model: in world metres, with exact points and noisy observations.
+        survey: with positions, without control.
+        centres_world: true camera positions.
     """
 
     model: pycolmap.Reconstruction
@@ -46,7 +46,7 @@ def fly(
     seed: int = 0,
     tilt_deg: float = 3.0,
 ) -> Flight:
-    """Lines 25 m apart, there and back along the east, 75 m above the ground, a photograph every 15 m.
+    """Simulate east-west strips 25 m apart, 75 m above the ground, with a photograph every 15 m.
 
     Args:
         position_m: standard deviation of the receiver, in each direction.
@@ -77,7 +77,7 @@ def name_of(i: int) -> str:
 
 
 def photograph(i: int, longitude_latitude_height: np.ndarray) -> Photograph:
-    """What was read of one photograph."""
+    """Create one photograph of a survey."""
     longitude, latitude, height = longitude_latitude_height.tolist()
     position = Position(latitude, longitude, height, math.nan, math.nan, "mean sea level", "EXIF")
     size = (ZOOM * WIDTH, ZOOM * HEIGHT)
@@ -93,7 +93,7 @@ def photographed(
     noise_px: float,
     generator: np.random.Generator,
 ) -> pycolmap.Reconstruction:
-    """A model of those points that two photographs or more see."""
+    """Create a model of the points visible in two photographs or more."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     poses = [pycolmap.Rigid3d(np.c_[R.T, -R.T @ c]) for R, c in zip(rotations, centres, strict=True)]
@@ -119,7 +119,7 @@ def projected(camera: pycolmap.Camera, pose: pycolmap.Rigid3d, points: np.ndarra
 
 
 def with_control(flight: Flight, places: np.ndarray = CONTROL, marks_each: int = 4, noise_px: float = 0.3) -> Survey:
-    """The survey with control points G1, G2, ... marked in those photographs that they are nearest to the middle of.
+    """Add control points G1, G2, ..., each marked in the photographs whose centre is nearest to it.
 
     Args:
         noise_px: of the marks, in pixels of the model's images.
@@ -141,7 +141,7 @@ def with_control(flight: Flight, places: np.ndarray = CONTROL, marks_each: int =
 
 
 def in_a_frame_of_its_own(model: pycolmap.Reconstruction, seed: int = 0) -> pycolmap.Reconstruction:
-    """As structure from motion leaves it: turned, scaled and moved at will."""
+    """Transform a model by an arbitrary similarity, as structure from motion returns it."""
     generator = np.random.default_rng(seed)
     turned = pycolmap.Reconstruction(model)
     rotation = Rotation.random(rng=generator).as_matrix()

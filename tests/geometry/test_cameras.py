@@ -56,7 +56,7 @@ def test_the_projection_matrix_is_what_project_uses():
     torch.testing.assert_close((homogeneous[:, :2] / homogeneous[:, 2:]).transpose(1, 2), uv)
 
 
-def test_going_along_a_pixels_direction_for_a_depth_and_projecting_comes_back():
+def test_unprojecting_to_a_depth_and_projecting_is_the_identity():
     own = cameras()
     generator = torch.Generator().manual_seed(1)
     uv = 40 * torch.rand(3, 8, 2, generator=generator, dtype=torch.float64)
@@ -83,7 +83,7 @@ def test_the_principal_point_looks_forward_with_x_right_and_y_down():
     assert z.tolist() == [[2, 2, 2]]
 
 
-def test_points_behind_and_in_the_cameras_plane_are_told_by_z():
+def test_points_behind_and_in_the_cameras_plane_have_z_of_zero_or_less():
     own = cameras()[0]
     behind = own.position_world - 2 * own.forward_world
     uv, z = own.project(torch.cat([behind, own.position_world]))
@@ -92,7 +92,7 @@ def test_points_behind_and_in_the_cameras_plane_are_told_by_z():
     assert uv.isfinite().all()
 
 
-def test_a_resized_view_sees_the_same_at_scaled_pixels():
+def test_a_resized_camera_projects_to_scaled_pixels():
     own, points = cameras(), world_points()
     uv, z = own.project(points)
     small = own.resized(16, 24)
@@ -102,14 +102,14 @@ def test_a_resized_view_sees_the_same_at_scaled_pixels():
     torch.testing.assert_close(same, z)
 
 
-def test_a_cropped_view_keeps_its_pixels():
+def test_a_cropped_camera_keeps_its_pixels():
     own, points = cameras(), world_points()
     cut = own.cropped(20, 70)
     assert (cut.size_px == torch.tensor([20, 70])).all()
     torch.testing.assert_close(cut.project(points), own.project(points))
 
 
-def test_indexing_gives_batches_in_the_order_asked_for():
+def test_indexing_keeps_the_order_of_the_indices():
     own = cameras()
     assert len(own) == 3
     assert len(own[1]) == 1

@@ -4,7 +4,14 @@ import pycolmap
 import pytest
 
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import Lens, lens_from_colmap, rectify
+from tidefield.geometry.lenses import (
+    COLMAP_MODELS,
+    COLMAP_PARAMETERS,
+    Lens,
+    colmap_parameters,
+    lens_from_colmap,
+    rectify,
+)
 
 CAMERAS = {
     "SIMPLE_PINHOLE": [210.0, 160.5, 119.0],
@@ -53,7 +60,7 @@ def test_pixels_come_back_from_their_rays_and_agree_with_colmap(model: str) -> N
     np.testing.assert_allclose(xy, colmap(model).cam_from_img(uv), atol=1e-7)
 
 
-def test_the_sixth_order_term_is_opencvs() -> None:
+def test_the_sixth_order_term_is_that_of_opencv() -> None:
     own = Lens(320, 240, 200.0, 200.0, 160.0, 120.0, k1=0.1, k2=-0.05, p1=0.002, p2=0.001, k3=0.03)
     xyz = np.random.default_rng(2).uniform((-0.7, -0.7, 1), (0.7, 0.7, 1), (50, 3))
     matrix = np.array([[200.0, 0, 160], [0, 200, 120], [0, 0, 1]])
@@ -62,12 +69,12 @@ def test_the_sixth_order_term_is_opencvs() -> None:
 
 
 @pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"])
-def test_other_camera_models_are_refused_with_a_way_out(model: str) -> None:
+def test_other_camera_models_are_refused(model: str) -> None:
     with pytest.raises(SceneError, match=rf"{model}.*RADIAL.*image_undistorter"):
         lens_from_colmap(model, 320, 240, [1.0] * 8)
 
 
-def test_colmaps_full_model_is_read_up_to_its_sixth_order() -> None:
+def test_full_opencv_is_read_if_its_rational_terms_are_zero() -> None:
     parameters = [200.0, 201.0, 160.0, 120.0, 0.1, -0.05, 0.002, 0.001, 0.03, 0.0, 0.0, 0.0]
     own = lens_from_colmap("FULL_OPENCV", 320, 240, parameters)
     camera = pycolmap.Camera(model="FULL_OPENCV", width=320, height=240, params=parameters)
@@ -94,7 +101,7 @@ def test_pixels_beyond_the_fold_of_a_lens_have_no_ray() -> None:
 
 
 @pytest.mark.parametrize("distorted", [*map(lens, DISTORTED), Lens(800, 600, 400.0, 400.0, 400.0, 300.0, k1=-0.3)])
-def test_the_pinhole_sees_only_what_the_photograph_shows_and_reaches_its_border(distorted: Lens) -> None:
+def test_the_pinhole_lies_inside_the_photograph_and_reaches_its_border(distorted: Lens) -> None:
     pinhole = distorted.pinhole()
     u, v = np.meshgrid(np.linspace(0, pinhole.width, 161), np.linspace(0, pinhole.height, 121))
     grid = np.stack([u, v], axis=-1).reshape(-1, 2)
@@ -109,7 +116,7 @@ def test_the_pinhole_sees_only_what_the_photograph_shows_and_reaches_its_border(
 
 @pytest.mark.parametrize("model", DISTORTED)
 @pytest.mark.parametrize("reduction", [1, 2])
-def test_dots_end_up_where_the_pinhole_projects_them(model: str, reduction: int) -> None:
+def test_rectified_dots_lie_where_the_pinhole_projects_them(model: str, reduction: int) -> None:
     distorted, pinhole = lens(model), lens(model).pinhole()
     u, v = np.meshgrid(np.linspace(20, 300, 8), np.linspace(20, 220, 6))
     rays = np.c_[pinhole.unproject(np.stack([u, v], axis=-1).reshape(-1, 2)), np.ones(48)]
@@ -122,19 +129,19 @@ def test_dots_end_up_where_the_pinhole_projects_them(model: str, reduction: int)
 
 
 @pytest.mark.parametrize("model", DISTORTED)
-def test_undistorted_photographs_have_no_blank_pixels(model: str) -> None:
+def test_rectified_photographs_have_no_blank_pixels(model: str) -> None:
     white = np.full((240, 320, 3), 255, np.uint8)
     assert (rectify(white, lens(model), 320, 240) == 255).all()
     assert (rectify(white, lens(model), 100, 75) == 255).all()
 
 
-def test_a_photograph_without_distortion_passes_untouched() -> None:
+def test_a_photograph_without_distortion_is_unchanged() -> None:
     photograph = np.random.default_rng(3).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     assert (rectify(photograph, lens("PINHOLE"), 320, 240) == photograph).all()
     assert lens("PINHOLE").pinhole() == lens("PINHOLE")
 
 
-def test_reduction_is_the_mean_of_the_pixels_that_are_covered() -> None:
+def test_reduction_is_the_mean_of_the_covered_pixels() -> None:
     photograph = np.random.default_rng(4).integers(0, 256, (240, 320, 4), dtype=np.uint8)
     means = photograph.reshape(60, 4, 80, 4, 4).astype(float).mean(axis=(1, 3))
     assert np.abs(rectify(photograph, lens("PINHOLE"), 80, 60) - means).max() <= 0.5
@@ -143,3 +150,24 @@ def test_reduction_is_the_mean_of_the_pixels_that_are_covered() -> None:
 def test_a_resized_lens_projects_to_resized_pixels() -> None:
     xyz = np.array([[0.2, -0.3, 1.0]])
     np.testing.assert_allclose(lens("OPENCV").resized(160, 60).project(xyz), lens("OPENCV").project(xyz) * (0.5, 0.25))
+
+
+def test_the_table_of_camera_models_is_colmaps() -> None:
+    """The smallest pycolmap that is promised lacks the last models."""
+    for number, model in enumerate(COLMAP_MODELS):
+        if model in pycolmap.CameraModelId.__members__:
+            assert int(pycolmap.CameraModelId.__members__[model]) == number
+    for model, names in COLMAP_PARAMETERS.items():
+        camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 320, 240)
+        names = ["k" if (model, name) == ("SIMPLE_RADIAL", "k1") else name for name in names]
+        assert camera.params_info.split(", ") == names
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_parameters_come_back_in_colmaps_order(model: str) -> None:
+    assert colmap_parameters(lens(model), model) == CAMERAS[model]
+
+
+def test_parameters_of_a_simpler_model_drop_terms_and_average_the_focal_lengths() -> None:
+    assert colmap_parameters(lens("OPENCV"), "RADIAL") == [215.0, 163.0, 116.0, -0.2, 0.05]
+    assert colmap_parameters(lens("RADIAL"), "FULL_OPENCV") == [280.0, 280.0, 160.0, 120.0, -0.32, 0.15] + [0.0] * 6

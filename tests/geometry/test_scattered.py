@@ -1,4 +1,4 @@
-"""Values between scattered points."""
+"""Interpolation between scattered points, compared with scipy's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Similarities: exact ones are found exactly, wrong points are outvoted, what points cannot hold is held or told."""
+"""Similarities: exact data, gross errors, weights, and rotations that the points do not determine."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from tidefield.geometry.similarity import (
     Similarity,
-    fit_similarity,
     hypotheses,
     least_median,
     level,
@@ -21,7 +20,7 @@ DOWN = TRUTH.rotation.T @ [0.0, 0, -1]
 
 
 def cameras(count: int = 20, across: float = 1.0, seed: int = 0) -> np.ndarray:
-    """In a model's units: flat, and as wide across as is wanted."""
+    """Points in a model's units: nearly flat, with a given half width."""
     return np.random.default_rng(seed).uniform(-1, 1, (count, 3)) * (2, across, 0.02) @ TRUTH.rotation
 
 
@@ -29,7 +28,7 @@ def assert_same(found: Similarity, expected: Similarity, points: np.ndarray, wit
     np.testing.assert_allclose(found(points), expected(points), atol=within)
 
 
-def test_a_similarity_and_its_inverse_undo_each_other_and_follow_one_another():
+def test_inverse_and_composition():
     points = cameras()
     np.testing.assert_allclose(TRUTH.inverse()(TRUTH(points)), points, atol=1e-12)
     other = Similarity(0.5, level(np.array([1.0, 2, 3])), np.array([1.0, 2, 3]))
@@ -39,17 +38,27 @@ def test_a_similarity_and_its_inverse_undo_each_other_and_follow_one_another():
 
 
 def test_exact_points_give_the_exact_similarity():
-    assert_same(fit_similarity(cameras(), TRUTH(cameras())), TRUTH, cameras())
+    for found in hypotheses(cameras(3), TRUTH(cameras(3)), None, np.random.default_rng(0)):
+        assert_same(found, TRUTH, cameras(), 1e-6)
 
 
-def test_a_mirror_image_gets_a_rotation_all_the_same():
-    points = cameras(across=1.5)
-    found = fit_similarity(points, TRUTH(points) * [1, 1, -1])
-    assert np.linalg.det(found.rotation) == pytest.approx(1)
+def test_mirrored_points_give_rotations():
+    points = cameras(5, across=1.5)
+    found = hypotheses(points, TRUTH(points) * [1, 1, -1], None, np.random.default_rng(0))
+    assert len(found) == 10
+    assert [np.linalg.det(one.rotation) for one in found] == pytest.approx([1] * 10)
+
+
+def test_coincident_points_give_finite_similarities():
+    points = cameras(6)
+    points[:3] = points[0]
+    found = hypotheses(points, TRUTH(points), DOWN, np.random.default_rng(0))
+    assert len(found) == 20 + 15
+    assert all(np.isfinite(one(points)).all() for one in found)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.45])
-def test_wrong_points_are_outvoted(share):
+def test_up_to_half_of_the_points_may_be_wrong(share):
     points = cameras(40)
     wrong = np.arange(40) < 40 * share
     target = TRUTH(points) + wrong[:, None] * np.random.default_rng(1).normal(0, 1e5, (40, 3))
@@ -59,31 +68,31 @@ def test_wrong_points_are_outvoted(share):
     np.testing.assert_array_equal(outliers(np.linalg.norm(found(points) - target, axis=1), 15.0), wrong)
 
 
-def test_points_on_a_line_are_enough_where_down_is_known():
+def test_collinear_points_suffice_if_down_is_given():
     points = cameras(12, across=0.0)
     points -= np.outer((points - points.mean(0)) @ DOWN, DOWN)
-    among = hypotheses(points, TRUTH(points), DOWN, np.random.default_rng(0))
-    found, _ = least_median(among, points, TRUTH(points))
+    candidates = hypotheses(points, TRUTH(points), DOWN, np.random.default_rng(0))
+    found, _ = least_median(candidates, points, TRUTH(points))
     assert_same(found, TRUTH, cameras(), 1e-6)
 
 
-def test_points_on_a_line_tell_nothing_without_down():
+def test_collinear_points_give_no_hypothesis_without_down():
     points = np.outer(np.arange(5.0), [1.0, 2, 3])
     assert hypotheses(points, TRUTH(points), None, np.random.default_rng(0)) == []
 
 
-def test_weights_make_the_better_positions_count():
+def test_accurate_points_have_more_weight():
     points = cameras(60)
     generator = np.random.default_rng(3)
     sigma = np.where(np.arange(60)[:, None] < 6, 0.02, 5.0) * np.ones((60, 3))
     target = TRUTH(points) + generator.normal(0, 1, (60, 3)) * sigma
-    even = refine_similarity(TRUTH, points, target, np.ones((60, 3))).similarity
-    weighed = refine_similarity(TRUTH, points, target, sigma).similarity
-    off = [np.linalg.norm(found(points) - TRUTH(points), axis=1).mean() for found in (even, weighed)]
+    unweighted = refine_similarity(TRUTH, points, target, np.ones((60, 3))).similarity
+    weighted = refine_similarity(TRUTH, points, target, sigma).similarity
+    off = [np.linalg.norm(found(points) - TRUTH(points), axis=1).mean() for found in (unweighted, weighted)]
     assert off[1] < 0.05 < off[0]
 
 
-def test_the_tilt_that_positions_leave_open_is_as_large_as_it_is_said_to_be():
+def test_the_estimated_tilt_error_is_the_observed_one():
     points, tilts = cameras(30, across=0.15), []
     for seed in range(200):
         target = TRUTH(points) + np.random.default_rng(seed).normal(0, 1.5, (30, 3))
@@ -92,7 +101,7 @@ def test_the_tilt_that_positions_leave_open_is_as_large_as_it_is_said_to_be():
     assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(found.tilt_rad, rel=0.35)
 
 
-def test_a_vertical_that_is_held_stays_within_what_it_is_known_to():
+def test_a_prior_vertical_is_kept_within_its_standard_deviation():
     points = cameras(12, across=0.0)
     target = TRUTH(points) + np.random.default_rng(0).normal(0, 1, (12, 3))
     free = refine_similarity(TRUTH, points, target, np.ones((12, 3)))
@@ -103,7 +112,7 @@ def test_a_vertical_that_is_held_stays_within_what_it_is_known_to():
 
 
 @pytest.mark.parametrize("down", [[0.0, 0, -1], [0.0, 0, 1], [3.0, -1, 0.2]])
-def test_levelling_brings_down_down(down):
+def test_levelling_rotates_down_to_minus_z(down):
     rotation = level(np.array(down))
     np.testing.assert_allclose(rotation @ np.array(down) / np.linalg.norm(down), [0, 0, -1], atol=1e-9)
     assert np.linalg.det(rotation) == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Models laid onto the Earth by the positions of their cameras, right and wrong ones."""
+"""GPS alignment and the adjustment to differential positions, with right and wrong positions."""
 
 import math
 from dataclasses import replace
@@ -9,8 +9,8 @@ import pytest
 from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
 
 from tidefield.errors import SurveyError
-from tidefield.survey.georeference.alignment import camera_centres, find_down
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.georeference.gps_alignment import camera_centres, find_down
 from tidefield.survey.survey import Survey
 
 
@@ -19,13 +19,13 @@ def quiet(done: int, whole: int) -> None:
 
 
 def located(flight, survey: Survey | None = None):
-    """A copy of the flight's model in a frame of its own, laid onto the Earth, and what is said of it."""
+    """Georeference a copy of the flight's model that starts in an arbitrary frame."""
     model = in_a_frame_of_its_own(flight.model)
     return model, georeference(model, survey or flight.survey, quiet)
 
 
 def moved(survey: Survey, changes: dict[str, dict]) -> Survey:
-    """The survey with some of its photographs' positions changed; None for no position."""
+    """Change the positions of some photographs; None removes one."""
     photographs = [
         replace(p, position=changes[p.name] and replace(p.position, **changes[p.name])) if p.name in changes else p
         for p in survey.photographs
@@ -38,7 +38,7 @@ def all_moved(survey: Survey, change) -> Survey:
 
 
 def off_m(flight, model, frame) -> np.ndarray:
-    """How far the cameras lie from the truth, by way of longitude and latitude."""
+    """Compute the errors of the camera positions by way of longitude and latitude."""
     centres = camera_centres(model)
     names = sorted(centres)
     truth = frame.from_geographic(FRAME.to_geographic(flight.centres_world))
@@ -46,7 +46,7 @@ def off_m(flight, model, frame) -> np.ndarray:
     return np.array([centres[name] for name in names]) - truth[order]
 
 
-def test_exact_positions_place_the_model_exactly():
+def test_exact_positions_give_an_exact_model():
     flight = fly(noise_px=0.0)
     model, found = located(flight)
     assert found.source == "GPS"
@@ -60,7 +60,7 @@ def test_exact_positions_place_the_model_exactly():
     assert abs(np.median([point.xyz[2] for point in model.points3D.values()])) < 1.0, "the origin is on the ground"
 
 
-def test_noisy_positions_place_the_model_better_than_any_of_them():
+def test_noise_of_positions_averages_out():
     flight = fly(lines=4, each=8, position_m=2.0)
     model, found = located(flight)
     off = off_m(flight, model, found.frame)
@@ -70,7 +70,7 @@ def test_noisy_positions_place_the_model_better_than_any_of_them():
 
 
 @pytest.mark.parametrize("degrees", [1.0, 0.0005])
-def test_one_position_that_is_far_off_is_named_and_not_used(degrees):
+def test_a_gross_error_is_reported_and_not_used(degrees):
     flight = fly(position_m=1.0)
     name = name_of(7)
     survey = moved(flight.survey, {name: {"latitude_deg": 54.51 + degrees}})
@@ -92,7 +92,7 @@ def test_a_third_of_the_positions_may_be_wrong():
     assert np.abs(off_m(flight, model, found.frame)).max() < 3.0
 
 
-def test_what_receivers_state_decides_which_positions_count():
+def test_stated_accuracy_is_the_weight_of_a_position():
     flight = fly(lines=3, each=6, position_m=0.01)
     generator = np.random.default_rng(5)
     states = {}
@@ -104,7 +104,7 @@ def test_what_receivers_state_decides_which_positions_count():
     assert np.abs(off_m(flight, model, found.frame)).max() < 0.1
 
 
-def test_a_single_line_of_flight_is_kept_upright_by_its_photographs():
+def test_a_single_strip_is_levelled_by_its_photographs():
     flight = fly(lines=1, each=12, position_m=1.0)
     model, found = located(flight)
     assert any("vertical" in note and "mean viewing direction" in note for note in found.notes)
@@ -113,7 +113,7 @@ def test_a_single_line_of_flight_is_kept_upright_by_its_photographs():
     assert np.abs(off_m(flight, model, found.frame)).max() < 4.0
 
 
-def test_a_single_line_of_flight_is_kept_upright_by_its_gimbal_where_there_is_one():
+def test_a_single_strip_is_levelled_by_gimbal_angles_if_given():
     flight = fly(lines=1, each=12, position_m=1.0)
     gimbals = []
     for i, each in enumerate(flight.survey.photographs):
@@ -128,7 +128,7 @@ def test_a_single_line_of_flight_is_kept_upright_by_its_gimbal_where_there_is_on
     assert np.abs(down[:, 2] - truth[:, 2]).max() < 0.01
 
 
-def test_heights_that_are_missing_come_from_above_take_off_or_from_level_flight():
+def test_missing_heights_are_relative_altitudes_or_level_flight():
     flight = fly(lines=3, each=6, position_m=0.5)
     without = all_moved(flight.survey, lambda position: {"height_m": math.nan})
     model, found = located(flight, without)
@@ -144,7 +144,7 @@ def test_heights_that_are_missing_come_from_above_take_off_or_from_level_flight(
 
 
 @pytest.mark.parametrize("left", [0, 2])
-def test_without_positions_the_model_is_upright_and_says_that_it_is_nowhere(left):
+def test_without_positions_the_model_is_only_levelled(left):
     flight = fly()
     survey = moved(flight.survey, {name_of(i): None for i in range(left, 15)})
     model, found = located(flight, survey)
@@ -156,7 +156,7 @@ def test_without_positions_the_model_is_upright_and_says_that_it_is_nowhere(left
     assert np.abs(np.median([point.xyz for point in model.points3D.values()], axis=0)).max() < 0.5
 
 
-def test_positions_that_are_all_the_same_place_nothing():
+def test_identical_positions_give_no_georeference():
     flight = fly()
     _, found = located(flight, all_moved(flight.survey, lambda p: {"latitude_deg": 54.5, "longitude_deg": -2.75}))
     assert found.source == "none"
@@ -171,13 +171,13 @@ def test_positions_that_are_all_the_same_place_nothing():
         (lambda p: {"latitude_deg": -p.latitude_deg}, "sign of one of the two"),
     ],
 )
-def test_positions_that_mirror_the_survey_are_an_error_that_says_how(change, words):
+def test_mirrored_positions_are_an_error_that_names_the_mistake(change, words):
     flight = fly(lines=4, position_m=1.0)
     with pytest.raises(SurveyError, match=words):
         located(flight, all_moved(flight.survey, change))
 
 
-def test_positions_on_both_sides_of_the_date_line_are_next_to_each_other():
+def test_positions_across_the_date_line():
     flight = fly(noise_px=0.0)
     east = 180.0 - flight.survey.photographs[7].position.longitude_deg
     survey = all_moved(
@@ -190,7 +190,7 @@ def test_positions_on_both_sides_of_the_date_line_are_next_to_each_other():
     assert found.gps.horizontal_rms_m < 0.05
 
 
-def test_zeros_are_no_positions():
+def test_positions_at_zero_are_left_out():
     flight = fly(noise_px=0.0)
     survey = moved(flight.survey, {name_of(3): {"latitude_deg": 0.0, "longitude_deg": 0.0}})
     _, found = located(flight, survey)
@@ -204,7 +204,7 @@ def differential(survey: Survey) -> Survey:
 
 @pytest.fixture(scope="module")
 def bowl():
-    """A survey that was reconstructed with the wrong distortion, and is bent; its positions are good to 2 cm."""
+    """A survey bent by the wrong lens distortion, with positions accurate to 2 cm."""
     lens = [FOCAL, FOCAL, WIDTH / 2 - 4, HEIGHT / 2 + 6, -0.03, 0.01, 0.002, -0.001]
     camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=lens, camera_id=1)
     true = fly(lines=4, each=7, position_m=0.015, camera=camera)
@@ -223,7 +223,7 @@ def ground_off_m(truth, model, frame) -> np.ndarray:
     return np.array([model.points3D[k].xyz for k in numbers]) - there
 
 
-def test_differential_positions_take_out_the_bend_that_others_leave(bowl):
+def test_differential_positions_remove_the_bend(bowl):
     flight, truth = bowl
     model, found = located(flight)
     bent = ground_off_m(truth, model, found.frame)
@@ -234,10 +234,10 @@ def test_differential_positions_take_out_the_bend_that_others_leave(bowl):
     assert found.gps.horizontal_rms_m < 0.05
     assert np.median(np.abs(straight[:, 2])) < 0.15
     assert np.median(np.abs(straight[:, 2])) < 0.4 * np.median(np.abs(bent[:, 2]))
-    assert model.cameras[1].params[0] == pytest.approx(FOCAL), "positions at one height do not tell it"
+    assert model.cameras[1].params[0] == pytest.approx(FOCAL), "positions at one height do not determine it"
 
 
-def test_a_differential_position_that_is_worse_than_it_states_is_not_followed(bowl):
+def test_a_differential_position_worse_than_stated_is_rejected(bowl):
     flight, _ = bowl
     survey = differential(flight.survey)
     place = next(p.position for p in survey.photographs if p.name == name_of(9))
@@ -248,7 +248,7 @@ def test_a_differential_position_that_is_worse_than_it_states_is_not_followed(bo
     assert np.abs(found.gps.error_m[others]).max() < 0.1
 
 
-def test_differential_positions_help_where_there_is_control_too(bowl):
+def test_differential_positions_and_ground_control_combine(bowl):
     flight, truth = bowl
     survey = replace(
         differential(flight.survey), control=with_control(replace(flight, model=truth), CONTROL[:3]).control

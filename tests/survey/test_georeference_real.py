@@ -1,6 +1,6 @@
-"""Real surveys, over the models of their photographs at half size: what GPS and ground control say of them.
+"""Georeferences of real surveys, from models of their photographs at half size.
 
-The surveyors' list of swindale holds one point that contradicts its own three marks and all other points.
+The surveyors' list of swindale has one point that contradicts its own three marks and all other points.
 """
 
 from dataclasses import replace
@@ -32,7 +32,7 @@ def located(name: str, control: bool = True) -> tuple[pycolmap.Reconstruction, G
     ("name", "epsg", "horizontal_m", "vertical_m"),
     [("brighton_beach", 32615, 0.56, 0.15), ("swindale", 32630, 1.9, 2.2)],
 )
-def test_gps_is_met_to_its_own_noise(name, epsg, horizontal_m, vertical_m):
+def test_gps_residuals_are_the_receivers_noise(name, epsg, horizontal_m, vertical_m):
     _, found = located(name, control=False)
     assert found.source == "GPS"
     assert found.frame is not None
@@ -42,7 +42,7 @@ def test_gps_is_met_to_its_own_noise(name, epsg, horizontal_m, vertical_m):
     assert found.left_out == found.notes == ()
 
 
-def test_differential_gps_takes_the_bend_out_of_turin_lot():
+def test_differential_gps_removes_the_bend_of_turin_lot():
     model, found = located("turin_lot")
     assert "instead of 11 cm horizontally and 31 cm vertically" in found.notes[0]
     assert found.gps.horizontal_rms_m < 0.03
@@ -51,7 +51,7 @@ def test_differential_gps_takes_the_bend_out_of_turin_lot():
     assert max(down) < -0.9998, "all gimbals said -89.9 degrees or more"
 
 
-def test_control_brings_swindale_to_decimetres_and_finds_the_point_that_is_wrong():
+def test_control_of_swindale_is_met_to_decimetres_without_the_wrong_point():
     _, found = located("swindale")
     assert found.source == "ground control"
     assert [(item.kind, item.name) for item in found.left_out] == [("control point", "StkdT_12379")]

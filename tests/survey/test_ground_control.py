@@ -1,4 +1,4 @@
-"""Models laid onto ground control and adjusted to it; what is wrong with the control is found and named."""
+"""Alignment with and adjustment to ground control, and the rejection of wrong marks and points."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
 
 from tidefield.errors import SurveyError
-from tidefield.survey.georeference.adjustment import reliable
+from tidefield.survey.georeference.bundle_adjustment import reliable
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.survey import Control, Survey
 
@@ -27,21 +27,21 @@ def without_positions(survey: Survey) -> Survey:
 
 
 def with_marks(survey: Survey, change) -> Survey:
-    """The survey with each mark replaced by what `change` makes of it; None takes it away."""
+    """Replace each mark by `change(mark)`; None removes it."""
     assert survey.control is not None
     marks = [changed for mark in survey.control.marks if (changed := change(mark)) is not None]
     return replace(survey, control=replace(survey.control, marks=tuple(marks)))
 
 
 def only_marks(survey: Survey, point: str, count: int) -> Survey:
-    """The survey with only the first few marks of a point."""
+    """Keep only the first few marks of a point."""
     assert survey.control is not None
     kept = [mark for mark in survey.control.marks if mark.point == point][:count]
     return with_marks(survey, lambda mark: mark if mark.point != point or mark in kept else None)
 
 
 def off_m(flight, model, found) -> np.ndarray:
-    """Errors of the sparse points that the photographs were adjusted to nothing but each other at."""
+    """Compute the errors of the sparse points."""
     truth = np.array([flight.model.points3D[k].xyz for k in sorted(flight.model.points3D)])
     there = found.frame.from_crs(FRAME.to_crs(truth))
     return np.array([model.points3D[k].xyz for k in sorted(model.points3D)]) - there
@@ -70,7 +70,7 @@ def bent():
 
 
 @pytest.mark.parametrize("positions", [True, False])
-def test_the_model_meets_the_control_whether_or_not_there_are_positions(flight, positions):
+def test_the_model_meets_the_control_with_and_without_positions(flight, positions):
     survey = with_control(flight)
     model, found = located(flight, survey if positions else without_positions(survey))
     assert found.source == "ground control"
@@ -86,7 +86,7 @@ def test_the_model_meets_the_control_whether_or_not_there_are_positions(flight, 
     assert len(found.gps.names) == (15 if positions else 0)
 
 
-def test_the_points_of_the_control_do_not_stay_in_the_model(flight):
+def test_control_points_are_not_added_to_the_model(flight):
     model, _ = located(flight, with_control(flight))
     assert model.num_points3D() == flight.model.num_points3D()
     for number in flight.model.reg_image_ids():
@@ -94,7 +94,7 @@ def test_the_points_of_the_control_do_not_stay_in_the_model(flight):
     assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
 
 
-def test_a_shift_that_all_positions_share_is_told_and_does_no_harm(flight):
+def test_a_common_shift_of_all_positions_is_reported_and_ignored(flight):
     lifted = tuple(
         replace(p, position=replace(p.position, height_m=p.position.height_m + 48)) for p in flight.survey.photographs
     )
@@ -106,7 +106,7 @@ def test_a_shift_that_all_positions_share_is_told_and_does_no_harm(flight):
 
 @pytest.mark.parametrize("marks", [2, 3, 4])
 @pytest.mark.parametrize("positions", [True, False])
-def test_a_mark_that_is_moved_by_200_pixels_is_found_named_and_left_out(flight, marks, positions):
+def test_a_mark_moved_by_200_pixels_is_rejected(flight, marks, positions):
     survey = only_marks(with_control(flight), "G3", marks)
     if not positions:
         survey = without_positions(survey)
@@ -120,7 +120,7 @@ def test_a_mark_that_is_moved_by_200_pixels_is_found_named_and_left_out(flight, 
     assert ("G3" in found.check.names) == (marks > 2)
 
 
-def test_a_point_that_was_surveyed_wrongly_is_found_named_and_left_out(flight):
+def test_a_wrongly_surveyed_point_is_rejected(flight):
     survey = with_control(flight)
     assert survey.control is not None
     east, north, up = survey.control.points["G2"]
@@ -133,7 +133,7 @@ def test_a_point_that_was_surveyed_wrongly_is_found_named_and_left_out(flight):
     assert np.abs(off_m(flight, model, found)).max() < 1.0
 
 
-def test_a_point_that_is_half_a_metre_off_is_told_from_the_others_by_leaving_it_out():
+def test_a_point_half_a_metre_off_is_rejected_by_cross_validation():
     flight = fly(lines=4, each=6, position_m=2.0)
     survey = with_control(flight, np.r_[CONTROL, [[-15, -35], [15, 38]]])
     assert survey.control is not None
@@ -143,7 +143,7 @@ def test_a_point_that_is_half_a_metre_off_is_told_from_the_others_by_leaving_it_
     assert [(item.kind, item.name) for item in found.left_out] == [("control point", "G5")]
 
 
-def test_a_point_one_of_whose_three_marks_agrees_by_chance_is_left_out_whole(flight):
+def test_a_point_with_one_of_three_marks_agreeing_by_chance_is_rejected(flight):
     survey = only_marks(with_control(flight), "G6", 3)
     assert survey.control is not None
     one, *others = [mark for mark in survey.control.marks if mark.point == "G6"]
@@ -155,7 +155,7 @@ def test_a_point_one_of_whose_three_marks_agrees_by_chance_is_left_out_whole(fli
     assert "G6" not in found.control.names
 
 
-def test_matches_that_fit_far_worse_than_most_are_not_adjusted_to(flight):
+def test_mismatches_are_removed_before_the_adjustment(flight):
     model = pycolmap.Reconstruction(flight.model)
     wrong = {}
     for number in sorted(model.point3D_ids())[::15]:
@@ -174,14 +174,14 @@ def seen_by(model: pycolmap.Reconstruction, number: int) -> set[int]:
     return {element.image_id for element in model.points3D[number].track.elements}
 
 
-def test_points_that_one_photograph_shows_are_used_and_said_not_to_be_checked(flight):
+def test_points_in_one_photograph_are_used_and_reported_as_unchecked(flight):
     survey = only_marks(only_marks(with_control(flight), "G1", 1), "G4", 1)
     _, found = located(flight, survey)
     assert found.check.names == ("G2", "G3", "G5", "G6", "G7", "G8")
     assert any("G1, G4" in note and "not checked" in note for note in found.notes)
 
 
-def test_control_takes_out_the_bend_that_a_wrong_lens_leaves(bent):
+def test_control_removes_the_bend_of_a_wrong_lens(bent):
     true, model, survey = bent
     turned = in_a_frame_of_its_own(model)
     found = georeference(turned, survey, quiet)
@@ -197,7 +197,7 @@ def test_control_takes_out_the_bend_that_a_wrong_lens_leaves(bent):
     assert np.sqrt((worse[:, 2] ** 2).mean()) > 3 * np.sqrt((off[:, 2] ** 2).mean())
 
 
-def test_two_points_move_what_the_positions_have_placed(flight):
+def test_two_points_shift_the_model_aligned_with_positions(flight):
     survey = with_control(flight, CONTROL[:2])
     model, found = located(flight, survey)
     assert found.control.names == ("G1", "G2")
@@ -207,12 +207,12 @@ def test_two_points_move_what_the_positions_have_placed(flight):
     assert found.control.horizontal_rms_m < 0.5
 
 
-def test_two_points_are_enough_without_positions_where_the_photographs_hold_the_vertical(flight):
+def test_two_points_suffice_with_the_vertical_of_the_photographs(flight):
     model, found = located(flight, without_positions(with_control(flight, CONTROL[:2])))
     assert np.linalg.norm(off_m(flight, model, found)[:, :2], axis=1).mean() < 5.0
 
 
-def test_points_on_one_line_do_not_turn_the_model_over(flight):
+def test_collinear_points_do_not_turn_the_model_over(flight):
     line = np.column_stack([np.linspace(-35, 35, 5), np.zeros(5)])
     model, found = located(flight, with_control(flight, line))
     assert np.abs(off_m(flight, model, found)).max() < 5.0
@@ -224,7 +224,7 @@ def test_one_point_without_positions_is_too_few(flight):
         located(flight, survey)
 
 
-def test_points_that_are_mixed_up_are_an_error(flight):
+def test_exchanged_point_names_are_an_error(flight):
     survey = with_control(flight)
     assert survey.control is not None
     names = sorted(survey.control.points)
@@ -233,7 +233,7 @@ def test_points_that_are_mixed_up_are_an_error(flight):
         located(flight, replace(survey, control=replace(survey.control, points=mixed)))
 
 
-def test_control_in_another_system_is_an_error_that_says_which(flight):
+def test_control_in_the_wrong_system_is_an_error(flight):
     survey = with_control(flight)
     assert survey.control is not None
     wrong = Control("EPSG:32630", survey.control.points, survey.control.marks)
@@ -241,7 +241,7 @@ def test_control_in_another_system_is_an_error_that_says_which(flight):
         located(flight, replace(survey, control=wrong))
 
 
-def test_marks_in_photographs_that_were_not_placed_are_named_and_the_rest_used(flight):
+def test_marks_in_photographs_without_a_pose_are_left_out(flight):
     survey = with_control(flight)
     astray = with_marks(survey, lambda m: replace(m, photograph="lost.jpg") if m.photograph == name_of(2) else m)
     _, found = located(flight, astray)

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
 
-from tidefield.survey.georeference.adjustment import adjustment_options
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options
 from tidefield.survey.sfm.mapping import MIN_SPREAD_DEG, TERMS, LensChoice, LensTrial, best_of, choose_lens, lens_notes
 from tidefield.survey.survey import LensPrior
 

@@ -16,7 +16,7 @@ from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError, SurveyError
 from tidefield.survey.findings import findings
-from tidefield.survey.georeference.alignment import camera_centres
+from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, PrepareOptions, prepare
 from tidefield.survey.report import write_report

@@ -1,4 +1,4 @@
-"""Pinhole cameras, many at once.
+"""Batches of pinhole cameras.
 
 Conventions (OpenCV): +x right, +y down, +z forward; pixel centres at +0.5, so an image of width W spans
 u in [0, W]. `T_world_camera` maps camera coordinates into the world. Lens distortion has been removed before
@@ -27,7 +27,7 @@ class Cameras:
         focal_px: (fx, fy).
         principal_px: (cx, cy), pixel centres at +0.5.
         size_px: (width, height).
-        near_far: nearest and farthest z-depth (along +z) at which this camera may meet the scene, world units.
+        near_far: nearest and farthest z-depth (along +z) of the scene for this camera, world units.
         gain: colour gain of the photograph, per channel, relative to the scene's common exposure; 1 where unknown.
             A photograph divided by its gain is at the common exposure (docs/method.md, section 12).
         names: of the photographs, to index by; empty where the cameras have none.
@@ -88,33 +88,33 @@ class Cameras:
 
     @property
     def projection(self) -> Float[Tensor, "V 3 4"]:
-        """P_i of the paper, K_i [R_i | t_i]: world points to homogeneous pixels; the third component is z-depth."""
+        """Projection matrices P_i = K_i [R_i | t_i] of the paper to homogeneous pixels and z-depth."""
         rotation = self.T_world_camera[:, :, :3].transpose(1, 2)
         view = torch.cat([rotation, -rotation @ self.position_world[:, :, None]], dim=2)
         depth = view[:, 2:]
         return torch.cat([self.focal_px[..., None] * view[:, :2] + self.principal_px[..., None] * depth, depth], dim=1)
 
     def project(self, points_world: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
-        """Pixels and z-depths of points in every camera.
+        """Project the same points with every camera: pixels and z-depths.
 
         Points at or behind a camera have z <= 0 and meaningless pixels: test z before using them.
         """
         return project(self, points_world.expand(len(self), -1, -1))
 
     def directions_world(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
-        """Ray directions through pixels, scaled so that one unit of ray is one unit of z-depth."""
+        """Compute ray directions through pixels, scaled to a z-depth of 1."""
         xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
         xyz = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return xyz @ self.T_world_camera[:, :, :3].transpose(1, 2)
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same views on a grid of width x height pixels."""
+        """Scale the images to width x height pixels."""
         size = self.size_px.new_tensor([width, height]).expand_as(self.size_px)
         ratio = size / self.size_px
         return replace(self, focal_px=self.focal_px * ratio, principal_px=self.principal_px * ratio, size_px=size)
 
     def cropped(self, width: int, height: int) -> Cameras:
-        """The same pixels, cut or continued at the right and the bottom."""
+        """Crop or extend the images at the right and the bottom."""
         return replace(self, size_px=self.size_px.new_tensor([width, height]).expand_as(self.size_px))
 
 
@@ -158,7 +158,7 @@ def project(
 
 
 def pixel_grid(width: int, height: int, device: torch.device | str | None = None) -> Float[Tensor, "P 2"]:
-    """Centres of all pixels of an image, row by row: (0.5, 0.5), (1.5, 0.5), ..."""
+    """List the centres of all pixels of an image, row by row: (0.5, 0.5), (1.5, 0.5), ..."""
     v, u = torch.meshgrid(
         torch.arange(height, device=device) + 0.5, torch.arange(width, device=device) + 0.5, indexing="ij"
     )

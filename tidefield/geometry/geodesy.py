@@ -1,16 +1,16 @@
-"""Local metres on the Earth: east-north-up at an origin, and the coordinate reference system that products use.
+"""Local east-north-up coordinates in metres, and their conversion to coordinate reference systems.
 
 World is a Cartesian frame, tangent to the ellipsoid at the origin, so that its distances are true distances. Those of a
 projected system are not: the British National Grid is 0.04% short in the north-west of England, and its north is not
-true north. A projected coordinate becomes a world coordinate by exact mathematics on the ellipsoid of that system's own
-datum (projection undone, geocentric, topocentric: EPSG guidance note 7-2, 4.1.1 and 4.1.2); no shift between datums,
-which may be wrong by metres, comes between surveyed coordinates and the world, nor between the world and products.
+true north. Projected coordinates are converted on the ellipsoid of that system's own datum (inverse projection,
+geocentric, topocentric: EPSG guidance note 7-2, 4.1.1 and 4.1.2). This is exact: no datum shift, which may be wrong by
+metres, lies between surveyed coordinates and the world, nor between the world and products.
 
-Heights are taken as they are given. One above the sea counts as if it were above the ellipsoid, the same both ways; a
-height h too small shrinks the world by h / 6,371,000: 8 millionths for the 50 m between sea level and the WGS 84
+Heights are used as given. A height above the sea is treated as one above the ellipsoid, in both directions; a height
+that is too small by h shrinks the world by h / 6,371,000: 8 millionths for the 50 m between sea level and the WGS 84
 ellipsoid in England.
 
-Longitude, easting and x come before latitude, northing and y, whatever order a system's definition has. All is float64.
+Longitude, easting and x come before latitude, northing and y, whatever a system's own axis order. All is float64.
 """
 
 from __future__ import annotations
@@ -26,17 +26,19 @@ from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 WGS84 = "EPSG:4326"
+EARTH_RADIUS_M = 6_371_000.0
+"""Mean radius, for distances on a sphere that may be wrong by half a per cent."""
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """East, north and up in metres from an origin on the ellipsoid of a datum, which is that of `crs`.
+    """A topocentric frame: east, north and up in metres from an origin, on the datum of `crs`.
 
     Attributes:
         longitude_deg, latitude_deg, height_m: the origin, on that datum and from its own prime meridian.
         crs: projected coordinate reference system of the products: "EPSG:27700", or WKT where it has no code.
-        vertical_datum: what heights count from, in words.
+        vertical_datum: zero of the heights, as text.
     """
 
     longitude_deg: float
@@ -47,16 +49,16 @@ class LocalFrame:
 
     @classmethod
     def at(cls, crs: str, origin: tuple[float, float, float], vertical_datum: str | None = None) -> LocalFrame:
-        """A frame with its origin at a coordinate of a projected or geographic system.
+        """Create a frame with its origin at a coordinate of a projected or geographic system.
 
         Args:
-            crs: as pyproj understands it. Products of a projected system stay in it; those of a geographic one use the
-                UTM zone of the origin, on the same datum where that exists and on WGS 84 otherwise.
+            crs: in any form that pyproj reads. A projected system is used for products too; for a geographic one
+                products use the UTM zone of the origin, on the same datum where that exists and on WGS 84 otherwise.
             origin: (easting, northing, height) or (longitude, latitude, height).
-            vertical_datum: None asks the system, which mostly does not know.
+            vertical_datum: None reads it from the system, if this defines one.
 
         Raises:
-            ValueError: for a system that is unknown, or neither projected nor geographic, or does not reach that far.
+            ValueError: the system is unknown, neither projected nor geographic, or undefined at the origin.
         """
         system = parse_crs(crs)
         products = system
@@ -64,10 +66,10 @@ class LocalFrame:
             degrees = np.rad2deg(_radians_per_unit(_base(system)))
             products = _utm(origin[0] * degrees, origin[1] * degrees, system)
         name = _name(products)
-        known = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
-        frame = cls(0.0, 0.0, 0.0, name, known)
+        heights = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
+        frame = cls(0.0, 0.0, 0.0, name, heights)
         longitude, latitude, height = frame._geodetic(_name(system), np.array([origin], dtype=np.float64))[0]
-        return cls(float(longitude), float(latitude), float(height), frame.crs, known)
+        return cls(float(longitude), float(latitude), float(height), frame.crs, heights)
 
     @property
     def epsg(self) -> int | None:
@@ -76,57 +78,45 @@ class LocalFrame:
 
     @property
     def geographic_crs(self) -> str:
-        """The geographic system whose ellipsoid the origin is on."""
+        """Geographic system of the origin."""
         return _name(self._datum)
 
     def from_system(self, crs: str, coordinates: Points) -> Points:
-        """World from (easting, northing, height) or (longitude, latitude, height) in any system.
+        """Convert (easting, northing, height) or (longitude, latitude, height) in any system to world.
 
-        Exact for systems on the frame's datum; from others, pyproj shifts between the datums as well as it can.
+        Exact for systems on the frame's datum; for others, as accurate as pyproj's datum shift.
 
         Raises:
-            ValueError: where the system is unknown or does not reach.
+            ValueError: the system is unknown, or undefined at these coordinates.
         """
         return self._transform(self._local, self._geodetic(crs, coordinates))
 
     def from_crs(self, easting_northing_height: Points) -> Points:
-        """World from coordinates in the frame's own projected system; exact."""
+        """Convert coordinates in the frame's own projected system to world; exact."""
         return self.from_system(self.crs, easting_northing_height)
 
     def to_crs(self, xyz_world: Points) -> Points:
-        """Easting, northing and height in the frame's projected system and its units; exact."""
+        """Convert world to easting, northing and height in the frame's projected system and its units; exact."""
         geodetic = self._transform(self._local, xyz_world, inverse=True)
         result = self._transform(self._projection, geodetic / self._degrees, inverse=True)
         result[:, 2] /= _metres_per_height(self._crs)
         return result
 
     def from_geographic(self, longitude_latitude_height: Points) -> Points:
-        """World from WGS 84 (GPS), degrees and metres."""
+        """Convert WGS 84 (GPS), degrees and metres, to world."""
         return self.from_system(WGS84, longitude_latitude_height)
 
     def to_geographic(self, xyz_world: Points) -> Points:
-        """Longitude, latitude (WGS 84) and height; as accurate as pyproj's shift from the frame's datum to WGS 84.
+        """Convert world to WGS 84 longitude and latitude, and height; as accurate as pyproj's datum shift.
 
-        Heights stay those of the frame.
+        Heights keep the frame's vertical datum.
         """
         projected = self.to_crs(xyz_world)
         height_m = projected[:, 2] * _metres_per_height(self._crs)
         return np.column_stack([self._transform(self._wgs84, projected)[:, :2], height_m])
 
-    def linear(self, lower_world: Float64[np.ndarray, " 3"], upper_world: Float64[np.ndarray, " 3"]) -> LinearFrame:
-        """The tangent of `to_crs` at the origin, with its largest error between two corners of the world."""
-        step_m = 10.0
-        steps = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))]) * step_m
-        there = self.to_crs(steps)
-        matrix = np.column_stack([(there[:3] - there[3:6]).T / (2 * step_m), there[6]])
-        axes = [np.linspace(low, high, 9) for low, high in zip(lower_world, upper_world, strict=True)]
-        box = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        unit_m = [_metres(self._base)] * 2 + [_metres_per_height(self._crs)]
-        error = (box @ matrix[:, :3].T + matrix[:, 3] - self.to_crs(box)) * unit_m
-        return LinearFrame(matrix, float(np.linalg.norm(error, axis=1).max()))
-
     def to_json(self) -> dict:
-        """What `from_json` reads, for a JSON file."""
+        """Return the values that `from_json` reads."""
         origin = {"longitude_deg": self.longitude_deg, "latitude_deg": self.latitude_deg, "height_m": self.height_m}
         return {
             "origin": origin,
@@ -138,7 +128,7 @@ class LocalFrame:
 
     @classmethod
     def from_json(cls, values: dict) -> LocalFrame:
-        """Raises: KeyError, TypeError or ValueError for what `to_json` did not make."""
+        """Read the values of `to_json`. Raises KeyError, TypeError or ValueError if they are incomplete or wrong."""
         origin = [float(values["origin"][key]) for key in ("longitude_deg", "latitude_deg", "height_m")]
         parse_crs(values["crs"])
         return cls(*origin, crs=str(values["crs"]), vertical_datum=str(values["vertical_datum"]))
@@ -154,7 +144,7 @@ class LocalFrame:
     @cached_property
     def _datum(self) -> CRS:
         geodetic = self._base.geodetic_crs
-        assert geodetic is not None, "parse_crs lets only systems with a datum pass"
+        assert geodetic is not None, "parse_crs accepts only systems with a datum"
         return geodetic.to_2d()
 
     @cached_property
@@ -173,7 +163,7 @@ class LocalFrame:
 
     @cached_property
     def _local(self) -> Transformer:
-        """Degrees and metres on the datum to the world."""
+        """Transformation from degrees and metres on the datum to world."""
         assert self._datum.ellipsoid is not None
         a, b = self._datum.ellipsoid.semi_major_metre, self._datum.ellipsoid.semi_minor_metre
         origin = f"+lon_0={self.longitude_deg!r} +lat_0={self.latitude_deg!r} +h_0={self.height_m!r}"
@@ -183,7 +173,7 @@ class LocalFrame:
         )
 
     def _geodetic(self, crs: str, coordinates: Points) -> Points:
-        """Degrees and metres on the frame's datum, of coordinates in any system."""
+        """Convert coordinates in any system to degrees and metres on the frame's datum."""
         system = parse_crs(crs)
         base = _base(system)
         datum = base.geodetic_crs
@@ -192,7 +182,7 @@ class LocalFrame:
             if base.is_projected:
                 points = self._transform(Transformer.from_crs(base, self._datum, always_xy=True), points)
         else:
-            # Through the projected system as it was given, because that may say itself how it lies to WGS 84.
+            # By way of the projected system as given, because its definition may hold its own shift to WGS 84.
             height_m = points[:, 2].copy()
             shift = Transformer.from_crs(_horizontal(system), _horizontal(self._crs), always_xy=True)
             points = self._transform(self._projection, self._transform(shift, points))
@@ -211,24 +201,11 @@ class LocalFrame:
         return result
 
 
-@dataclass(frozen=True)
-class LinearFrame:
-    """A straight approximation of `LocalFrame.to_crs`, for those who have no pyproj.
-
-    Attributes:
-        crs_from_world: (easting, northing, height) = matrix[:, :3] @ xyz_world + matrix[:, 3].
-        largest_error_m: over the extent that it was made for.
-    """
-
-    crs_from_world: Float64[np.ndarray, "3 4"]
-    largest_error_m: float
-
-
 def parse_crs(text: str) -> CRS:
-    """A projected or geographic coordinate reference system, with heights of its own or without.
+    """Parse a projected or geographic coordinate reference system, with or without a vertical one.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: the text is none.
     """
     try:
         crs = CRS.from_user_input(text)
@@ -240,8 +217,17 @@ def parse_crs(text: str) -> CRS:
     return crs
 
 
+def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
+    """Compute the length of a degree of longitude and of latitude on a sphere, within 0.7% of the ellipsoid's."""
+    north = float(np.deg2rad(EARTH_RADIUS_M))
+    return float(np.cos(np.deg2rad(latitude_deg))) * north, north
+
+
 def utm_zone(longitude_deg: float, latitude_deg: float) -> str:
-    """Number and hemisphere, such as "30N"; south-west Norway and Svalbard have wider zones than the rest."""
+    """Return the UTM zone's number and hemisphere, such as "30N".
+
+    pyproj's query_utm_crs_info does not know the wider zones of south-west Norway and Svalbard.
+    """
     zone = int((longitude_deg + 180) // 6) % 60 + 1
     if 56 <= latitude_deg < 64 and 3 <= longitude_deg < 12:
         zone = 32
@@ -251,7 +237,7 @@ def utm_zone(longitude_deg: float, latitude_deg: float) -> str:
 
 
 def _utm(longitude_deg: float, latitude_deg: float, geographic: CRS) -> CRS:
-    """The UTM zone of a place, on the datum of a geographic system where it is defined and on WGS 84 otherwise."""
+    """Find the UTM system of a place, on the datum of a geographic system if it exists there, else on WGS 84."""
     zone = utm_zone(longitude_deg, latitude_deg)
     datum = _base(geographic).name
     code = (32600 if zone.endswith("N") else 32700) + int(zone[:-1])
@@ -262,8 +248,8 @@ def _utm(longitude_deg: float, latitude_deg: float, geographic: CRS) -> CRS:
 
 
 def _name(crs: CRS) -> str:
-    """The shortest text that means exactly this system: its EPSG code, or WKT."""
-    # At 70 of 100 PROJ is sure that two systems are equivalent, though their names may differ.
+    """Return the shortest exact name of a system: its EPSG code, or WKT."""
+    # From a confidence of 70 of 100, PROJ calls two systems equivalent though their names may differ.
     code = None if crs.is_bound else crs.to_epsg(min_confidence=70)
     return crs.to_wkt() if code is None else f"EPSG:{code}"
 
@@ -273,7 +259,7 @@ def _horizontal(crs: CRS) -> CRS:
 
 
 def _base(crs: CRS) -> CRS:
-    """The horizontal system itself, without what it says of its way to WGS 84."""
+    """Return the horizontal system without a shift to WGS 84 that is bound to it."""
     horizontal = _horizontal(crs)
     return horizontal.source_crs if horizontal.is_bound and horizontal.source_crs is not None else horizontal
 
@@ -285,14 +271,10 @@ def _vertical_name(crs: CRS) -> str | None:
 
 
 def _metres_per_height(crs: CRS) -> float:
-    """Unit of the system's own heights; systems without heights are given them in metres."""
+    """Unit of the system's heights; metres where it defines none."""
     if crs.is_compound:
         return crs.sub_crs_list[1].axis_info[0].unit_conversion_factor
     return crs.axis_info[2].unit_conversion_factor if len(crs.axis_info) == 3 else 1.0
-
-
-def _metres(projected: CRS) -> float:
-    return projected.axis_info[0].unit_conversion_factor
 
 
 def _radians_per_unit(geographic: CRS) -> float:

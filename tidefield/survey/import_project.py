@@ -23,7 +23,7 @@ from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import Lens, colmap_parameters
 from tidefield.geometry.similarity import Similarity
 from tidefield.survey.export import write_transforms
 
@@ -136,12 +136,9 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
 
 def _camera(lens: Lens, number: int) -> pycolmap.Camera:
     """Make the simplest camera of COLMAP that has all of the lens's terms."""
-    kind, parameters = "PINHOLE", [lens.fx, lens.fy, lens.cx, lens.cy]
-    if lens.is_distorted:
-        kind, parameters = "OPENCV", [*parameters, lens.k1, lens.k2, lens.p1, lens.p2]
-    if lens.k3:
-        kind, parameters = "FULL_OPENCV", [*parameters, lens.k3, 0.0, 0.0, 0.0]
-    return pycolmap.Camera(camera_id=number, model=kind, width=lens.width, height=lens.height, params=parameters)
+    model = "FULL_OPENCV" if lens.k3 else "OPENCV" if lens.is_distorted else "PINHOLE"
+    parameters = colmap_parameters(lens, model)
+    return pycolmap.Camera(camera_id=number, model=model, width=lens.width, height=lens.height, params=parameters)
 
 
 def _unobserved(posed: PosedPhotographs) -> Observations:

@@ -19,31 +19,8 @@ from jaxtyping import Float64, Int, UInt8
 from tidefield.data.readers.files import bounded_bytes, inside, keep_present
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import Lens, lens_from_colmap
+from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, Lens, lens_from_colmap
 
-# Model number in cameras.bin -> name and number of parameters of the supported models; names of the others.
-_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    6: ("FULL_OPENCV", 12),
-}
-_OTHER_MODELS = {
-    5: "OPENCV_FISHEYE",
-    7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    14: "SIMPLE_FISHEYE",
-    15: "FISHEYE",
-    16: "EUCM",
-    17: "EQUIRECTANGULAR",
-}
 _NO_POINT = -1
 _Points = tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
@@ -176,10 +153,11 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     reader = _Reader(path)
     for _ in range(reader.count(24)):
         camera, model, width, height = reader.take("IiQQ")
-        if model not in _MODELS and model not in _OTHER_MODELS:
+        if not 0 <= model < len(COLMAP_MODELS):
             raise ValueError(f"it has a camera of the model number {model}, which COLMAP does not have")
-        name, parameters = _MODELS.get(model) or (_OTHER_MODELS[model], 0)
-        yield camera, lens_from_colmap(name, width, height, reader.take(f"{parameters}d"))
+        name = COLMAP_MODELS[model]
+        parameters = reader.take(f"{len(COLMAP_PARAMETERS.get(name, ()))}d")
+        yield camera, lens_from_colmap(name, width, height, parameters)
     reader.end()
 
 

@@ -1,1 +1,1 @@
-"""A model laid onto the Earth, by GPS or by ground control."""
+"""Georeferencing of models: GPS alignment, ground control and bundle adjustment."""

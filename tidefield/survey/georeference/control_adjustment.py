@@ -1,4 +1,9 @@
-"""A model in the world adjusted to ground control, with marks and points that are wrong found, named and left out."""
+"""Bundle adjustment to ground control, its cross-validation, and the rejection of wrong marks and points.
+
+A model that is only aligned with its control points keeps the bend of its own matches. Adjusted together with the
+matches, fixed control points remove the bend, and determine lens parameters that flat ground does not: a longer lens is
+equivalent to a higher flight, unless points lie at two heights or a bend shows the difference.
+"""
 
 from __future__ import annotations
 
@@ -11,25 +16,44 @@ from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import list_names
-from tidefield.survey.georeference.adjustment import Lens, adjust, carry_over, leave_one_out, reliable, seen_control
-from tidefield.survey.georeference.alignment import metres
-from tidefield.survey.georeference.ground_control import on_one_line
-from tidefield.survey.georeference.marks import Marks, reprojection_px, triangulate_points
+from tidefield.survey.georeference.bundle_adjustment import (
+    adjustment_options,
+    all_images,
+    carry_over,
+    generalise_lenses,
+    reliable,
+    thinned,
+)
+from tidefield.survey.georeference.gps_alignment import metres
+from tidefield.survey.georeference.ground_control import (
+    Marks,
+    are_collinear,
+    reprojection_px,
+    triangulate,
+    triangulate_points,
+)
 
+_REPEATS = 4
+"""Weight of a mark. A matched point is as precise as a mark, but its errors are correlated with its neighbours' (lens,
+shutter), which the sum of squares ignores; the weight compensates for that."""
 _MARK_TOLERANCE = 0.005
-"""Of an image's width. A mark farther than this from where an adjusted model shows its point is wrong, or, where others
-are as far, five robust standard deviations."""
+"""Of the image width. Marks with a larger reprojection error in an adjusted model are wrong, or, if others are as bad,
+those beyond five robust standard deviations."""
 _POINT_FACTOR = 5.0
+"""A point is wrong whose error, left out, is this many times the median of the others."""
 _WRONG_POINTS = 3
-"""More points than this are not refused for what the others say of them."""
+"""No more points than this are rejected by cross-validation."""
 _WORTH_FREEING = 0.9
-"""A lens is adjusted where that takes a tenth off the errors of the points that are left out."""
+"""The lens is adjusted if the errors of the points left out fall below this share."""
 _ROUNDS = 4
+_FOLDS = 12
+_FOLDS_OF_LARGE = 4
+_LARGE = 300  # photographs
 
 
 @dataclass(frozen=True)
 class ControlResult:
-    """What adjusting to ground control came to; see `Georeference`."""
+    """Results of an adjustment to ground control; see `Georeference`."""
 
     control: Residuals
     check: Residuals
@@ -43,76 +67,144 @@ def adjust_to_control(
     agree: Bool[np.ndarray, " M"],
     progress: Callable[[int, int], object],
 ) -> ControlResult:
-    """Adjust a model that has been laid onto ground control, in place.
+    """Adjust a model that is aligned with its control points, in place.
 
-    The lens is adjusted too if the points that are left out in turn are then met better. Marks come back when the
-    adjusted model agrees with them, and go when it does not.
+    The lens is adjusted too if this reduces the errors of the points that are left out in turn. Marks are added when
+    the adjusted model agrees with them, and removed when it does not.
 
     Args:
-        agree: the marks to begin with.
+        agree: the marks to start with.
     """
-    if on_one_line(_places(marks.where(agree))):
-        why = (
-            "Fewer than three control points can be used, or they lie on one line: the photographs were only laid onto"
+    if are_collinear(_coordinates(marks.where(agree))):
+        note = (
+            "Fewer than three control points can be used, or they lie on one line: the photographs were aligned with "
+            "them without adjustment, and cannot be checked."
         )
-        seen = seen_control(model, marks.where(agree))
-        return ControlResult(seen, Residuals(), _named(model, marks, agree), (f"{why} them, and cannot be checked.",))
+        seen = _control_residuals(model, marks.where(agree))
+        return ControlResult(seen, Residuals(), _rejected(model, marks, agree), (note,))
     refused: set[str] = set()
     sound = reliable(model)
     while True:
-        agree = _settled(sound, marks, agree, "held", refused)
-        lens, check = _better_lens(sound, marks.where(agree), progress)
+        agree = _consistent(sound, marks, agree, False, refused)
+        free_lens, check = _choose_lens(sound, marks.where(agree), progress)
         wrong = _worst(check, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
         if wrong is None or len(refused) == _WRONG_POINTS:
             break
         refused.add(wrong)
         agree = agree & ~marks.of(wrong)
-    settled = _settled(sound, marks, agree, lens, refused)
-    if (settled != agree).any():
-        agree, check = settled, leave_one_out(sound, marks.where(settled), lens, progress)
-    adjusted = adjust(sound, marks.where(agree), lens)
+    final = _consistent(sound, marks, agree, free_lens, refused)
+    if (final != agree).any():
+        agree, check = final, _cross_validate(sound, marks.where(final), free_lens, progress)
+    adjusted = _adjusted(sound, marks.where(agree), free_lens)
     result = ControlResult(
-        control=seen_control(adjusted, marks.where(agree)),
+        control=_control_residuals(adjusted, marks.where(agree)),
         check=check,
-        left_out=_named(adjusted, marks, agree),
-        notes=(*_lens_notes(model, adjusted, lens), *_unchecked(marks.where(agree), check)),
+        left_out=_rejected(adjusted, marks, agree),
+        notes=(*_lens_notes(model, adjusted, free_lens), *_unchecked(marks.where(agree), check)),
     )
     carry_over(adjusted, model)
     return result
 
 
-def _settled(
-    model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"], lens: Lens, refused: set[str]
+def _adjusted(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool) -> pycolmap.Reconstruction:
+    """Copy a model in the world and adjust it to its matches and to marks of fixed points.
+
+    Args:
+        free_lens: adjust focal length, principal point and distortion too, of COLMAP's OPENCV.
+    """
+    copy = pycolmap.Reconstruction(model)
+    config = all_images(copy)
+    generalise_lenses(copy, config, free_lens)
+    for name, surveyed in marks.points.items():
+        config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
+    options = adjustment_options()
+    options.refine_focal_length = True
+    pycolmap.create_default_bundle_adjuster(options, config, copy).solve()
+    return copy
+
+
+def _add_control(model: pycolmap.Reconstruction, marks: Marks, surveyed: Float64[np.ndarray, " 3"]) -> int:
+    track = pycolmap.Track()
+    for number, uv in zip(marks.image, marks.uv_px, strict=True):
+        points = model.image(int(number)).points2D
+        for _ in range(_REPEATS):
+            points.append(pycolmap.Point2D(uv))
+            track.add_element(int(number), len(points) - 1)
+    return model.add_point3D(surveyed, track)
+
+
+def _cross_validate(
+    model: pycolmap.Reconstruction, marks: Marks, free_lens: bool, progress: Callable[[int, int], object]
+) -> Residuals:
+    """Leave out each control point in turn, adjust, and triangulate it from its marks.
+
+    With more than a dozen points a twelfth of them is left out at a time, with more than 300 photographs a quarter.
+    Large models are thinned, which hardly changes the errors.
+
+    Args:
+        model: in the world, not yet adjusted to any of the points.
+        progress: called with the numbers of finished and of all adjustments.
+    """
+    surveyed = marks.points
+    seen = [name for name in surveyed if np.count_nonzero(marks.of(name)) >= 2]
+    count = _FOLDS if model.num_reg_images() <= _LARGE else _FOLDS_OF_LARGE
+    folds = [fold for fold in (seen[start::count] for start in range(count)) if fold]
+    names, errors = [], []
+    light = thinned(model)
+    for done, fold in enumerate(folds):
+        progress(done, len(folds))
+        rest = marks.where(~marks.of(*fold))
+        if are_collinear(_coordinates(rest)):
+            continue
+        adjusted = _adjusted(light, rest, free_lens)
+        for name in fold:
+            point = triangulate(adjusted, marks.where(marks.of(name)))
+            if point is not None:
+                names.append(name)
+                errors.append(point - surveyed[name])
+    progress(len(folds), len(folds))
+    return Residuals(tuple(names), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def _control_residuals(adjusted: pycolmap.Reconstruction, marks: Marks) -> Residuals:
+    """Compute triangulated minus surveyed coordinates of the control points."""
+    seen, surveyed = triangulate_points(adjusted, marks, 1.0), marks.points
+    errors = [point - surveyed[name] for name, point in seen.items()]
+    return Residuals(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def _consistent(
+    model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"], free_lens: bool, refused: set[str]
 ) -> Bool[np.ndarray, " M"]:
-    """The marks that a model adjusted to them agrees with."""
+    """Find marks with which a model agrees that is adjusted to them."""
     allowed = ~marks.of(*refused)
     for _ in range(_ROUNDS):
-        adjusted = adjust(model, marks.where(agree), lens)
+        adjusted = _adjusted(model, marks.where(agree), free_lens)
         share = reprojection_px(adjusted, marks, marks.surveyed_world) / marks.width_px
-        settled = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
-        settled &= ~marks.of(*_outvoted(marks, settled))
-        if (settled == agree).all() or on_one_line(_places(marks.where(settled))):
+        found = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
+        found &= ~marks.of(*_outvoted(marks, found))
+        if (found == agree).all() or are_collinear(_coordinates(marks.where(found))):
             break
-        agree = settled
+        agree = found
     return agree
 
 
 def _outvoted(marks: Marks, agree: Bool[np.ndarray, " M"]) -> list[str]:
-    """Points most of whose marks disagree: then so does the point, and what agrees does so by chance."""
+    """List points most of whose marks disagree: those that agree do so by chance."""
     return [name for name in marks.points if 2 * np.count_nonzero(agree & marks.of(name)) < marks.of(name).sum()]
 
 
-def _better_lens(
+def _choose_lens(
     model: pycolmap.Reconstruction, marks: Marks, progress: Callable[[int, int], object]
-) -> tuple[Lens, Residuals]:
-    """The lens as it is, unless a freed one meets the points that are left out better."""
-    held = leave_one_out(model, marks, "held", lambda done, whole: progress(done, 2 * whole))
-    freed = leave_one_out(model, marks, "freed", lambda done, whole: progress(done + whole, 2 * whole))
-    return ("freed", freed) if freed.rms_m < _WORTH_FREEING * held.rms_m else ("held", held)
+) -> tuple[bool, Residuals]:
+    """Decide whether to adjust the lens, by the points that are left out; also return their residuals."""
+    fixed = _cross_validate(model, marks, False, lambda done, whole: progress(done, 2 * whole))
+    free = _cross_validate(model, marks, True, lambda done, whole: progress(done + whole, 2 * whole))
+    return (True, free) if free.rms_m < _WORTH_FREEING * fixed.rms_m else (False, fixed)
 
 
 def _worst(check: Residuals, floor_m: float) -> str | None:
-    """The point that lies farther off than any other, if by much more than half of the others do."""
+    """Find the point of the largest error, if this is far larger than the others' median."""
     if len(check.names) < 4:
         return None
     distance = np.linalg.norm(check.error_m, axis=1)
@@ -121,12 +213,12 @@ def _worst(check: Residuals, floor_m: float) -> str | None:
     return check.names[last] if distance[last] > max(_POINT_FACTOR * typical, floor_m) else None
 
 
-def _places(marks: Marks) -> Float64[np.ndarray, "N 3"]:
+def _coordinates(marks: Marks) -> Float64[np.ndarray, "N 3"]:
     return np.array(list(marks.points.values()), dtype=np.float64).reshape(-1, 3)
 
 
 def _pixel_m(model: pycolmap.Reconstruction) -> float:
-    """Ground under a pixel of the model's images, by the middle camera's height."""
+    """Compute the ground sampling distance of the model's images: the median over the cameras."""
     ground = np.median([point.xyz[2] for point in model.points3D.values()])
     images = [model.image(number) for number in model.reg_image_ids()]
     return float(
@@ -134,8 +226,8 @@ def _pixel_m(model: pycolmap.Reconstruction) -> float:
     )
 
 
-def _named(model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"]) -> tuple[LeftOut, ...]:
-    """What was left out: a point as a whole where its marks agree with one another, else mark by mark."""
+def _rejected(model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"]) -> tuple[LeftOut, ...]:
+    """Describe rejected marks: a point as a whole where its marks agree with one another, else mark by mark."""
     found = []
     pixels = reprojection_px(model, marks, marks.surveyed_world) * marks.zoom
     for name, surveyed in marks.points.items():
@@ -168,16 +260,16 @@ def _misplaced(count: int, error_m: Float64[np.ndarray, " 3"]) -> str:
     )
 
 
-def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction, lens: Lens) -> tuple[str, ...]:
-    if lens == "held":
+def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction, free_lens: bool) -> tuple[str, ...]:
+    if not free_lens:
         return ()
     changes = [
         f"{camera.mean_focal_length():.1f} to {adjusted.camera(number).mean_focal_length():.1f} px"
         for number, camera in sorted(model.cameras.items())
     ]
     return (
-        f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): the "
-        "points that are left out in turn are met better so.",
+        f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): this "
+        "reduces the errors of points that are left out in turn.",
     )
 
 

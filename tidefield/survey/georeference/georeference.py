@@ -1,4 +1,4 @@
-"""A model laid onto the Earth: by ground control where it is given, else by GPS, else upright only."""
+"""Georeferencing of a model: by ground control where it is given, else by GPS, else levelled only."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from jaxtyping import Float64
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
-from tidefield.survey.georeference.alignment import Down, PositionFit, camera_centres, find_down, fit_positions
+from tidefield.survey.georeference.bundle_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
 from tidefield.survey.georeference.control_adjustment import adjust_to_control
-from tidefield.survey.georeference.gps import GivenPositions, given_positions
-from tidefield.survey.georeference.ground_control import fit_control
-from tidefield.survey.georeference.marks import place_marks
-from tidefield.survey.georeference.position_adjustment import DIFFERENTIAL_M, Differential, adjust_to_positions
+from tidefield.survey.georeference.gps_alignment import (
+    Down,
+    GivenPositions,
+    PositionFit,
+    camera_centres,
+    find_down,
+    fit_positions,
+    given_positions,
+)
+from tidefield.survey.georeference.ground_control import fit_control, locate_marks
 from tidefield.survey.io.gcp_file import refuse_elsewhere
 from tidefield.survey.survey import Control, Photograph, Survey
 
@@ -26,17 +32,17 @@ from tidefield.survey.survey import Control, Photograph, Survey
 def georeference(
     model: pycolmap.Reconstruction, survey: Survey, progress: Callable[[int, int], object]
 ) -> Georeference:
-    """Lay a model onto the Earth, in place: it comes in any frame and is in the world afterwards.
+    """Transform a model of any frame into the world, in place, and adjust it to positions and ground control.
 
-    Positions of differential receivers take the bend out of the model. With three control points or more the whole
-    model is adjusted to these, and checked without each of them in turn.
+    Positions of differential receivers remove the bend of the model. With three control points or more the model is
+    adjusted to these, and cross-validated.
 
     Args:
-        model: with photographs' names as its images' names.
-        progress: called with how much of how much is done, from the beginning for each of several parts.
+        model: its images' names are the photographs' names.
+        progress: called with the numbers of finished and of all steps; several parts count from 0 each.
 
     Raises:
-        SurveyError: the positions mirror the survey, or ground control is of another place or fits nothing.
+        SurveyError: the positions mirror the survey, or ground control is elsewhere or fits nothing.
     """
     photographs = [p for p in survey.photographs if p.name in camera_centres(model)]
     positions = given_positions(photographs)
@@ -44,36 +50,36 @@ def georeference(
         refuse_elsewhere(survey.control, *positions.middle)
     frame = _frame(survey, positions)
     if frame is None:
-        return _upright_only(model, positions, find_down(model, photographs))
-    laid = _lay_onto_positions(model, positions, frame, photographs, progress)
+        return _level_only(model, positions, find_down(model, photographs))
+    aligned = _align_with_positions(model, positions, frame, photographs, progress)
     if survey.control is not None:
-        return _by_control(model, survey, survey.control, positions, frame, laid, progress)
-    if laid.fit is None:
-        return _upright_only(model, positions, find_down(model, photographs))
+        return _by_control(model, survey, survey.control, positions, frame, aligned, progress)
+    if aligned.fit is None:
+        return _level_only(model, positions, find_down(model, photographs))
     ground = round(_ground(_points(model)))
-    down_to_it = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground]))
+    to_ground = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground]))
     frame = replace(frame, height_m=float(ground))
-    _move(model, down_to_it)
+    _transform(model, to_ground)
     return Georeference(
         frame=frame,
         source="GPS",
-        world_from_model=down_to_it @ laid.world_from_model,
+        world_from_model=to_ground @ aligned.world_from_model,
         gps=_gps_residuals(model, positions, frame),
         control=Residuals(),
         check=Residuals(),
-        left_out=(*positions.left_out, *laid.fit.left_out),
-        notes=laid.notes,
+        left_out=(*positions.left_out, *aligned.fit.left_out),
+        notes=aligned.notes,
     )
 
 
 @dataclass(frozen=True)
-class _Laid:
-    """A model that has been laid onto its cameras' positions, if that could be.
+class _Aligned:
+    """Result of the alignment of a model with its cameras' positions.
 
     Attributes:
-        fit: of the model as it is now, to its positions; None if they place nothing.
-        world_from_model: from the model as it came.
-        notes: what was done.
+        fit: of the transformed model to the positions; None if these do not determine it.
+        world_from_model: from the original model.
+        notes: on what was done.
     """
 
     fit: PositionFit | None
@@ -81,23 +87,23 @@ class _Laid:
     notes: tuple[str, ...]
 
 
-def _lay_onto_positions(
+def _align_with_positions(
     model: pycolmap.Reconstruction,
     positions: GivenPositions,
     frame: LocalFrame,
     photographs: Sequence[Photograph],
     progress: Callable[[int, int], object],
-) -> _Laid:
+) -> _Aligned:
     fit = _fit(model, positions, frame, find_down(model, photographs))
     if fit is None:
-        return _Laid(None, Similarity(1.0, np.eye(3), np.zeros(3)), ())
-    _move(model, fit.world_from_model)
+        return _Aligned(None, Similarity(1.0, np.eye(3), np.zeros(3)), ())
+    _transform(model, fit.world_from_model)
     adjusted = adjust_to_positions(model, _differential(positions, fit, frame), progress)
     again = _fit(model, positions, frame, find_down(model, photographs))
-    assert again is not None, "the model has just been laid onto them"
-    _move(model, again.world_from_model)
+    assert again is not None, "the model has just been aligned with them"
+    _transform(model, again.world_from_model)
     final = _fit(model, positions, frame, find_down(model, photographs))
-    return _Laid(final, again.world_from_model @ fit.world_from_model, (*again.notes, *adjusted))
+    return _Aligned(final, again.world_from_model @ fit.world_from_model, (*again.notes, *adjusted))
 
 
 def _by_control(
@@ -106,28 +112,28 @@ def _by_control(
     control: Control,
     positions: GivenPositions,
     frame: LocalFrame,
-    laid: _Laid,
+    aligned: _Aligned,
     progress: Callable[[int, int], object],
 ) -> Georeference:
-    marks, unplaced = place_marks(model, control, survey.photographs, frame)
-    similarity, agree = fit_control(model, marks, find_down(model, survey.photographs), laid.fit)
-    _move(model, similarity)
+    marks, unplaced = locate_marks(model, control, survey.photographs, frame)
+    similarity, agree = fit_control(model, marks, find_down(model, survey.photographs), aligned.fit)
+    _transform(model, similarity)
     result = adjust_to_control(model, marks, agree, progress)
-    astray = laid.fit.left_out if laid.fit else ()
+    gross_errors = aligned.fit.left_out if aligned.fit else ()
     return Georeference(
         frame=frame,
         source="ground control",
-        world_from_model=similarity @ laid.world_from_model,
+        world_from_model=similarity @ aligned.world_from_model,
         gps=_gps_residuals(model, positions, frame),
         control=result.control,
         check=result.check,
-        left_out=(*positions.left_out, *astray, *unplaced, *result.left_out),
-        notes=(*laid.notes, *result.notes),
+        left_out=(*positions.left_out, *gross_errors, *unplaced, *result.left_out),
+        notes=(*aligned.notes, *result.notes),
     )
 
 
 def _frame(survey: Survey, positions: GivenPositions) -> LocalFrame | None:
-    """In the system of the control, with a round coordinate amid it as its origin; else about the positions."""
+    """Choose the frame: in the system of the control, with a round coordinate as origin; else around the positions."""
     if survey.control is None:
         return positions.frame() if positions.names else None
     control = survey.control
@@ -137,13 +143,13 @@ def _frame(survey: Survey, positions: GivenPositions) -> LocalFrame | None:
     return LocalFrame.at(control.crs, (x, y, height))
 
 
-def _upright_only(model: pycolmap.Reconstruction, positions: GivenPositions, down: Down) -> Georeference:
-    """The vertical from the photographs, the ground's middle as origin, the model's own scale."""
+def _level_only(model: pycolmap.Reconstruction, positions: GivenPositions, down: Down) -> Georeference:
+    """Level a model by its photographs, with the middle of the ground as origin and the model's own scale."""
     rotation = level(down.direction_model)
     points = _points(model) @ rotation.T
     similarity = Similarity(1.0, rotation, -np.append(np.median(points[:, :2], axis=0), _ground(points)))
-    _move(model, similarity)
-    said = f"{len(positions.names)} photographs have positions" if positions.names else "No photograph has a position"
+    _transform(model, similarity)
+    found = f"{len(positions.names)} photographs have positions" if positions.names else "No photograph has a position"
     reason = "they do not follow the photographs" if len(positions.names) >= 3 else "three are needed"
     return Georeference(
         frame=None,
@@ -154,7 +160,7 @@ def _upright_only(model: pycolmap.Reconstruction, positions: GivenPositions, dow
         check=Residuals(),
         left_out=positions.left_out,
         notes=(
-            f"{said}, and {reason}: the scene is not georeferenced. Its scale is the model's own and not metres; its "
+            f"{found}, and {reason}: the scene is not georeferenced. Its scale is the model's own and not metres; its "
             f"vertical is from {down.source}, its north is arbitrary.",
         ),
     )
@@ -168,7 +174,7 @@ def _fit(
 
 
 def _differential(positions: GivenPositions, fit: PositionFit, frame: LocalFrame) -> Differential:
-    """Those positions that state centimetres and are no gross errors."""
+    """Select positions whose stated accuracy is that of a differential receiver, without gross errors."""
     given = frame.from_geographic(positions.longitude_latitude_height)
     stated = positions.stated_m[:, [0, 0, 1]]
     good = np.flatnonzero(fit.used & (stated < DIFFERENTIAL_M).all(axis=1))
@@ -177,15 +183,15 @@ def _differential(positions: GivenPositions, fit: PositionFit, frame: LocalFrame
 
 
 def _gps_residuals(model: pycolmap.Reconstruction, positions: GivenPositions, frame: LocalFrame) -> Residuals:
-    """Of all positions, in the world where the model is by now."""
+    """Compute the residuals of all positions, for a model in the world."""
     if not positions.names:
         return Residuals()
     centres = camera_centres(model)
-    there = np.array([centres[name] for name in positions.names])
-    return Residuals(positions.names, there - frame.from_geographic(positions.longitude_latitude_height))
+    found = np.array([centres[name] for name in positions.names])
+    return Residuals(positions.names, found - frame.from_geographic(positions.longitude_latitude_height))
 
 
-def _move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+def _transform(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
     model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 

@@ -20,7 +20,7 @@ from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import WGS84, parse_crs
+from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
 from tidefield.survey.io.text_files import PhotographNames, read_crs, read_text
 from tidefield.survey.survey import Control, Mark, Photograph
@@ -33,7 +33,6 @@ MAX_DISTANCE_M = 3_000.0
 
 _EXPECTED_LINE = "expected `x y z px py image [point]`"
 _SAME_POINT_M = 0.001
-_METRES_PER_DEGREE = 111_000.0  # of latitude; only scales the tolerance above
 _MAX_OUTSIDE = 0.5  # share of the marks; more means that the photographs were resized
 _FITTING_M = 1_000.0
 _MAX_SUGGESTIONS = 4
@@ -104,7 +103,7 @@ def _lines(path: Path, text: str, header: str) -> Iterator[_Line]:
 
 def _tolerance(crs: str) -> tuple[float, float, float]:
     """Largest difference between two positions of one point, as left by rounding when a list is printed."""
-    across = _SAME_POINT_M / (_METRES_PER_DEGREE if parse_crs(crs).is_geographic else 1.0)
+    across = _SAME_POINT_M / (metres_per_degree(0.0)[1] if parse_crs(crs).is_geographic else 1.0)
     return across, across, _SAME_POINT_M
 
 

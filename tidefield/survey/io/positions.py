@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import WGS84, parse_crs
+from tidefield.geometry.geodesy import EARTH_RADIUS_M, WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.text_files import PhotographNames, find_file, read_crs, read_text
 from tidefield.survey.survey import Photograph, Position
 
@@ -41,7 +41,6 @@ _EXPECTED_TABLE = (
 # geo.txt after the name: x y [z [yaw pitch roll [horizontal accuracy, vertical accuracy]]]
 # (https://github.com/OpenDroneMap/docs/blob/publish/source/geo.rst)
 _GEO_ANGLES, _GEO_ACCURACIES = 3, 6
-_EARTH_M = 6_371_000.0  # mean radius
 # A position this far from the median of the others is wrong: no single flight is so long.
 _FAR_M = 10_000.0
 _FAR_TIMES_MEDIAN = 20.0
@@ -305,8 +304,7 @@ def metres_around(positions: Sequence[Position]) -> Float64[np.ndarray, "N 2"]:
     """East and north of the median position, in metres; on a sphere, exact to some per cent over tens of kilometres."""
     degrees = np.array([(position.longitude_deg, position.latitude_deg) for position in positions]).reshape(-1, 2)
     east = (degrees[:, 0] - degrees[:1, 0] + 180) % 360 - 180  # continuous across the date line
-    scale = np.deg2rad(_EARTH_M) * np.array([np.cos(np.deg2rad(np.median(degrees[:, 1]))), 1.0])
-    metres = np.column_stack([east, degrees[:, 1]]) * scale
+    metres = np.column_stack([east, degrees[:, 1]]) * metres_per_degree(float(np.median(degrees[:, 1])))
     return metres - np.median(metres, axis=0)
 
 
@@ -318,7 +316,7 @@ def _geocentric_m(position: Position) -> Float64[np.ndarray, "1 3"]:
     """Geocentric coordinates on a sphere, for approximate distances that are continuous across the date line."""
     latitude, longitude = np.deg2rad([position.latitude_deg, position.longitude_deg])
     around = np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude)])
-    return _EARTH_M * np.array([[*around, np.sin(latitude)]])
+    return EARTH_RADIUS_M * np.array([[*around, np.sin(latitude)]])
 
 
 def _remark(photographs: Sequence[Photograph], what: str) -> str:

@@ -16,16 +16,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from tidefield.errors import SurveyError
-from tidefield.survey.georeference.adjustment import adjustment_options, all_images, thinned
-from tidefield.survey.georeference.alignment import PositionFit, camera_centres, find_down, fit_positions
-from tidefield.survey.georeference.gps import given_positions
+from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, thinned
+from tidefield.survey.georeference.gps_alignment import (
+    PositionFit,
+    camera_centres,
+    find_down,
+    fit_positions,
+    given_positions,
+)
 from tidefield.survey.sfm.features import Progress, decode_name
 from tidefield.survey.stages import interruptible
 from tidefield.survey.survey import Photograph
@@ -237,11 +243,10 @@ def _try_lens(
 def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
     """Adjust all poses, points and lenses of a model; `focal`: refine focal lengths too."""
     for camera in model.cameras.values():
-        mean = (camera.focal_length_x + camera.focal_length_y) / 2
-        centre = camera.principal_point_x, camera.principal_point_y
-        terms = np.pad(camera.params[len(camera.focal_length_idxs()) + 2 :], (0, 4))[: TERMS[lens]]
+        current = lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
+        mean = (current.fx + current.fy) / 2
         camera.model = getattr(pycolmap.CameraModelId, lens)
-        camera.params = [*([mean, mean] if lens == "OPENCV" else [mean]), *centre, *terms]
+        camera.params = colmap_parameters(replace(current, fx=mean, fy=mean), lens)
     options = adjustment_options()
     options.refine_focal_length, options.refine_principal_point = focal, False
     config = all_images(model)

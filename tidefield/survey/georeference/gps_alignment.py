@@ -1,0 +1,308 @@
+"""GPS alignment: the robust similarity from a model to the given positions of its cameras."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64
+
+from tidefield.data.georeference import LeftOut
+from tidefield.errors import SurveyError
+from tidefield.geometry.geodesy import WGS84, LocalFrame
+from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
+from tidefield.survey.io.positions import impossible
+from tidefield.survey.survey import Photograph, Position
+
+_NOMINAL_M = 3.0
+"""Standard deviation assumed for a receiver that states none: a good fix, so that only gross errors are rejected."""
+_LEAST_M = 0.01
+"""Smallest standard deviation, which keeps the weights finite."""
+_MAX_TILT_RAD = math.radians(1.0)
+"""If positions determine the vertical less accurately than this, a prior from the photographs is used."""
+_MIRRORED = 0.3
+"""Positions were mirrored if their mirror image has a median error of less than this share of theirs."""
+_DATUMS = {
+    "mean sea level": "mean sea level, as the receivers know it",
+    "ellipsoid": "the WGS 84 ellipsoid",
+    "unknown": "unknown; heights are as the receivers gave them",
+}
+
+
+@dataclass(frozen=True)
+class GivenPositions:
+    """Positions of photographs.
+
+    Attributes:
+        names: of the photographs.
+        longitude_latitude_height: WGS 84, degrees and metres.
+        stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none.
+        vertical_datum: zero of the heights, as text.
+        left_out: impossible positions.
+    """
+
+    names: tuple[str, ...]
+    longitude_latitude_height: Float64[np.ndarray, "N 3"]
+    stated_m: Float64[np.ndarray, "N 2"]
+    vertical_datum: str
+    left_out: tuple[LeftOut, ...]
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Median longitude and latitude."""
+        longitude, latitude, _ = np.median(self.longitude_latitude_height, axis=0)
+        return float(longitude), float(latitude)
+
+    def frame(self) -> LocalFrame:
+        """Create a local frame at their middle, with products in its UTM zone and heights as given."""
+        return LocalFrame.at(WGS84, (*self.middle, 0.0), self.vertical_datum)
+
+
+def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
+    """Collect the photographs' positions, without impossible ones."""
+    located: list[tuple[Photograph, Position]] = []
+    left_out = []
+    for photograph in photographs:
+        if photograph.position is None:
+            continue
+        reason = impossible(photograph.position)
+        if reason is None:
+            located.append((photograph, photograph.position))
+        else:
+            left_out.append(LeftOut("GPS", photograph.name, reason))
+    located, heights, datum = _with_heights(located)
+    degrees = np.array([(p.longitude_deg, p.latitude_deg) for _, p in located], dtype=np.float64).reshape(-1, 2)
+    stated = [(position.horizontal_m, position.vertical_m) for _, position in located]
+    if len(degrees):  # all on one side of the date line
+        degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180 + degrees[0, 0]
+    return GivenPositions(
+        names=tuple(photograph.name for photograph, _ in located),
+        longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
+        stated_m=np.array(stated, dtype=np.float64).reshape(-1, 2),
+        vertical_datum=datum,
+        left_out=tuple(left_out),
+    )
+
+
+def _with_heights(
+    located: list[tuple[Photograph, Position]],
+) -> tuple[list[tuple[Photograph, Position]], list[float], str]:
+    """Select positions with heights: absolute ones, else above take-off, else all at one height. Also their datum."""
+    absolute = [(photograph, position) for photograph, position in located if math.isfinite(position.height_m)]
+    if len(absolute) >= 3:
+        datum = Counter(position.datum for _, position in absolute).most_common(1)[0][0]
+        return absolute, [position.height_m for _, position in absolute], _DATUMS[datum]
+    relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
+    if len(relative) >= 3:
+        return relative, [photograph.relative_altitude_m for photograph, _ in relative], "the place of take-off"
+    return located, [0.0] * len(located), "the mean height of flight, since the photographs have no heights"
+
+
+@dataclass(frozen=True)
+class Down:
+    """Direction of gravity in a model.
+
+    Attributes:
+        direction_model: unit vector.
+        sigma_rad: standard deviation.
+        source: of the direction, as text.
+    """
+
+    direction_model: Float64[np.ndarray, " 3"]
+    sigma_rad: float
+    source: str
+
+
+@dataclass(frozen=True)
+class PositionFit:
+    """A model aligned with its cameras' positions.
+
+    Attributes:
+        world_from_model: the similarity.
+        centres_model: projection centres of the cameras.
+        given_world: their given positions.
+        used: which were not gross errors.
+        sigma_m: observed standard deviations (east, north, up), per position.
+        left_out: the gross errors, named.
+        notes: what the positions do not determine.
+    """
+
+    world_from_model: Similarity
+    centres_model: Float64[np.ndarray, "N 3"]
+    given_world: Float64[np.ndarray, "N 3"]
+    used: Bool[np.ndarray, " N"]
+    sigma_m: Float64[np.ndarray, "N 3"]
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+
+
+def camera_centres(model: pycolmap.Reconstruction) -> dict[str, Float64[np.ndarray, " 3"]]:
+    """Map names of registered photographs to their projection centres in the model."""
+    images = [model.image(number) for number in model.reg_image_ids()]
+    return {image.name: image.projection_center() for image in images}
+
+
+def find_down(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> Down:
+    """Estimate the direction of gravity from gimbal angles, else from how photographs are usually held.
+
+    Photographs are taken level: their x axes are horizontal, whichever way the camera points. Where these axes are all
+    parallel, down is the direction nearest to the mean viewing direction that is perpendicular to them.
+    """
+    gimbal = {p.name: p.gimbal_deg for p in photographs if p.gimbal_deg is not None}
+    images = [model.image(number) for number in model.reg_image_ids()]
+    R_camera_model = np.array([image.cam_from_world().rotation.matrix() for image in images])
+    stated = [i for i, image in enumerate(images) if image.name in gimbal]
+    if 2 * len(stated) > len(images):
+        pitch, roll = np.deg2rad([gimbal[images[i].name][1:] for i in stated]).T
+        down_camera = np.stack([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), -np.sin(pitch)], axis=1)
+        down_model = np.einsum("nji,nj->ni", R_camera_model[stated], down_camera)
+        return Down(_unit(np.median(down_model, axis=0)), math.radians(1), "the gimbals' pitch")
+    x, forward = R_camera_model[:, 0], R_camera_model[:, 2].mean(0)
+    strength, axes = np.linalg.eigh(x.T @ x / len(x))
+    if strength[1] > 0.05:
+        return Down(axes[:, 0] * (1.0 if axes[:, 0] @ forward >= 0 else -1.0), math.radians(5), "level photographs")
+    along = axes[:, 2]
+    return Down(_unit(forward - (forward @ along) * along), math.radians(5), "the mean viewing direction")
+
+
+def fit_positions(
+    centres_model: Float64[np.ndarray, "N 3"], positions: GivenPositions, frame: LocalFrame, down: Down
+) -> PositionFit | None:
+    """Estimate the similarity from a model to its cameras' positions.
+
+    Args:
+        centres_model: projection centres, in the order of `positions`.
+        frame: the world.
+        down: a prior for positions that do not determine the vertical (all on one line).
+
+    Returns:
+        None if there are fewer than three positions, or if they do not follow the model's cameras.
+
+    Raises:
+        SurveyError: the positions mirror the survey, as they do when latitude and longitude are swapped.
+    """
+    if len(positions.names) < 3:
+        return None
+    given = frame.from_geographic(positions.longitude_latitude_height)
+    stated = positions.stated_m[:, [0, 0, 1]]
+    nominal = np.where(np.isfinite(stated), stated, _NOMINAL_M)
+    similarity, median = _robust_start(centres_model, given, down)
+    if median > _NOMINAL_M:
+        _refuse_mirrored(centres_model, positions, down, median)
+    sigma, notes, used = nominal, (), np.ones(len(given), dtype=bool)
+    for _ in range(3):
+        error = similarity(centres_model) - given
+        used = ~outliers(np.linalg.norm(error, axis=1), 5 * np.linalg.norm(nominal, axis=1))
+        sigma = _observed_sigma(error, used, stated)
+        similarity, notes = _refined(similarity, centres_model[used], given[used], sigma[used], down)
+    error = similarity(centres_model) - given
+    if not _follow(given[used], error[used]):
+        return None
+    return PositionFit(similarity, centres_model, given, used, sigma, _gross(positions.names, error, used), notes)
+
+
+def metres(length_m: float) -> str:
+    """Format a length with the digits that matter."""
+    if length_m >= 10_000:
+        return f"{length_m / 1000:,.0f} km"
+    return (
+        f"{length_m:,.0f} m" if length_m >= 20 else f"{length_m:.1f} m" if length_m >= 2 else f"{100 * length_m:.0f} cm"
+    )
+
+
+def _observed_sigma(
+    error: Float64[np.ndarray, "N 3"], used: Bool[np.ndarray, " N"], stated: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    """Estimate robust standard deviations, horizontal and vertical, from residuals; stated ones are relative weights.
+
+    A model bends by more than a differential receiver errs, so a stated accuracy separates good fixes from poor ones,
+    but does not predict the residuals.
+    """
+    known = np.isfinite(stated)
+    typical = np.nanmedian(stated, axis=0) if known.any(axis=0).all() else np.ones(3)
+    relative = np.where(known, np.maximum(stated, _LEAST_M) / np.maximum(typical, _LEAST_M), 1.0)
+    scaled = np.abs(error[used]) / relative[used]
+    horizontal = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, :2])))
+    vertical = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, 2])))
+    return relative * [horizontal, horizontal, vertical]
+
+
+def _refined(
+    start: Similarity,
+    source: Float64[np.ndarray, "N 3"],
+    target: Float64[np.ndarray, "N 3"],
+    sigma: Float64[np.ndarray, "N 3"],
+    down: Down,
+) -> tuple[Similarity, tuple[str, ...]]:
+    """Refine a similarity, with the prior of the vertical where positions do not determine it; also what to note."""
+    fit = refine_similarity(start, source, target, sigma)
+    if fit.tilt_rad < _MAX_TILT_RAD:
+        return fit.similarity, ()
+    held = refine_similarity(start, source, target, sigma, down.direction_model, down.sigma_rad)
+    return held.similarity, (
+        "The cameras' positions alone do not determine the vertical (they lie on one line, or are too inaccurate): it "
+        f"is taken from {down.source}, to within about {math.degrees(held.tilt_rad):.1f} degrees.",
+    )
+
+
+def _follow(given: Float64[np.ndarray, "N 3"], error: Float64[np.ndarray, "N 3"]) -> bool:
+    """Test whether positions fit better than half of their own spread."""
+    spread = np.sqrt(((given - given.mean(0)) ** 2)[:, :2].sum(1).mean())
+    return len(given) >= 3 and bool(np.sqrt((error[:, :2] ** 2).sum(1).mean()) < 0.5 * spread)
+
+
+def _gross(
+    names: tuple[str, ...], error: Float64[np.ndarray, "N 3"], used: Bool[np.ndarray, " N"]
+) -> tuple[LeftOut, ...]:
+    distance = np.linalg.norm(error, axis=1)
+    typical = metres(float(np.median(distance[used])))
+    return tuple(
+        LeftOut(
+            "GPS",
+            names[i],
+            f"its position lies {metres(float(distance[i]))} from where the photographs place the camera; "
+            f"half of the others are within {typical}",
+        )
+        for i in np.flatnonzero(~used)
+    )
+
+
+def _robust_start(
+    source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"], down: Down
+) -> tuple[Similarity, float]:
+    """Find the similarity of least median distance among those with the ground below the cameras; also the median."""
+    candidates = hypotheses(source, target, down.direction_model, np.random.default_rng(0))
+    return least_median([one for one in candidates if (one.rotation @ down.direction_model)[2] < 0], source, target)
+
+
+def _refuse_mirrored(
+    centres_model: Float64[np.ndarray, "N 3"], positions: GivenPositions, down: Down, median: float
+) -> None:
+    """Raise an error if swapped coordinates or a changed sign make the positions fit."""
+    given = positions.longitude_latitude_height
+    corrections = {
+        "latitude and longitude are swapped": given[:, [1, 0, 2]],
+        "the sign of one of the two is wrong": given * [-1, 1, 1],
+    }
+    for mistake, corrected in corrections.items():
+        possible = np.abs(corrected[:, 1]) < 90
+        if np.count_nonzero(possible) < 3:
+            continue
+        longitude, latitude = np.median(corrected[possible], axis=0)[:2]
+        frame = LocalFrame.at(WGS84, (float(longitude), float(latitude), 0.0))
+        _, least = _robust_start(centres_model[possible], frame.from_geographic(corrected[possible]), down)
+        if least < _MIRRORED * median:
+            raise SurveyError(
+                f"the positions of the photographs (latitude {positions.middle[1]:.5f}, longitude "
+                f"{positions.middle[0]:.5f}) mirror what the photographs show: {mistake}; "
+                "expected latitude, counted positive to the north, and longitude, to the east; correct them where they "
+                "were given"
+            )
+
+
+def _unit(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    return vector / np.linalg.norm(vector)
