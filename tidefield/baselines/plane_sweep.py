@@ -15,6 +15,7 @@ from tidefield.baselines.photograph import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.rays import angle_between
 from tidefield.model.fill import fill_unseen
 from tidefield.model.rendering import Render, Rendering
 
@@ -50,7 +51,7 @@ def nearest_photographs(scene: Scene, camera: Cameras, count: int) -> list[int]:
     uv, z = sources.project(points_world)
     ours = F.normalize(points_world - camera.position_world, dim=-1)
     theirs = F.normalize(points_world - sources.position_world[:, None], dim=-1)
-    angle = 2 * torch.asin(((theirs - ours).norm(dim=-1) / 2).clamp(max=1))
+    angle = angle_between(ours, theirs)
     angle = torch.where(in_frame(sources, uv, z), angle, torch.pi / 2).mean(1)
     return [scene.train[i] for i in angle.argsort()[:count].tolist()]
 

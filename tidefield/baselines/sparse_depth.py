@@ -15,6 +15,7 @@ from tidefield.baselines.photograph import read_photograph
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.rays import angle_between
 from tidefield.model.fill import fill_unseen
 from tidefield.model.rendering import Render, Rendering
 
@@ -63,5 +64,4 @@ def _angles(camera: Cameras, sources: Cameras, points_world: Float[Tensor, "P 3"
     """Angle at each point between the directions to `camera` and to each source, radians."""
     ours = torch.nn.functional.normalize(points_world - camera.position_world, dim=-1)
     theirs = torch.nn.functional.normalize(points_world - sources.position_world[:, None], dim=-1)
-    # From the chord: unlike the cosine it does not lose small angles to rounding.
-    return 2 * torch.asin(((theirs - ours).norm(dim=-1) / 2).clamp(max=1))
+    return angle_between(ours, theirs)

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from tidefield.data.readers.posed import Observations
 from tidefield.geometry.lenses import Lens
+from tidefield.geometry.rays import intersect_axes
 
 # A camera's range is [0.5 x 1st, 1.4 x 99th percentile] of the depths of its sparse points. Over flat ground seen from
 # 60 m that leaves 30 m for trees whose tops were not matched, and 24 m for holes. In disparity, in which samples are
@@ -48,10 +49,9 @@ def near_far_from_cameras(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> Float
     and it is nearer than 100 b.
     """
     position, forward = T_world_camera[:, :, 3], T_world_camera[:, :, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     spread = np.linalg.norm(position - position.mean(axis=0), axis=1).max()
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] > 0.02:  # below: parallel axes, which meet nowhere
-        focus = np.linalg.solve(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0))[:, 0]
+    focus = intersect_axes(position, forward)
+    if focus is not None:
         depth = ((focus - position) * forward).sum(axis=1)
         if np.mean(depth > 0.1 * spread) > 0.9:
             depth = np.maximum(depth, 0.1 * spread)

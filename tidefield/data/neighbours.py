@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from tidefield.data.depth_prior import unproject_to_surface
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.geometry.rays import angle_between
 
 FADE = 0.04
 """Share of its rank by which a view must be better than the first one left out to count in full."""
@@ -62,8 +63,7 @@ def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "K S 3"], candid
     share = (from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)).reshape(-1, places, points).mean(-1).T
     ours = F.normalize(surface_world - targets.position_world[:, None], dim=-1)
     theirs = F.normalize(surface_world[:, None] - candidates.position_world[None, :, None], dim=-1)
-    # From the chord: unlike the cosine it keeps small angles.
-    angle = 2 * torch.asin(((theirs - ours[:, None]).norm(dim=-1) / 2).clamp(max=1))
+    angle = angle_between(ours[:, None], theirs)
     return share * torch.exp(-angle.mean(-1) / ANGLE_SCALE_RAD)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tidefield.data.scene import Scene
+from tidefield.geometry.rays import intersect_axes
 
 Array = NDArray[np.float64]
 Kind = Literal["survey", "facing", "around"]
@@ -90,11 +91,10 @@ def _distance(scene: Scene) -> float:
 
 def _focus(position: Array, ahead: Array) -> Array | None:
     """The point nearest to all optical axes, where these do meet, in front of the cameras (Blender, turntables)."""
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    if np.linalg.eigvalsh(across.mean(0))[0] < 0.02:
+    focus = intersect_axes(position, ahead)
+    if focus is None:
         return None
-    focus = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, position))
-    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, focus - position), axis=1)
+    missed = np.linalg.norm(np.cross(ahead, focus - position), axis=1)
     spread = np.linalg.norm(position - position.mean(0), axis=1)
     in_front = ((focus - position) * ahead).sum(1) > 0
     meets = np.median(missed) < 0.25 * np.median(spread) and in_front.mean() > 0.9
