@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.baselines.photograph import read_photograph
+from tidefield.baselines.untrained import read_photograph
 from tidefield.model.fill import fill_unseen
 from tidefield.model.gather import doubled, gather, joined, maps_from_images, weighted_rows
 
