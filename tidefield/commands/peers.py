@@ -12,12 +12,11 @@ from rich.console import Console
 from tidefield.baselines.nerfstudio import driver, environment
 from tidefield.commands.opening import budget_of
 from tidefield.compare import protocols
-from tidefield.compare.ablation import variants
-from tidefield.compare.record import run_measured
+from tidefield.compare.ablation import variants, write_ablation
 from tidefield.compare.results import Results, read_results
-from tidefield.compare.run import Settings
+from tidefield.compare.run import Settings, run_measured
 from tidefield.compare.run import compare as run_all
-from tidefield.compare.write import write_ablation, write_comparison
+from tidefield.compare.tables import write_comparison
 from tidefield.config import PRESETS
 from tidefield.device import choose_device
 from tidefield.errors import RunError
