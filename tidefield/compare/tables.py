@@ -181,6 +181,8 @@ def paper_table(
     columns, rows = ["scene"], [[scene] for scene in (*scenes, MEAN)]
     for k, (metric, style) in enumerate((("psnr", "{:.2f}"), ("ssim", "{:.3f}"), ("lpips_vgg", "{:.3f}"))):
         name = PUBLISHED_METRICS[k].upper()
+        if not any(results.metric(scene, method, metric) is not None for scene in scenes for method in measured):
+            continue
         for method in measured:
             columns.append(f"{name} {method}")
             values = [results.metric(s, method, metric) for s in scenes] + [results.mean(method, metric, scenes)]
