@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | frames | memory | table | card | surveys`; without a name, speed.
+"""`python -m benchmarks speed | frames | memory | surveys | table | card`; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -21,12 +21,12 @@ from tidefield.machine import spin_briefly
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
-BEGUN = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
-DESCRIPTION = """What Tidefield achieves, and how fast: speed, frames, memory, surveys, and a page of results. Without
-a name, it is speed. Quality is what `tidefield compare` and `tidefield ablate` measure.
+LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
+DESCRIPTION = """Measure speed, views, memory and surveys, and write the page of results. Without a name, it is speed.
+`tidefield compare` and `tidefield ablate` measure quality.
 
-A figure is worth something only on a machine that does nothing else meanwhile. The whole page is made of what
-`tidefield compare` and `tidefield ablate` left and of what speed, frames and memory kept with --runs."""
+Measure on a machine that does nothing else. The page is made of the files of `tidefield compare`, `tidefield ablate`,
+speed, frames and memory."""
 
 
 def speed(
@@ -36,17 +36,17 @@ def speed(
     device: str = "cpu",
     quick: bool = False,
 ) -> None:
-    """Rays per second of paper and swift, stage by stage, and their share of the machine's ceilings (2-3 minutes).
+    """Rays per second of paper and swift, by stage, and their share of the machine's peak arithmetic (2-3 minutes).
 
     Args:
-        runs: Keep the figures in this folder's speed.json.
+        runs: Store the figures in this folder's speed.json.
         scene: Measure on this scene instead of the built-in one.
         width: Width of its photographs in pixels.
         device: auto, cpu, cuda, cuda:N or mps.
-        quick: A few seconds, to see that it works; the figures mean little.
+        quick: A few seconds, to check that it works; the figures are not meaningful.
     """
     if quick and runs is not None:
-        raise RunError("--quick was given with --runs: such figures are not worth keeping; leave one of them out")
+        raise RunError("--quick was given with --runs: such figures are not worth storing; leave one of them out")
     spin_briefly()
     from rich.console import Console
 
@@ -97,11 +97,11 @@ def frames(
     weights: Path | None = None,
     device: str = "cpu",
 ) -> None:
-    """Views of a scene that nothing was trained on: the first, further ones, many photographs, steadiness (minutes).
+    """Time of zero-shot views: the first, further ones, and among many photographs (minutes).
 
     Args:
         scene: The scene, a survey.
-        runs: Keep the figures in this folder's frames.json.
+        runs: Store the figures in this folder's frames.json.
         preset: Which network.
         weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
         device: auto, cpu, cuda, cuda:N or mps.
@@ -127,7 +127,7 @@ def memory(
     """Peak memory of rendering one frame of 4000 x 3000 pixels from photographs of that size (minutes, 1 GB of disk).
 
     Args:
-        runs: Keep the figures in this folder's memory.json.
+        runs: Store the figures in this folder's memory.json.
         preset: Which network.
         width: Width of photographs and frame in pixels; the height is three quarters of it.
         photographs: How many the scene has.
@@ -143,32 +143,24 @@ def surveys(
     photographs: Path,
     runs: Path,
     names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
-    pairs: int | None = None,
-    many: int = 2000,
     prepared: Path | None = None,
     ready: Path | None = None,
     out: Path = Path("docs/surveys.md"),
 ) -> None:
-    """Prepare surveys as they came from the camera, beside exhaustive structure from motion; write the page (hours).
+    """Prepare surveys and compare with exhaustive structure from motion; write the page (hours).
 
     Args:
         photographs: Folder with the surveys' folders.
         runs: Folder for the results, as RUNS/SURVEY.
         names: Of the surveys.
-        pairs: Of the exhaustive run, match only so many pairs, and reckon the time of all; 0 leaves it out.
-        many: Prepare so many copies of the first survey's photographs, too, for the memory it takes; 0 for none.
         prepared: Folder of a `tidefield compare` on the prepared scenes, by the surveys' names, for the page.
         ready: Folder of a `tidefield compare` on ready-made scenes of these names, for the page.
         out: The Markdown file to write; replaced if it is there.
     """
-    from benchmarks.many import measure_many
     from benchmarks.surveys import measure_surveys, write_page
-    from tidefield.compare.record import run_measured
+    from tidefield.compare.run import run_measured
 
-    say = partial(print, flush=True)
-    measure_surveys(photographs, runs, names, pairs, run_measured, say)
-    if many:
-        measure_many(photographs / names[0], runs, many, run_measured, say)
+    measure_surveys(photographs, runs, names, run_measured, partial(print, flush=True))
     write_page(runs, names, prepared, ready, out)
     print(out)
 
@@ -176,31 +168,31 @@ def surveys(
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
-    begun: tuple[Path, ...] = BEGUN,
+    lengths: tuple[Path, ...] = LENGTHS,
     runs: Path = MEASURED,
     out: Path = Path("docs/results.md"),
 ) -> None:
-    """Write the page of results from what was measured; what is missing is said to be.
+    """Write the page of results from stored measurements; it marks what is missing.
 
     Args:
-        comparison: What `tidefield compare` left; of what several files tell, the last one counts.
-        ablation: What `tidefield ablate` left, likewise.
-        begun: What `tidefield compare` left with other lengths of training, and from scratch.
+        comparison: Files of `tidefield compare`; of a result in several files the last one counts.
+        ablation: Files of `tidefield ablate`, likewise.
+        lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
         runs: Folder of speed, frames and memory.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
 
-    write_page(comparison, ablation, begun, runs, out)
+    write_page(comparison, ablation, lengths, runs, out)
     print(out)
 
 
 def card(weights: Path, comparison: tuple[Path, ...] = COMPARISON) -> None:
-    """Write the card that lies beside weights, from the file itself and from what was measured.
+    """Write the card of weights, from the file itself and from stored measurements.
 
     Args:
         weights: Of `tidefield pretrain`.
-        comparison: What `tidefield compare` left, with the method zero-shot, or paper-zero-shot for those of paper.
+        comparison: Files of `tidefield compare` with the method zero-shot, or paper-zero-shot for those of paper.
     """
     from benchmarks.card import write_card
 
@@ -219,7 +211,7 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"benchmarks: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("benchmarks: interrupted; the same command goes on", file=sys.stderr)
+        print("benchmarks: interrupted; repeat the command to continue", file=sys.stderr)
         sys.exit(130)
 
 

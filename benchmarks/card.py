@@ -6,35 +6,32 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tidefield.train.weights import about, sha256
-
-from benchmarks.bars import SCENES, UNSEEN
+from benchmarks.table import SCENES, marked, notes
 from tidefield.compare.results import Results, read_figures
-from tidefield.compare.run import PAPER_ZERO_SHOT, UNTRAINED, ZERO_SHOT
-from tidefield.compare.table import Table, shown
-from tidefield.compare.tables import METRICS, lpips_weights
+from tidefield.compare.tables import METRICS, Table, lpips_weights, shown
 from tidefield.errors import RunError
 from tidefield.files import completed_file
+from tidefield.methods import METHODS, names
+from tidefield.train.checkpoint import describe_weights, weights_sha256
 from tidefield.train.stream import (
+    EXPOSURE_ERROR,
+    EXPOSURE_ERROR_SHARE,
     POINTLESS_SHARE,
     RECOLOURED_SHARE,
     SHIFT_PX,
     SHIFTED_SHARE,
     SPARSE_POINTS,
     SPARSE_SHARE,
-    UNEVEN,
-    UNEVEN_SHARE,
 )
 
-OWN = {"swift": ZERO_SHOT, "paper": PAPER_ZERO_SHOT}
-"""By preset, what its weights are called in a comparison."""
-PEERS = ("nerfacto", *UNTRAINED)
+OTHERS = ("nerfacto", *names("untrained"))
+"""Methods next to which zero-shot results stand."""
 BY_DIRECTION = (
     "Neighbours are, as printed, the photographs that look in the most similar directions, wherever they were taken. "
     "Of a survey that looks straight down they may not show the place at all, and the view then has one colour: on "
     "surveys, use `swift`, which chooses them by what they show."
 )
-"""Told of presets that do so."""
+"""For presets that do so."""
 LICENCES = {
     "brighton_beach": "BSD-2-Clause, (c) 2017 Piero Toffanin",
     "turin_lot": "MIT, from the repository vinstray/i-sfm",
@@ -55,11 +52,12 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
     """
-    own = OWN[about(weights)["config"]["preset"]]
-    results = read_figures(comparison, SCENES, (own, *PEERS))
+    preset = describe_weights(weights)["config"]["preset"]
+    own = next(name for name in names("zero-shot") if METHODS[name].preset == preset)
+    results = read_figures(comparison, SCENES, (own, *OTHERS))
     if not any(method == own for _, method in results.by):
-        named = ", ".join(map(str, comparison))
-        raise RunError(f"{named} hold no {own} results: expected some; run `tidefield compare` with them")
+        files = ", ".join(map(str, comparison))
+        raise RunError(f"{files} hold no {own} results: expected some; run `tidefield compare` with them")
     out = weights.with_suffix(".md")
     with completed_file(out, overwrite=True) as partial:
         partial.write_text(card(weights, results), encoding="utf-8")
@@ -68,42 +66,43 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
 
 def card(weights: Path, results: Results) -> str:
     """The whole card; the first of the results' methods is what the weights are called there."""
-    told = about(weights)
-    unknown = [name for name in told["real"] if name not in LICENCES]
+    recorded = describe_weights(weights)
+    unknown = [name for name in recorded["real"] if name not in LICENCES]
     if unknown:
         raise RunError(f"{weights} learned from {', '.join(unknown)}: expected scenes whose licences are known")
-    real = "".join(f"\n- {name}: the training photographs ({LICENCES[name]})" for name in told["real"])
-    machine, preset = told["machine"], told["config"]["preset"]
-    named = f" --real {' '.join(told['real'])}" if told["real"] else ""
-    count = told["processes"]
+    real = "".join(f"\n- {name}: the training photographs ({LICENCES[name]})" for name in recorded["real"])
+    machine, preset = recorded["machine"], recorded["config"]["preset"]
+    named = f" --real {' '.join(recorded['real'])}" if recorded["real"] else ""
+    count = recorded["processes"]
     launch = "tidefield" if count == 1 else f"torchrun --nproc-per-node {count} -m tidefield.cli"
     parts = [
         f"# Weights of the preset {preset}",
-        f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, SHA-256 `{sha256(weights)}`. "
+        f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, "
+        f"SHA-256 `{weights_sha256(weights)}`. "
         "`python -m benchmarks card` wrote this card from the file and from what `tidefield compare` measured.",
         "## What for",
         "Views of scenes that nothing was trained on (`--zero-shot`), and a start for `tidefield train`. For drone "
         "photographs of tidal flats that overlap well and have sparse points. Where few photographs see a place, where "
         "things move, and far from where photographs were taken, views are guesses: do not measure in them.",
-        *([BY_DIRECTION] if told["config"]["train"]["neighbours"] == "direction" else []),
+        *([BY_DIRECTION] if recorded["config"]["train"]["neighbours"] == "direction" else []),
         "## What they were trained on",
         "- procedural tidal flats of five categories, of random altitude, overlap, lens, sun, wetness, exposure, with "
         f"moving water and wrong poses{real}",
         f"{SPARSE_SHARE:.0%} of the scenes came with {SPARSE_POINTS[0]:.0%} to {SPARSE_POINTS[1]:.0%} of their sparse "
         f"points and {POINTLESS_SHARE:.0%} without any; of {SHIFTED_SHARE:.0%} the photographs were off by "
-        f"{SHIFT_PX[0]} to {SHIFT_PX[1]} px, of {UNEVEN_SHARE:.0%} the exposures by {UNEVEN[0]:.0%} to "
-        f"{UNEVEN[1]:.0%}; {RECOLOURED_SHARE:.0%} had the channels of their colours in a random order, and all were "
-        "turned at random.",
-        f"{told['steps']:,} steps in {told['seconds'] / 3600:.1f} hours on {machine['processor']}, {machine['cores']} "
-        f"cores, {told['date']}, Tidefield {told['version']}:",
-        f"    {launch} pretrain OUT{named} --preset {preset} --steps {told['steps']} --seed {told['seed']}",
+        f"{SHIFT_PX[0]} to {SHIFT_PX[1]} px, of {EXPOSURE_ERROR_SHARE:.0%} the exposures by {EXPOSURE_ERROR[0]:.0%} to "
+        f"{EXPOSURE_ERROR[1]:.0%}; {RECOLOURED_SHARE:.0%} had the channels of their colours in a random order, and all "
+        "were rotated at random.",
+        f"{recorded['steps']:,} steps in {recorded['seconds'] / 3600:.1f} hours on {machine['processor']}, "
+        f"{machine['cores']} cores, {recorded['date']}, Tidefield {recorded['version']}:",
+        f"    {launch} pretrain OUT{named} --preset {preset} --steps {recorded['steps']} --seed {recorded['seed']}",
         "PSNR in dB on scenes that nothing is learned from (of the real ones, their held-out photographs), two small "
         "views of each:",
-        _curve(told["validation"]).markdown(),
+        _curve(recorded["validation"]).markdown(),
         "## What they achieve",
-        "Zero-shot, means over the held-out photographs; `docs/results.md` says how the peers were trained. Nothing of "
-        f"{' and '.join(UNSEEN)} was ever learned from.",
-        *(_quality(results, metric, title, style).markdown() for metric, title, style, _ in METRICS[:4]),
+        "Zero-shot, means over the held-out photographs; `docs/results.md` says how the others were trained.",
+        *notes(results),
+        *(table.markdown() for table in _quality(results)),
         *lpips_weights(results),
         "## Licence",
         "Apache-2.0, as Tidefield itself.",
@@ -117,10 +116,13 @@ def _curve(points: list[Mapping[str, Any]]) -> Table:
     return Table("", ["step", *kinds], rows)
 
 
-def _quality(results: Results, metric: str, title: str, style: str) -> Table:
-    rows = [
-        (scene, *(shown(results.metric(scene, method, metric), style) for method in results.methods))
-        for scene in results.scenes
-        if (scene, results.methods[0]) in results.by
-    ]
-    return Table(title, ["scene", *results.methods], rows)
+def _quality(results: Results) -> list[Table]:
+    """A table for each measured metric, of the scenes on which these weights were measured."""
+    scenes = [scene for scene in results.scenes if (scene, results.methods[0]) in results.by]
+    tables = []
+    for metric, title, style, _ in METRICS:
+        rows = [[scene, *(results.metric(scene, method, metric) for method in results.methods)] for scene in scenes]
+        if any(value is not None for row in rows for value in row[1:]):
+            cells = [[marked(str(row[0])), *(shown(value, style) for value in row[1:])] for row in rows]
+            tables.append(Table(title, ["scene", *results.methods], cells))
+    return tables

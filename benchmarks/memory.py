@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.record import Runner, run_measured, tidefield
+from tidefield.compare.run import Runner, run_measured, tidefield
 from tidefield.files import write_json
 from tidefield.machine import describe
 
@@ -31,7 +31,7 @@ def measure_memory(
     run: Runner = run_measured,
     prepare: Callable[[Path, str, int, int], str] | None = None,
 ) -> dict[str, Any]:
-    """Render in a process of its own and keep what it took in RUNS/memory.json; returns what is kept.
+    """Render in a process of its own, store its time and memory as RUNS/memory.json and return them.
 
     Args:
         runs: where the result goes; the scene lies there as long as it is needed.
@@ -45,7 +45,7 @@ def measure_memory(
     runs.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=runs, prefix=".memory-") as folder:
         work = Path(folder)
-        name = (prepare or _in_a_process_of_its_own)(work, preset, width, photographs)
+        name = (prepare or _in_another_process)(work, preset, width, photographs)
         command = [
             "render",
             str(work / "run"),
@@ -56,7 +56,7 @@ def measure_memory(
             device,
             "--quiet",
         ]
-        took = run(tidefield(*command), {"XDG_CACHE_HOME": str(work / "cache")})
+        usage = run(tidefield(*command), {"XDG_CACHE_HOME": str(work / "cache")})
     record = {
         "preset": preset,
         "size_px": [width, width * 3 // 4],
@@ -64,7 +64,7 @@ def measure_memory(
         "device": device,
         "command": f"python -m benchmarks memory --runs RUNS --preset {preset} --width {width} "
         f"--photographs {photographs} --device {device}",
-        **asdict(took),
+        **asdict(usage),
         **describe(),
     }
     write_json(runs / MEMORY_FILE, record)
@@ -101,7 +101,7 @@ def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
     return scene.names[scene.test[-1]]
 
 
-def _in_a_process_of_its_own(work: Path, preset: str, width: int, photographs: int) -> str:
+def _in_another_process(work: Path, preset: str, width: int, photographs: int) -> str:
     """`make_run`, without its memory in this process, which the measured one would be charged with."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(make_run, work, preset, width, photographs).result()

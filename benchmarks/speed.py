@@ -1,36 +1,53 @@
-"""Rays per second of `paper` and of `swift`, where their time goes, and how near they come to the machine's ceilings.
+"""Rays per second of `paper` and of `swift`, where their time goes, and their share of the machine's peak arithmetic.
 
 What is counted:
 - A ray is a pixel, of a training tile or of a rendering. Networks are fresh: weights change no timing.
 - Rates are medians of several runs after a warm-up. Rendering has its features encoded beforehand; encoding is timed
-  apart, as the mean over a scene's photographs.
+  separately, as the mean over a scene's photographs.
 - Arithmetic: matrix products, convolutions and attention, forwards and, in training, backwards. Elementwise work is
-  left out, so shares of the ceilings are lower bounds.
-- Copies: what encoding, gathering, aggregation, ray transformer, colour and compositing hand on, written once and read
-  once, forwards only. A lower bound, too: what lies between, and gradients, come on top.
-- Stages are timed in runs of their own, because on a GPU it takes a pause after each.
+  left out, so shares of the peak are lower bounds.
+- Stages are timed in runs of their own, by forward hooks on the network's parts. Everything between them (batches,
+  samples, reading features, compositing, the loss) is "rest". What cores otherwise do in parallel is done one after
+  another there, by all cores together: a clock can follow only one thing at a time.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
+from unittest.mock import patch
 
 import torch
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.ceilings import Ceilings, measure_ceilings, timed
-from benchmarks.stages import ENCODING, flops_of, watched
 from tidefield.config import Config
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.renderer import Renderer
+from tidefield.parallel import sequential
 from tidefield.train.loop import Budget, SceneTrainer
 
 SQUARE_PX = 32
 """Renderings are timed on whole squares of so many pixels, as tiles are."""
 BUDGET = Budget(steps=1000)
+LARGEST_SIDE = 8192
+"""Of the matrices whose product measures the peak arithmetic."""
+ENCODING, REST = "encoding", "rest"
+PARTS = {
+    "Encoder": ENCODING,
+    "Aggregate": "aggregation",
+    "RayTransformer": "ray transformer",
+    "ColourBlend": "colour",
+}
+"""Stages by the class names of the network's parts."""
+STAGES = (*PARTS.values(), "backward", "optimiser", REST)
 
 
 @dataclass(frozen=True)
@@ -56,7 +73,6 @@ class Pace:
         runs: how many.
         rays: of each run.
         flops_per_ray: counted arithmetic.
-        bytes_per_ray: counted copies.
         seconds_per_ray: by stage.
     """
 
@@ -64,7 +80,6 @@ class Pace:
     runs: int
     rays: int
     flops_per_ray: float
-    bytes_per_ray: float
     seconds_per_ray: dict[str, float]
 
 
@@ -87,9 +102,9 @@ def measure_speed(
         configs: by preset; `paper` and `swift` are compared if both are there.
         device: where to compute.
         effort: spent on each figure.
-        say: told what is going on.
+        say: reports progress.
     """
-    say("ceilings of this machine ...")
+    say("peak arithmetic of this machine ...")
     ceilings = measure_ceilings(device, effort.seconds / 8)
     speeds = {}
     for preset, config in configs.items():
@@ -107,7 +122,7 @@ def measure_speed(
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
         "threads": torch.get_num_threads(),
         "photographs": {"count": len(scene.names), "width": int(scene.cameras.size_px[:, 0].max())},
-        "ceilings": asdict(ceilings),
+        "ceilings": ceilings,
         "presets": {preset: asdict(speed) | _shares(speed, ceilings) for preset, speed in speeds.items()},
         "ratios": ratios,
     }
@@ -117,10 +132,10 @@ def measure_training(trainer: SceneTrainer, effort: Effort) -> Pace:
     """Steps of training, batches included."""
     device, rays = trainer.device, trainer.rays_per_step
     for index in trainer.scene.train:
-        trainer.surfaces[index]  # made once in a training
+        trainer.priors[index]  # made once in a training
     trainer.step(BUDGET)
     times = _repeated(lambda: trainer.step(BUDGET), device, effort)
-    with watched(trainer.network, device, trainer.optimizer) as clock:
+    with stage_clock(trainer.network, device, trainer.optimizer) as clock:
         for _ in range(effort.least):
             trainer.step(BUDGET)
     return Pace(
@@ -128,7 +143,6 @@ def measure_training(trainer: SceneTrainer, effort: Effort) -> Pace:
         runs=len(times),
         rays=rays,
         flops_per_ray=flops_of(lambda: trainer.step(BUDGET)) / rays,
-        bytes_per_ray=2 * sum(clock.bytes.values()) / (rays * effort.least),
         seconds_per_ray={stage: seconds / (rays * effort.least) for stage, seconds in clock.seconds.items()},
     )
 
@@ -144,18 +158,16 @@ def measure_rendering(trainer: SceneTrainer, effort: Effort) -> tuple[Pace, floa
     view = window(camera, max(effort.rays, round(rate * effort.seconds / effort.least)))
     rays = view.width * view.height
     times = _repeated(lambda: renderer(view), device, effort)
-    anew = Renderer(network, scene, trainer.config, device)
-    with watched(network, device) as clock:
-        anew(view)
+    fresh = Renderer(network, scene, trainer.config, device)
+    with stage_clock(network, device) as clock:
+        fresh(view)
     encoding = clock.seconds.pop(ENCODING, 0.0)
-    clock.bytes.pop(ENCODING, None)
     small = window(camera, SQUARE_PX**2)
     pace = Pace(
         rays_per_second=rays / statistics.median(times),
         runs=len(times),
         rays=rays,
         flops_per_ray=flops_of(lambda: renderer(small)) / (small.width * small.height),
-        bytes_per_ray=2 * sum(clock.bytes.values()) / rays,
         seconds_per_ray={stage: seconds / rays for stage, seconds in clock.seconds.items()},
     )
     return pace, encoding / max(clock.photographs, 1)
@@ -179,14 +191,133 @@ def _repeated(action: Callable[[], object], device: torch.device, effort: Effort
     return times
 
 
-def _shares(speed: Speed, ceilings: Ceilings) -> dict[str, dict[str, dict[str, float]]]:
-    """Which part of each ceiling is reached."""
+def _shares(speed: Speed, ceilings: Mapping[str, float]) -> dict[str, dict[str, dict[str, float]]]:
+    """The share of the machine's peak arithmetic that is reached, by kind of work and of number."""
     shares = {}
     for kind, pace in (("training", speed.training), ("rendering", speed.rendering)):
-        flops, copied = (pace.rays_per_second * x for x in (pace.flops_per_ray, pace.bytes_per_ray))
-        shares[kind] = {
-            "float32": flops / ceilings.float32_flops,
-            "bfloat16": flops / ceilings.bfloat16_flops,
-            "copy": copied / ceilings.copy_bytes,
-        }
+        flops = pace.rays_per_second * pace.flops_per_ray
+        shares[kind] = {number: flops / ceilings[f"{number}_flops"] for number in ("float32", "bfloat16")}
     return {"shares": shares}
+
+
+class Clock:
+    """Charges every moment to one stage: of those that are running, the one that started last.
+
+    Attributes:
+        seconds: by stage, in the order of `STAGES` in the end.
+        photographs: how many photographs, or crops, were encoded.
+    """
+
+    def __init__(self, device: torch.device, now: Callable[[], float] = time.perf_counter) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.photographs = 0
+        self._device, self._now = device, now
+        self._running = [REST]
+        self._since = now()
+
+    def begin(self, stage: str) -> None:
+        self._charge()
+        self._running.append(stage)
+
+    def end(self) -> None:
+        """Stop the stage that started last."""
+        self._charge()
+        self._running.pop()
+
+    def stop(self) -> None:
+        self._charge()
+        assert self._running == [REST], f"{self._running} never ended"
+        self.seconds = {stage: self.seconds[stage] for stage in STAGES if stage in self.seconds}
+
+    def _charge(self) -> None:
+        synchronise(self._device)
+        now = self._now()
+        self.seconds[self._running[-1]] += now - self._since
+        self._since = now
+
+
+@contextmanager
+def stage_clock(
+    network: nn.Module, device: torch.device, optimizer: torch.optim.Optimizer | None = None
+) -> Iterator[Clock]:
+    """A clock that runs, stage by stage, as long as the block."""
+    clock, backward = Clock(device), Tensor.backward
+
+    def timed_backward(*args: Any, **kwargs: Any) -> None:
+        clock.begin("backward")
+        backward(*args, **kwargs)
+        clock.end()
+
+    def count(module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        clock.photographs += len(inputs[0])
+
+    with ExitStack() as stack:
+        stack.enter_context(sequential())
+        stack.enter_context(patch.object(Tensor, "backward", timed_backward))
+        for module in network.modules():
+            if stage := PARTS.get(type(module).__name__):
+                hooks = [
+                    module.register_forward_pre_hook(lambda *_, stage=stage: clock.begin(stage)),
+                    module.register_forward_hook(lambda *_: clock.end()),
+                    *([module.register_forward_pre_hook(count)] if stage == ENCODING else []),
+                ]
+                for hook in hooks:
+                    stack.callback(hook.remove)
+        if optimizer is not None:
+            stack.callback(optimizer.register_step_pre_hook(lambda *_: clock.begin("optimiser")).remove)
+            stack.callback(optimizer.register_step_post_hook(lambda *_: clock.end()).remove)
+        yield clock
+        clock.stop()
+
+
+def flops_of(action: Callable[[], object]) -> int:
+    """Count multiplications and additions of an action's matrix products, convolutions and attention."""
+    # The counter does not know attention on CPUs; in its plain form it is two matrix products.
+    with sequential(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        action()
+    return counter.get_total_flops()
+
+
+def measure_ceilings(device: torch.device, seconds: float) -> dict[str, float]:
+    """Measure the arithmetic per second in products of large matrices; spends about `seconds` on each kind."""
+    kinds = {"float32_flops": torch.float32, "bfloat16_flops": torch.bfloat16}
+    return {name: _product_rate(dtype, device, seconds) for name, dtype in kinds.items()}
+
+
+def _product_rate(dtype: torch.dtype, device: torch.device, seconds: float) -> float:
+    """Of square matrices as large as the time allows."""
+    side = 256
+    while side < LARGEST_SIDE and _best(_product(side, dtype, device), device, 0.0) < seconds / 16:
+        side *= 2
+    return 2 * side**3 / _best(_product(side, dtype, device), device, seconds)
+
+
+def _product(side: int, dtype: torch.dtype, device: torch.device) -> Callable[[], Tensor]:
+    matrix = torch.rand(side, side, device=device).to(dtype)
+    return lambda: matrix @ matrix
+
+
+def _best(action: Callable[[], object], device: torch.device, seconds: float) -> float:
+    """The shortest of as many runs as the time allows, at least one, after a warm-up."""
+    timed(action, device)
+    times = [timed(action, device)]
+    while sum(times) < seconds:
+        times.append(timed(action, device))
+    return min(times)
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait until the device has finished its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    elif device.type == "mps":
+        torch.mps.synchronize()
+
+
+def timed(action: Callable[[], object], device: torch.device) -> float:
+    """Seconds that an action takes."""
+    synchronise(device)
+    start = time.perf_counter()
+    action()
+    synchronise(device)
+    return time.perf_counter() - start

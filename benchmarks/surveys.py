@@ -1,29 +1,28 @@
-"""`tidefield prepare` on surveys as they came from the camera, beside exhaustive structure from motion.
+"""`tidefield prepare` on surveys as they came from the camera, compared with exhaustive structure from motion.
 
-RUNS/SURVEY/scene is the prepared scene, RUNS/SURVEY/exhaustive the other's model, and RUNS/SURVEY/prepare.json and
-exhaustive/exhaustive.json hold what they took. What is there is not repeated. What comes of training on prepared scenes
-and on ready-made ones of the same surveys is read from comparisons.
+Exhaustive means COLMAP's defaults without knowledge of the survey: every photograph matched with every other, the focal
+length free. RUNS/SURVEY/scene is the prepared scene, RUNS/SURVEY/exhaustive/model the other model; prepare.json and
+exhaustive/exhaustive.json hold time and memory. What is done is not repeated. Results of training on prepared and on
+ready-made scenes of the same surveys are read from comparisons.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.record import Runner, tidefield
 from tidefield.compare.results import Result, read_results
-from tidefield.compare.run import WHOLE
-from tidefield.compare.table import NOTHING, Table, shown
+from tidefield.compare.run import WHOLE, Runner, tidefield
+from tidefield.compare.tables import NOTHING, Table, shown
 from tidefield.errors import SurveyError
 from tidefield.files import completed_file, read_json, write_json
 from tidefield.machine import describe
 
-AIMS = {"brighton_beach": (18, True), "turin_lot": (32, True), "swindale": (75, False)}
-"""Photographs to be placed, and whether the drone says how high it flew."""
-UNEVEN = "_uneven"
+UNCORRECTED = "_uneven"
 """Ends the name of a scene that was prepared with --colour off."""
 METRICS = (
     ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
@@ -33,29 +32,56 @@ METRICS = (
 
 
 def measure_surveys(
-    photographs: Path, runs: Path, surveys: Sequence[str], pairs: int | None, run: Runner, say: Callable[[str], object]
+    photographs: Path, runs: Path, surveys: Sequence[str], run: Runner, say: Callable[[str], object]
 ) -> None:
-    """Prepare every survey, and place its photographs exhaustively.
-
-    Args:
-        pairs: match only so many of all pairs and reckon the time of all from them; None matches all.
+    """Prepare every survey, and reconstruct it exhaustively.
 
     Raises:
-        SurveyError: a survey is not there.
+        SurveyError: a survey is missing.
         RunError: a command failed.
     """
     for survey in surveys:
         source, folder = photographs / survey, runs / survey
         if not source.is_dir():
-            raise SurveyError(f"{source} is not there: expected a folder of photographs; name others with --surveys")
+            raise SurveyError(f"{source} is missing: expected a folder of photographs; name others with --names")
         if read_json(folder / "prepare.json") is None:
             say(f"{survey}: prepare")
-            took = run(tidefield("prepare", source, folder / "scene"), {})
-            write_json(folder / "prepare.json", {**asdict(took), **describe()})
-        if pairs != 0 and read_json(folder / "exhaustive" / "exhaustive.json") is None:
+            usage = run(tidefield("prepare", source, folder / "scene"), {})
+            write_json(folder / "prepare.json", {**asdict(usage), **describe()})
+        if read_json(folder / "exhaustive" / "exhaustive.json") is None:
             say(f"{survey}: exhaustive")
-            some = [] if pairs is None else [str(pairs)]
-            run([sys.executable, "-m", "benchmarks.exhaustive", str(source), str(folder / "exhaustive"), *some], {})
+            run([sys.executable, "-m", "benchmarks.surveys", str(source), str(folder / "exhaustive")], {})
+
+
+def reconstruct_exhaustively(photographs: Path, out: Path) -> None:
+    """Run structure from motion with COLMAP's defaults; writes OUT/model and OUT/exhaustive.json."""
+    import pycolmap
+
+    out.mkdir(parents=True, exist_ok=True)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    database, seconds = out / "database.db", {}
+    database.unlink(missing_ok=True)
+
+    def step(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        start = time.perf_counter()
+        result = function(*arguments, **options)
+        seconds[name] = time.perf_counter() - start
+        return result
+
+    names = sorted(p.name for p in photographs.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
+    mode = pycolmap.CameraMode.SINGLE
+    step("features", pycolmap.extract_features, database, photographs, image_names=names, camera_mode=mode)
+    step("matches", pycolmap.match_exhaustive, database)
+    models = step("poses", pycolmap.incremental_mapping, database, photographs, out)
+    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    pairs = len(names) * (len(names) - 1) // 2
+    record: dict[str, Any] = {"photographs": len(names), "pairs": pairs, "seconds": seconds, "registered": 0}
+    if best is not None:
+        (out / "model").mkdir(exist_ok=True)
+        best.write_binary(out / "model")
+        record["registered"] = best.num_reg_images()
+        record["focal_px"] = [camera.mean_focal_length() for camera in best.cameras.values()]
+    write_json(out / "exhaustive.json", record)
 
 
 def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready: Path | None, out: Path) -> None:
@@ -69,84 +95,27 @@ def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready:
         out: the file.
     """
     records = {survey: _read(runs / survey) for survey in surveys}
-    many, made = read_json(runs / "many.json"), describe()["machine"]
-    text = "\n\n".join(
-        [
-            "# Surveys",
-            '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS --prepared COMPARISON --ready COMPARISON"` '
-            "wrote this page; nothing is typed by hand.",
-            f"On {made['cores']} cores of {made['processor']}, without a GPU. Exhaustive means COLMAP's defaults, as "
-            "the same library (pycolmap) runs them: every photograph matched with every other, focal length free. "
-            "Where only some of the pairs were matched, drawn at random, the time of all is reckoned from theirs and "
-            "that of placing the photographs is not in it.",
-            "## What was aimed at",
-            _aims(records, many, prepared, ready).markdown(),
-            "## What came of it",
-            _quality(records).markdown(),
-            *_trained(surveys, prepared, ready),
-            _time(records).markdown(),
-            *_many(many),
-        ]
-    )
+    made = next((r["usage"] for r in records.values() if r["usage"] and "machine" in r["usage"]), describe())["machine"]
+    parts = [
+        "# Surveys",
+        _model(records).markdown(),
+        *_trained(surveys, prepared, ready),
+        _time(records).markdown(),
+        f"On {made['cores']} cores of {made['processor']}, without a GPU. Exhaustive means COLMAP's defaults, run by "
+        "the same library (pycolmap): every photograph matched with every other, focal length free.",
+        '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS --prepared COMPARISON --ready COMPARISON"` '
+        "wrote this page; nothing is typed by hand.",
+    ]
     with completed_file(out, overwrite=True) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 def _read(folder: Path) -> dict[str, Any]:
     return {
         "report": read_json(folder / "scene" / "report.json"),
-        "took": read_json(folder / "prepare.json"),
+        "usage": read_json(folder / "prepare.json"),
         "exhaustive": read_json(folder / "exhaustive" / "exhaustive.json"),
     }
-
-
-def _aims(
-    records: dict[str, dict[str, Any]], many: dict[str, Any] | None, prepared: Path | None, ready: Path | None
-) -> Table:
-    """Every aim, what came out, and whether that is enough."""
-    rows: list[list[str]] = []
-
-    for survey, (placed, height) in AIMS.items():
-        record = records.get(survey)
-        if record is None or record["report"] is None:
-            continue
-        report = record["report"]
-        shots, more = report["reconstruction_statistics"], report["tidefield"]
-        found = shots["reconstructed_shots_count"]
-        rows.append(_row(f"{survey}: {placed} photographs placed or more", f"{found}", found >= placed))
-        error = more["reprojection"]["mean_px"]
-        rows.append(_row(f"{survey}: mean reprojection error of 0.6 px or less", f"{error:.2f} px", error <= 0.6))
-        if height:
-            share = more["resolution"]["height_above_ground"]["mean"] / more["resolution"]["relative_altitude"]["mean"]
-            aim = f"{survey}: flight height within 3 % of the drone's own"
-            rows.append(_row(aim, f"{share - 1:+.1%}", abs(share - 1) <= 0.03))
-        for check in (r for r in more["residuals"] if r["kind"] == "check"):
-            for name, least in (("horizontal", 0.05), ("vertical", 0.10)):
-                aim = f"{survey}: control points left out in turn met within {100 * least:.0f} cm, {name} RMS"
-                value = check[f"rms_{name}"]
-                gsd = more["resolution"]["gsd"]["mean"]
-                shown = f"{100 * value:.1f} cm, {value / gsd:.1f} pixels on the ground"
-                rows.append(_row(aim, shown, value < least))
-            if record["took"] is not None and record["exhaustive"] is not None:
-                ratio = _whole(record["exhaustive"]) / record["took"]["seconds"]
-                rows.append(_row(f"{survey}: 3 times as fast as exhaustive or more", f"{ratio:.1f} times", ratio >= 3))
-        ours, plain, theirs = (
-            result and result.metric("psnr_seen_cc")
-            for result in (_run(prepared, survey), _run(prepared, survey + UNEVEN), _run(ready, survey))
-        )
-        if ours is not None and theirs is not None:
-            gain = f"{ours - theirs:+.2f} dB" + (
-                "" if plain is None else f", with --colour off {plain - theirs:+.2f} dB"
-            )
-            rows.append(_row(f"{survey}: trained, PSNR not under the ready-made scene's", gain, ours >= theirs))
-    if many is not None:
-        aim = f"{many['photographs']} photographs in less than 4 GB"
-        rows.append(_row(aim, f"{many['peak_memory_bytes'] / 1e9:.2f} GB", many["peak_memory_bytes"] < 4e9))
-    return Table("", ["aim", "result", ""], rows)
-
-
-def _row(aim: str, shown: str, enough: bool) -> list[str]:
-    return [aim, shown, "met" if enough else "not met"]
 
 
 def _run(comparison: Path | None, scene: str) -> Result | None:
@@ -155,10 +124,10 @@ def _run(comparison: Path | None, scene: str) -> Result | None:
 
 
 def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) -> list[str]:
-    """What `swift` makes of prepared scenes, of those without evened colours, and of ready-made ones."""
+    """What `swift` achieves on prepared scenes, on those without exposure correction, and on ready-made ones."""
     columns = {
         "prepared": (prepared, ""),
-        "prepared with --colour off": (prepared, UNEVEN),
+        "prepared with --colour off": (prepared, UNCORRECTED),
         "ready-made": (ready, ""),
     }
     rows = []
@@ -171,13 +140,14 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
         return []
     text = (
         "Over the pixels of the held-out photographs that two training photographs or more see. Prepared scenes may "
-        "hold other photographs out than ready-made ones, if they have others, and photographs whose colours were "
-        "evened are other photographs: in those that became brighter the same misses count more, in darker ones less."
+        "hold other photographs out than ready-made ones, if they have others, and photographs "
+        "whose exposures were corrected are other photographs, the held-out ones included: in those that became "
+        "brighter the same errors count more, in darker ones less. So compare prepared scenes after the colour fit."
     )
     return [Table("Trained and evaluated", ["", *columns], rows).markdown(), text]
 
 
-def _quality(records: dict[str, dict[str, Any]]) -> Table:
+def _model(records: dict[str, dict[str, Any]]) -> Table:
     columns = ["", *records]
     rows: list[list[str]] = []
 
@@ -210,16 +180,6 @@ def _quality(records: dict[str, dict[str, Any]]) -> Table:
     return Table("Model", columns, rows)
 
 
-def _many(record: dict[str, Any] | None) -> list[str]:
-    if record is None:
-        return []
-    rows = [[f"{stage}, s", f"{seconds:.0f}"] for stage, seconds in record["steps_times"].items()]
-    rows.append(["peak memory, GB", f"{record['peak_memory_bytes'] / 1e9:.2f}"])
-    return [
-        Table(f"{record['photographs']} small photographs, copies of one survey far apart", ["", ""], rows).markdown()
-    ]
-
-
 def _mean(record: dict[str, Any], name: str) -> str | None:
     value = (record["report"]["tidefield"]["resolution"].get(name) or {}).get("mean")
     return None if value is None else f"{value:.1f}"
@@ -240,14 +200,14 @@ def _time(records: dict[str, dict[str, Any]]) -> Table:
             times = {} if record["report"] is None else record["report"]["processing_statistics"]["steps_times"]
             cells.append(f"{times[stage]:.0f}" if stage in times else NOTHING)
         rows.append([f"prepare: {stage}, s", *cells])
-    rows.append(["prepare: all, s", *(_seconds(r["took"]) for r in records.values())])
-    rows.append(["prepare: peak memory, GB", *(_memory(r["took"]) for r in records.values())])
+    rows.append(["prepare: all, s", *(_seconds(r["usage"]) for r in records.values())])
+    rows.append(["prepare: peak memory, GB", *(_memory(r["usage"]) for r in records.values())])
     others = [record["exhaustive"] for record in records.values()]
 
     def other(title: str, value: Callable[[dict[str, Any]], str]) -> None:
         rows.append([f"exhaustive: {title}", *(NOTHING if o is None else value(o) for o in others)])
 
-    other("pairs matched", lambda o: f"{o['pairs_matched']:,} of {o['pairs']:,}")
+    other("pairs matched", lambda o: f"{o['pairs']:,}")
     for stage in ("features", "matches", "poses"):
         other(f"{stage}, s", lambda o, stage=stage: f"{o['seconds'][stage]:.0f}" if stage in o["seconds"] else NOTHING)
     other("all of these, s", lambda o: f"{_whole(o):.0f}")
@@ -255,8 +215,8 @@ def _time(records: dict[str, dict[str, Any]]) -> Table:
     other("focal length, px", lambda o: ", ".join(f"{f:.0f}" for f in o.get("focal_px", ())) or NOTHING)
     ratios = [
         NOTHING
-        if r["took"] is None or r["exhaustive"] is None
-        else f"{_whole(r['exhaustive']) / r['took']['seconds']:.1f}"
+        if r["usage"] is None or r["exhaustive"] is None
+        else f"{_whole(r['exhaustive']) / r['usage']['seconds']:.1f}"
         for r in records.values()
     ]
     rows.append(["exhaustive / prepare", *ratios])
@@ -267,9 +227,13 @@ def _whole(exhaustive: dict[str, Any]) -> float:
     return sum(exhaustive["seconds"].values())
 
 
-def _seconds(took: dict[str, Any] | None) -> str:
-    return NOTHING if took is None else f"{took['seconds']:.0f}"
+def _seconds(usage: dict[str, Any] | None) -> str:
+    return NOTHING if usage is None else f"{usage['seconds']:.0f}"
 
 
-def _memory(took: dict[str, Any] | None) -> str:
-    return NOTHING if took is None else f"{took['peak_memory_bytes'] / 1e9:.1f}"
+def _memory(usage: dict[str, Any] | None) -> str:
+    return NOTHING if usage is None else f"{usage['peak_memory_bytes'] / 1e9:.1f}"
+
+
+if __name__ == "__main__":
+    reconstruct_exhaustively(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tidefield.compare.record import Took
-from tidefield.compare.run import Settings
+from tidefield.compare.run import Settings, Usage
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.evaluate import NAMES
@@ -30,12 +29,12 @@ def evaluation(scene: Scene, psnr: float) -> dict:
 
 
 class Children:
-    """Stands in for the processes: leaves what they would, and remembers what they were asked."""
+    """Stands in for the processes: writes what they would write, and records their commands."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.words, self.fails_at = scene, [], None
 
-    def __call__(self, command: Sequence[str], environment: Mapping[str, str]) -> Took:
+    def __call__(self, command: Sequence[str], environment: Mapping[str, str]) -> Usage:
         assert command[:3] == [sys.executable, "-m", "tidefield.cli"]
         words = list(command[3:])
         self.words.append(words)
@@ -54,7 +53,7 @@ class Children:
                 picture = (folder / "renderings" / self.scene.names[i]).with_suffix(".png")
                 picture.parent.mkdir(parents=True, exist_ok=True)
                 Image.fromarray(self.scene.photographs[i].numpy()).save(picture)
-        return Took(12.5, 3_000_000_000)
+        return Usage(12.5, 3_000_000_000)
 
 
 def quiet(text: str) -> None:

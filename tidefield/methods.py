@@ -77,9 +77,9 @@ def configuration(name: str, preset: str = "swift") -> AnyConfig:
 
 def untrained(name: str, scene: Scene) -> Render:
     """A baseline that needs no training."""
-    from tidefield.baselines import nearest, plane_sweep, sparse_depth
+    from tidefield.baselines.untrained import nearest, plane_sweep, sparse_depth
 
-    return {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth, "nearest": nearest}[name].make(scene)
+    return {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth, "nearest": nearest}[name](scene)
 
 
 def make_trainer(

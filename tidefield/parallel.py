@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from typing import Any, TypeVar
 
@@ -14,16 +16,17 @@ from torch.autograd.function import once_differentiable
 
 T = TypeVar("T")
 Part = Callable[[], tuple[Tensor, ...]]
+_SEQUENTIAL = ContextVar("sequential", default=False)
 
 
 def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> list[T]:
-    """Results of tasks in their order, computed in parallel where the device is a CPU.
+    """Run tasks at the same time where the device is a CPU; returns their results in their order.
 
     Each task gets one core for all of its operations. Sharing every small operation among the cores instead costs
     a hand-over per operation, several times the work itself on a busy machine; and this way the results cannot
     depend on the number of cores.
     """
-    if torch.device(device).type != "cpu":
+    if torch.device(device).type != "cpu" or _SEQUENTIAL.get():
         return [task() for task in tasks]
     cores = torch.get_num_threads()
     try:
@@ -32,6 +35,16 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
             return list(pool.map(lambda task: task(), tasks))
     finally:
         torch.set_num_threads(cores)
+
+
+@contextmanager
+def sequential() -> Iterator[None]:
+    """Make `in_parallel` run its tasks one after another in the calling thread, for profiling."""
+    token = _SEQUENTIAL.set(True)
+    try:
+        yield
+    finally:
+        _SEQUENTIAL.reset(token)
 
 
 def differentiable_parts(

@@ -1,10 +1,11 @@
-"""nerfstudio's methods: the scene is handed over as it is, and the worker's lines are understood."""
+"""nerfstudio's methods: the scene that they get, their configuration, and the way back of what they render."""
 
 import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 from subprocess import CompletedProcess
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import textured_wall as wall
 import torch
 from rich.console import Console
 
-from tidefield.baselines.nerfstudio import driver, environment
+from tidefield.baselines.nerfstudio import driver, environment, worker
 from tidefield.baselines.nerfstudio.export import export
 from tidefield.config import Budget
 from tidefield.data.load import load_scene
@@ -83,27 +84,32 @@ def test_the_exported_scene_is_the_same_scene(scene: Scene, tmp_path: Path, monk
 
 
 def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Path, fake: None):
-    run, told = tmp_path / "run", []
+    run, steps = tmp_path / "run", []
     run.mkdir()
     curve = make_curve(scene)
     budget = Budget(minutes=0.5)
-    done = driver.train("nerfacto", scene, run, budget, 0, CPU, curve, lambda step, seconds: told.append(step))
-    assert told == [1, 2, 3, 3]
+    done = driver.train("nerfacto", scene, run, budget, 0, CPU, curve, lambda step, seconds: steps.append(step))
+    assert steps == [1, 2, 3, 3]
     assert (done.step, done.seconds) == (3, 30.0)
     ((seconds, psnr),) = json.loads((run / "curve.json").read_text())
     assert seconds == 20.0
-    truth = curve.truths[0].float() / 255
-    assert psnr < 60
-    assert psnr == pytest.approx(float(-10 * torch.log10((truth - 0.5).square().mean())), abs=3)
+    factor = torch.tensor(json.loads((run / "job.json").read_text())["factor"])
+    assert factor.min() < 0.9, "a scene whose factor matters"
+    expected = []
+    for truth, camera in zip(curve.truths, curve.cameras, strict=True):
+        grey = (0.5 / factor * camera.gain[0]).clamp(0, 1)
+        expected.append(float(-10 * torch.log10((truth.float() / 255 - grey).square().mean())))
+    assert psnr == pytest.approx(sum(expected) / len(expected), abs=0.05)
     with driver.renderer(run) as render:
         for index in scene.test:
             view = render(scene.cameras[index])
-            assert view.colour.shape == (36, 48, 3)
+            grey = (0.5 / factor * scene.cameras.gain[index]).clamp(0, 1)
+            torch.testing.assert_close(view.colour, grey.expand(36, 48, 3))
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert driver.progress_of(run).step == 3
 
 
-def test_what_nerfstudio_dies_of_is_told(scene: Scene, tmp_path: Path, fake: None):
+def test_an_error_of_nerfstudio_is_reported(scene: Scene, tmp_path: Path, fake: None):
     run = tmp_path / "run"
     run.mkdir()
     with pytest.raises(RunError, match=r"bad luck.*nerfstudio\.log"):
@@ -112,7 +118,7 @@ def test_what_nerfstudio_dies_of_is_told(scene: Scene, tmp_path: Path, fake: Non
         driver.progress_of(run)
 
 
-def test_without_nerfstudio_one_is_told_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_nerfstudio_the_message_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(RunError, match="run `tidefield baselines install nerfacto`"):
         environment.python()
@@ -146,6 +152,48 @@ def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path,
         environment.install(True, quiet)
 
 
+def test_a_pose_is_converted_into_the_frame_of_the_model():
+    turn = torch.linalg.qr(torch.rand(3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    right, down, forward = turn.T  # OpenCV's axes of the camera in the world
+    position = torch.tensor([1.0, -2.0, 3.0])
+    world = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    shift, scale = torch.tensor([0.5, 0.25, -1.0]), 0.2
+    T_world_camera = torch.cat([turn, position[:, None]], dim=1)
+    pose = worker.model_pose(T_world_camera.tolist(), torch.cat([world, shift[:, None]], dim=1), scale)
+    # OpenGL's camera: +x right, +y up, -z forward.
+    for column, axis in zip(pose[:, :3].T, (right, -down, -forward), strict=True):
+        torch.testing.assert_close(column, world @ axis)
+    torch.testing.assert_close(pose[:, 3], scale * (world @ position + shift))
+
+
+def test_depths_are_converted_into_z_depths_of_the_world():
+    distance = np.array([[2.0, 3.0]])
+    np.testing.assert_allclose(worker.z_depth(distance, 0.5, np.array([[1.0, 1.5]])), [[4.0, 4.0]])
+    np.testing.assert_allclose(worker.z_depth(distance, 0.5, None), [[4.0, 6.0]])
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
+def test_the_configuration_differs_from_the_defaults_only_where_it_must(device: str):
+    model = SimpleNamespace(
+        camera_optimizer=SimpleNamespace(mode="SO3xR3"),
+        use_appearance_embedding=True,
+        implementation="tcnn",
+        eval_num_rays_per_chunk=32768,
+    )
+    data = SimpleNamespace(train_num_rays_per_batch=4096)
+    config = SimpleNamespace(
+        pipeline=SimpleNamespace(model=model, datamanager=data), machine=SimpleNamespace(), max_num_iterations=30000
+    )
+    job = {"method": "nerfacto", "data": "d", "out": "o", "steps": None, "seed": 3, "device": device}
+    worker.configure(config, job, tiny_cuda_nn=device != "cpu")
+    assert model.camera_optimizer.mode == "off"
+    assert not model.use_appearance_embedding
+    assert config.machine.seed == 3
+    assert config.machine.device_type == device.split(":")[0]
+    expected = ("torch", 2048, 1024) if device == "cpu" else ("tcnn", 32768, 4096)
+    assert (model.implementation, model.eval_num_rays_per_chunk, data.train_num_rays_per_batch) == expected
+
+
 @pytest.mark.slow
 def test_the_real_nerfacto_trains_and_renders(scene: Scene, tmp_path: Path):
     try:
@@ -155,10 +203,12 @@ def test_the_real_nerfacto_trains_and_renders(scene: Scene, tmp_path: Path):
     run = tmp_path / "run"
     run.mkdir()
     plain = replace(scene, cameras=wall.cameras(5))
-    driver.train("nerfacto", plain, run, Budget(steps=20), 0, CPU, None, lambda step, seconds: None)
+    driver.train("nerfacto", plain, run, Budget(steps=500), 0, CPU, None, lambda step, seconds: None)
     with driver.renderer(run) as render:
         view = render(plain.cameras[2])
     assert view.colour.shape == (36, 48, 3)
     assert np.isfinite(view.depth.numpy()).all()
-    error = (view.colour - plain.photographs[2].float() / 255).square().mean()
-    assert error < 0.06, "it has seen something of the wall"
+    truth = plain.photographs[2].float() / 255
+    uniform = (truth - truth.mean((0, 1))).square().mean()
+    error = (view.colour - truth).square().mean()
+    assert error < 0.8 * uniform, "better than the best picture of one colour"

@@ -6,6 +6,7 @@ import json
 import shlex
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,23 +15,20 @@ import pytest
 import textured_wall as wall
 import torch
 from scenes_on_disk import PINHOLE, survey, write_colmap
-from tidefield.train.weights import write_weights
 from torch import nn
 
-from benchmarks import frames, memory, speed, stages, table
+from benchmarks import frames, memory, speed, table
 from benchmarks.__main__ import main
 from tidefield import cli
 from tidefield.commands import views
-from tidefield.compare import record
-from tidefield.compare.record import Took
+from tidefield.compare.run import Usage, run_measured
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import pixel_grid
 from tidefield.model.network import Network
-from tidefield.model.rendering import Rendering
-from tidefield.model.views import Views
-from tidefield.train.loop import SceneTrainer
+from tidefield.parallel import in_parallel, sequential
+from tidefield.train.checkpoint import write_weights
 
 CPU = torch.device("cpu")
 
@@ -44,41 +42,34 @@ def tiny(preset: str) -> Config:
     return replace(config, network=network, train=train)
 
 
-def test_a_childs_memory_and_its_failure_are_seen() -> None:
-    took = record.run_measured(
+def test_memory_and_failure_of_a_process_are_reported() -> None:
+    usage = run_measured(
         [sys.executable, "-c", "import os; b'x' * 600_000_000; assert os.environ['A'] == 'b'"], {"A": "b"}
     )
-    assert took.peak_memory_bytes > 600_000_000
-    assert took.seconds > 0
+    assert usage.peak_memory_bytes > 600_000_000
+    assert usage.seconds > 0
     with pytest.raises(RunError, match="status 3"):
-        record.run_measured([sys.executable, "-c", "raise SystemExit(3)"], {})
+        run_measured([sys.executable, "-c", "raise SystemExit(3)"], {})
 
 
-def test_every_moment_is_charged_to_the_innermost_stage() -> None:
+def test_time_is_charged_to_the_innermost_stage() -> None:
     moments = iter([0.0, 1.0, 3.0, 6.0, 10.0, 15.0])
-    clock = stages.Clock(CPU, now=lambda: next(moments))
+    clock = speed.Clock(CPU, now=lambda: next(moments))
     clock.begin("colour")
-    clock.begin("gathering")
-    clock.end(torch.zeros(5))
+    clock.begin("encoding")
+    clock.end()
     clock.end()
     clock.stop()
-    assert clock.seconds == {"gathering": 3.0, "colour": 2.0 + 4.0, "rest": 1.0 + 5.0}
-    assert clock.bytes == {"gathering": 20, "colour": 0}
+    assert clock.seconds == {"encoding": 3.0, "colour": 2.0 + 4.0, "rest": 1.0 + 5.0}
 
 
-def test_shared_memory_counts_once() -> None:
-    values = torch.zeros(10, 7)
-    assert stages.bytes_of((values[:, :3], {"rest": [values[:, 3:]]})) == values.nbytes
-    assert stages.bytes_of(torch.zeros(1, 7).expand(10, 7)) == 28
-
-
-def test_arithmetic_is_that_of_products_and_attention() -> None:
+def test_products_and_attention_are_counted() -> None:
     a, b = torch.rand(4, 5), torch.rand(5, 6)
-    assert stages.flops_of(lambda: a @ b) == 2 * 4 * 5 * 6
+    assert speed.flops_of(lambda: a @ b) == 2 * 4 * 5 * 6
     query = torch.rand(3, 2, 7, 8)
     attention = nn.functional.scaled_dot_product_attention
     with torch.inference_mode():
-        assert stages.flops_of(lambda: attention(query, query, query)) == 2 * 2 * (3 * 2 * 7 * 7 * 8)
+        assert speed.flops_of(lambda: attention(query, query, query)) == 2 * 2 * (3 * 2 * 7 * 7 * 8)
 
 
 @pytest.mark.parametrize("rays", [1, 1024, 5000, 10**9])
@@ -96,17 +87,15 @@ def test_a_window_holds_rays_of_its_camera(rays: int) -> None:
 
 def test_speed_is_measured_stage_by_stage_and_leaves_no_trace() -> None:
     scene = wall.scene(wall.cameras(4))
-    before = Views.read, torch.Tensor.backward
+    before = torch.Tensor.backward
     configs = {preset: tiny(preset) for preset in ("paper", "swift")}
     report = speed.measure_speed(scene, configs, CPU, speed.Effort(0.0, least=1), lambda line: None)
-    assert (Views.read, torch.Tensor.backward) == before
+    assert torch.Tensor.backward is before
     assert set(report["ratios"]) == {"training", "rendering"}
     for preset in ("paper", "swift"):
         training, rendering = (report["presets"][preset][kind] for kind in ("training", "rendering"))
-        assert list(training["seconds_per_ray"]) == list(stages.STAGES)
-        assert set(rendering["seconds_per_ray"]) == set(stages.STAGES) - {
-            "batches", "encoding", "backward", "optimiser"
-        }  # fmt: skip
+        assert list(training["seconds_per_ray"]) == list(speed.STAGES)
+        assert set(rendering["seconds_per_ray"]) == set(speed.STAGES) - {"encoding", "backward", "optimiser"}
         assert all(seconds > 0 for pace in (training, rendering) for seconds in pace["seconds_per_ray"].values())
         assert training["flops_per_ray"] > rendering["flops_per_ray"] > 0
         assert report["presets"][preset]["encoding_seconds"] > 0
@@ -115,12 +104,11 @@ def test_speed_is_measured_stage_by_stage_and_leaves_no_trace() -> None:
     assert "| ray transformer |" in text
 
 
-def test_copies_of_rendering_are_at_least_what_is_gathered() -> None:
-    scene, config = wall.scene(wall.cameras(4)), tiny("paper")
-    trainer = SceneTrainer(config, scene, 0, CPU)
-    pace, _ = speed.measure_rendering(trainer, speed.Effort(0.0, least=1))
-    views, samples, channels = 2, 4, 8
-    assert pace.bytes_per_ray > 2 * views * samples * (3 + channels) * 4
+def test_tasks_run_in_the_calling_thread_while_they_are_profiled() -> None:
+    tasks = [threading.get_ident] * 3
+    with sequential():
+        assert set(in_parallel(tasks, "cpu")) == {threading.get_ident()}
+    assert threading.get_ident() not in in_parallel(tasks, "cpu")
 
 
 def test_the_measuring_process_stays_small() -> None:
@@ -135,7 +123,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
     monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
     asked = []
 
-    def run(command: Sequence[str], environment: Mapping[str, str]) -> Took:
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
         folder = Path(command[4])
         scene = load_scene(folder.parent / "scene")
         assert (scene.cameras.width, scene.cameras.height) == (96, 72)
@@ -144,7 +132,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         monkeypatch.setattr(sys, "argv", ["tidefield", *command[3:]])
         cli.main()
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents
-        return Took(1.0, 5_000_000_000)
+        return Usage(1.0, 5_000_000_000)
 
     memory.measure_memory(tmp_path, "swift", 96, 4, "cpu", run, memory.make_run)
     assert len(asked) == 1
@@ -152,7 +140,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
     assert {path.name for path in tmp_path.iterdir()} == {"cache", "memory.json"}
 
 
-def test_a_survey_lies_among_copies_of_itself() -> None:
+def test_copies_of_a_survey_lie_apart() -> None:
     own = wall.scene(wall.cameras(6, step=0.3), (0,))
     many = frames.among_copies(own, 15)
     assert (len(many.names), len(set(many.names)), len(many.cameras)) == (15, 15, 15)
@@ -167,35 +155,6 @@ def test_a_survey_lies_among_copies_of_itself() -> None:
     assert torch.cdist(copies, copies).fill_diagonal_(torch.inf).min() > 3
 
 
-def test_frames_that_show_the_same_differ_little_and_a_jump_is_seen() -> None:
-    cameras = wall.cameras(4, 96, 72, step=0.02)
-    each = [cameras[k] for k in range(4)]
-    shown = [Rendering(wall.photograph(c).float() / 255, wall.true_depth(c), torch.ones(72, 96)) for c in each]
-    assert max(change.nanmean() for change in frames.changes(shown, each)) < 1.5
-    brighter = replace(shown[2], colour=shown[2].colour + 0.1)
-    found = [change.nanmean().item() for change in frames.changes([*shown[:2], brighter, shown[3]], each)]
-    assert found == [pytest.approx(value, abs=1.5) for value in (0, 25.5, 25.5)]
-    elsewhere = replace(shown[1], depth=shown[1].depth * torch.where(torch.arange(96) < 48, 1.0, 1.1))
-    jumping = replace(elsewhere, colour=torch.where((torch.arange(96) < 48)[:, None], elsewhere.colour, 0.0))
-    change = next(frames.changes([shown[0], jumping], each[:2]))
-    assert change.nanmean() < 1.5, "what disagrees in depth is left out"
-    assert change[:, 60:].isnan().all()
-
-
-def test_a_jump_of_one_tile_is_told() -> None:
-    cameras = wall.cameras(2, 96, 72, step=0.0)
-    each = [cameras[k] for k in range(2)]
-    shown = [Rendering(torch.full((72, 96, 3), 0.5), wall.true_depth(c), torch.ones(72, 96)) for c in each]
-    colour = shown[1].colour.clone()
-    colour[32:64, 64:96] += 0.1
-    found = frames._summary([shown[0], replace(shown[1], colour=colour)], each)
-    assert found["greatest_of_a_tile_levels"] == pytest.approx(25.5, abs=1.5)
-    nothing = replace(shown[1], depth=2 * shown[1].depth)
-    told = frames._summary([shown[0], nothing, shown[0]], [each[0], each[1], each[0]])
-    assert set(told.values()) == {None}, "frames that share nothing say nothing, and JSON has no nan"
-    assert found["greatest_levels"] == found["mean_levels"] == pytest.approx(25.5 * 32 * 32 / (72 * 96), abs=0.2)
-
-
 def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, small = tmp_path / "scene", tiny("swift")
     write_colmap(scene, survey(PINHOLE))
@@ -203,25 +162,19 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(frames, "PRESETS", {"swift": small})
     monkeypatch.setattr(frames, "COUNTS", (12,))
     monkeypatch.setattr(frames, "SIZE_PX", (32, 24))
-    monkeypatch.setattr(frames, "STEADY_FRAMES", 3)
-    monkeypatch.setattr(frames, "STEADY_WIDTH", 32)
-    monkeypatch.setattr(frames, "STEADY_TILE_PX", 8)
-    monkeypatch.setattr(frames, "STEADY_FLIGHT_FRAMES", 48)
     write_weights(tmp_path / "w.safetensors", Network(small.network), small, {})
     asked = []
 
-    def run(command: Sequence[str], environment: Mapping[str, str]) -> Took:
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
         asked.extend(command)
         assert not Path(environment["XDG_CACHE_HOME"]).exists(), "nothing is decoded before"
-        return Took(12.5, 1)
+        return Usage(12.5, 1)
 
     record = frames.measure_frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", "cpu", run)
     assert record == json.loads((tmp_path / "frames.json").read_text())
     assert "--zero-shot" in asked
     assert record["first"]["seconds"] == 12.5
     assert list(record["by_photographs"]) == ["9", "12"]
-    steady = record["steadiness"].values()
-    assert all(0 < s["mean_levels"] <= s["greatest_levels"] <= s["greatest_of_a_tile_levels"] for s in steady)
     assert all(len(made.rows) > 1 for made in table.frame_tables(record))
 
 
@@ -229,7 +182,7 @@ def test_without_a_name_speed_is_measured(monkeypatch: pytest.MonkeyPatch, tmp_p
     with pytest.raises(SystemExit) as ended:
         main(["--quick", "--runs", str(tmp_path)])
     assert ended.value.code == 2
-    assert "not worth keeping" in capsys.readouterr().err
+    assert "not worth storing" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", ["--help", "speed --help", "frames --help", "memory --help", "table --help"])

@@ -9,10 +9,9 @@ from comparisons import Children, evaluation, quiet
 from scenes_on_disk import PINHOLE, survey, write_colmap
 from tidefield.options import Ablate
 
-from tidefield.compare.ablation import ablation_tables, variants, verdicts
+from tidefield.compare.ablation import ablation_tables, summarise, variants, write_ablation
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
-from tidefield.compare.write import write_ablation
 from tidefield.config import PAPER, SWIFT, EncoderConfig, config_from_json, config_to_json
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
@@ -34,7 +33,7 @@ def test_a_variant_is_a_network_that_a_run_can_store(name: str, preset):
     assert (varied == preset) == (name in itself)
 
 
-def test_there_is_no_other_variant():
+def test_an_unknown_variant_is_refused():
     with pytest.raises(RunError, match="no variant colourless: expected one of no-neighbours"):
         vary(SWIFT, "colourless")
 
@@ -49,7 +48,7 @@ def test_variants_are_trained_like_the_network_itself():
     assert len(variants(Ablate.variants)) == 2 + len(VARIANTS)
 
 
-def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
+def test_the_table_marks_differences_within_the_noise(tmp_path: Path):
     write_colmap(tmp_path / "flats", survey(PINHOLE))
     scene = load_scene(tmp_path / "flats", width=48)
     psnr = {"tidefield": 30.0, OTHER_SEED: 30.2, "views-2": 27.0, "degree-0": 29.85}
@@ -62,7 +61,7 @@ def test_the_table_says_what_is_within_the_noise(tmp_path: Path):
     assert [row[:2] for row in other.rows] == [["tidefield", "25.00"]]
 
 
-def test_what_brings_nothing_on_any_scene_gets_a_line_that_says_so(tmp_path: Path):
+def test_the_summary_names_what_has_no_effect_on_any_scene(tmp_path: Path):
     write_colmap(tmp_path / "flats", survey(PINHOLE))
     scene = load_scene(tmp_path / "flats", width=48)
     psnr = {
@@ -77,9 +76,9 @@ def test_what_brings_nothing_on_any_scene_gets_a_line_that_says_so(tmp_path: Pat
         "creek": {"tidefield": 25.0, "views-2": 25.01, "degree-0": 25.04, "field": 25.2, "views-8": 25.3},
     }
     by = {(name, method): Result(evaluation(scene, value)) for name, of in psnr.items() for method, value in of.items()}
-    lines = verdicts(Results(tuple(psnr), (*psnr["flats"], "no-neighbours"), by))
+    lines = summarise(Results(tuple(psnr), (*psnr["flats"], "no-neighbours"), by))
     assert [line.rpartition(": ")[2] for line in lines] == ["views-2.", "field.", "degree-0."]
-    assert "brings nothing" in lines[2]
+    assert "no effect" in lines[2]
 
 
 def test_an_ablation_is_run_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -17,18 +17,25 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 from tidefield.options import Compare
 
 from tidefield import cli
-from tidefield.compare import published
 from tidefield.compare.figures import most_different, side_by_side, write_curves
 from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
 from tidefield.compare.results import figures_of, read_figures, read_results
-from tidefield.compare.run import METHODS, Settings, commands, compare
-from tidefield.compare.table import Table
-from tidefield.compare.tables import cost_table, paper_table, quality_tables
-from tidefield.compare.write import write_comparison
+from tidefield.compare.run import Settings, commands, compare
+from tidefield.compare.tables import (
+    TABLE_2,
+    TABLE_3,
+    Table,
+    cost_table,
+    nerfacto_limits,
+    paper_table,
+    quality_tables,
+    write_comparison,
+)
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
 from tidefield.files import write_json
+from tidefield.methods import METHODS
 
 
 @pytest.fixture
@@ -43,11 +50,11 @@ def test_every_method_is_trained_and_evaluated_once(disk: Path, tmp_path: Path):
     methods, out = ("tidefield", "nerfacto", "nearest"), tmp_path / "out"
     compare({"flats": disk}, methods, SETTINGS, out, run, quiet)
     assert [words[0] for words in run.words] == ["train", "evaluate", "train", "evaluate", "evaluate"]
-    first, peer, floor = run.words[0], run.words[2], run.words[4]
-    assert first[3:5] == ["--preset", "swift"]
-    assert peer[3:5] == ["--method", "nerfacto"]
-    assert floor[3:5] == ["--method", "nearest"]
-    for words in (first, peer):
+    own, other, untrained = run.words[0], run.words[2], run.words[4]
+    assert own[3:5] == ["--preset", "swift"]
+    assert other[3:5] == ["--method", "nerfacto"]
+    assert untrained[3:5] == ["--method", "nearest"]
+    for words in (own, other):
         assert words[5:8] == ["--minutes", "10", "--curve"]
         assert words[8:10] == ["--width", "48"]
     compare({"flats": disk}, (*methods, "nerf"), SETTINGS, out, run, quiet)
@@ -58,14 +65,14 @@ def test_every_method_is_trained_and_evaluated_once(disk: Path, tmp_path: Path):
     assert record["evaluate"]["command"] == "tidefield evaluate RUN --device cpu"
 
 
-def test_zero_shot_is_with_the_weights_of_its_preset() -> None:
+def test_zero_shot_uses_the_weights_of_its_preset() -> None:
     for method, preset in (("zero-shot", "swift"), ("paper-zero-shot", "paper")):
         asked = commands(Path("data"), Path("run"), method, SETTINGS)
         assert list(asked) == ["evaluate"]
         assert asked["evaluate"][3:6] == ["--zero-shot", "--preset", preset]
 
 
-def test_a_training_that_broke_off_begins_anew_and_one_that_ended_does_not(disk: Path, tmp_path: Path):
+def test_an_interrupted_training_is_repeated_and_a_finished_one_is_not(disk: Path, tmp_path: Path):
     run = Children(load_scene(disk, width=48))
     run.fails_at = 2
     with pytest.raises(RunError, match="it broke"):
@@ -104,14 +111,14 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     page = (out / "tables.md").read_text()
     assert "| flats | 20.00 | - | **28.00** |" in page
     assert "LPIPS, VGG" in page
-    assert "LPIPS with alexnet-owt-7be5be79.pth, as it is published (SHA-256 7be5be79" in page
+    assert "LPIPS with alexnet-owt-7be5be79.pth, the published file (SHA-256 7be5be79" in page
     assert "LPIPS with vgg16-397923af.pth, which is another file than the published one (SHA-256 ffff" in page
     assert "LPIPS, AlexNet, all pixels (" not in page, "of what nobody has there is no table"
     assert "| flats, tidefield | 10.0 | 7 | 0.50 | 1,234 | 3.00, 3.00 |" in page
     numbers = json.loads((out / "comparison.json").read_text())
     assert numbers["settings"]["minutes"] == 10
     assert numbers["results"][0]["curve"] == [[10.0, 20.5], [600.0, 25.0]]
-    assert str(tmp_path) not in (out / "comparison.json").read_text(), "where things lie here is nobody's business"
+    assert str(tmp_path) not in (out / "comparison.json").read_text(), "the paths of this machine are not published"
     again = read_figures([out / "comparison.json", tmp_path / "none.json"], ["other"], results.methods)
     assert quality_tables(again) == quality_tables(results)
     assert cost_table(again) == cost_table(results)
@@ -119,7 +126,7 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
         assert figure.width == 3 * 320 + 2 * 4
 
 
-def test_the_best_stands_out_and_means_need_every_scene(disk: Path, tmp_path: Path):
+def test_the_best_is_bold_and_means_need_every_scene(disk: Path, tmp_path: Path):
     out = tmp_path / "out"
     run = Children(load_scene(disk, width=48))
     compare({"a": disk, "b": disk}, ("tidefield",), SETTINGS, out, run, quiet)
@@ -146,19 +153,28 @@ def test_the_last_of_several_comparisons_counts(disk: Path, tmp_path: Path):
     assert found.metric("a", "nearest", "psnr") == 28.0
 
 
-def test_published_figures_stand_beside_measured_ones(disk: Path, tmp_path: Path):
+def test_published_figures_stand_next_to_measured_ones(disk: Path, tmp_path: Path):
     out = tmp_path / "out"
     compare({"garden": disk}, ("tidefield",), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
     results = read_results(out, ["garden", "other"], ["tidefield"])
-    table = paper_table(results, published.TABLE_2, "Table 2")
+    table = paper_table(results, TABLE_2, "Table 2")
     assert table is not None
     assert table.rows[0][:4] == ["garden", "20.00", "25.01", "23.06"]
     assert table.rows[1][:4] == ["mean", "20.00", "25.01", "23.06"]
-    assert paper_table(results, published.TABLE_3, "Table 3") is None
-    assert np.mean([v["nerfacto"][0] for v in published.TABLE_2.values()]) == pytest.approx(21.77, abs=0.01)
-    assert np.mean([v["tidefield"][0] for v in published.TABLE_2.values()]) == pytest.approx(24.43, abs=0.01)
-    assert np.mean([v["tidefield"][0] for v in published.TABLE_3.values()]) == pytest.approx(22.49, abs=0.01)
-    assert np.mean([v["nerfacto"][0] for v in published.TABLE_3.values()]) == pytest.approx(22.30, abs=0.01)
+    assert paper_table(results, TABLE_3, "Table 3") is None
+    assert np.mean([v["nerfacto"][0] for v in TABLE_2.values()]) == pytest.approx(21.77, abs=0.01)
+    assert np.mean([v["tidefield"][0] for v in TABLE_2.values()]) == pytest.approx(24.43, abs=0.01)
+    assert np.mean([v["tidefield"][0] for v in TABLE_3.values()]) == pytest.approx(22.49, abs=0.01)
+    assert np.mean([v["nerfacto"][0] for v in TABLE_3.values()]) == pytest.approx(22.30, abs=0.01)
+
+
+def test_the_limits_of_nerfacto_are_stated_where_it_ran_on_a_cpu(disk: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    compare({"flats": disk}, ("nerfacto", "nearest"), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
+    (sentence,) = nerfacto_limits(read_results(out, ["flats"], ["nerfacto", "nearest"]))
+    assert "1,024 rays a batch instead of its default of 4,096" in sentence
+    assert "7 to 7 steps, 0.0% to 0.0% of its default of 30,000" in sentence
+    assert nerfacto_limits(read_results(out, ["flats"], ["nearest"])) == []
 
 
 def test_a_table_in_every_form():
@@ -229,7 +245,7 @@ def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: py
         named([disk, tmp_path / "elsewhere" / "flats"])
     (tmp_path / "other").symlink_to(disk)
     assert named([disk, tmp_path / "other"]) == {"flats": disk, "other": tmp_path / "other"}
-    assert set(MIPNERF360) == set(published.TABLE_2)
+    assert set(MIPNERF360) == set(TABLE_2)
     made = []
 
     def write(survey: object, folder: Path) -> None:
@@ -239,7 +255,7 @@ def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("tidefield.compare.protocols.make_survey", lambda *_, **__: None)
     monkeypatch.setattr("tidefield.compare.protocols.write_survey", write)
     scenes = tidal_flats(tmp_path / "scenes", 100, [disk])
-    assert set(scenes) == set(published.TABLE_3) | {"flats"}
+    assert set(scenes) == set(TABLE_3) | {"flats"}
     assert len(made) == 5
     tidal_flats(tmp_path / "scenes", 100, [])
     assert len(made) == 5
@@ -258,7 +274,7 @@ def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest
     assert called == list(asked)
 
 
-def test_what_is_missing_is_told_before_anything_is_trained(
+def test_missing_software_is_reported_before_anything_is_trained(
     disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.baselines.photograph import read_photograph
+from tidefield.baselines.untrained import read_photograph
 from tidefield.model.rendering import fill_unseen
 from tidefield.model.views import concatenate, gather, maps_from_images, upsample_twice, weighted_rows
 

@@ -42,8 +42,7 @@ class Ablate:
 def ablate(options: Ablate, console: Console) -> None:
     """Run `tidefield ablate`."""
     from tidefield.compare import protocols
-    from tidefield.compare.ablation import variants
-    from tidefield.compare.write import write_ablation
+    from tidefield.compare.ablation import variants, write_ablation
 
     for name in options.variants:
         vary(PRESETS[options.preset], name)  # before anything is trained

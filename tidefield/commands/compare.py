@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -54,11 +53,9 @@ class Compare:
 def compare(options: Compare, console: Console) -> None:
     """Run `tidefield compare`."""
     from tidefield.baselines.nerfstudio import driver
-    from tidefield.compare.write import write_comparison
+    from tidefield.compare.tables import write_comparison
     from tidefield.device import choose_device
 
-    if find_spec("matplotlib") is None:
-        raise RunError("matplotlib is not installed: expected it, for the curves; pip install 'tidefield[compare]'")
     for method in ("nerfacto", "splatfacto"):
         if method in options.methods:
             driver.require(method, choose_device(options.device))  # before anything is trained
@@ -85,9 +82,8 @@ def run_all(
     scenes: Mapping[str, Path], methods: Sequence[str], settings: Settings, out: Path, console: Console
 ) -> Results:
     """Train and evaluate what has not been done yet, and read all results."""
-    from tidefield.compare.record import run_measured
     from tidefield.compare.results import read_results
-    from tidefield.compare.run import compare
+    from tidefield.compare.run import compare, run_measured
 
     compare(scenes, methods, settings, out, run_measured, lambda text: print_lines(console, [text]))
     return read_results(out, list(scenes), methods)

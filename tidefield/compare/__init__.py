@@ -1,1 +1,1 @@
-"""Methods compared on the same photographs, split, resolution, machine and budget: runs, tables and figures."""
+"""Compare methods on the same photographs, split, resolution, machine and budget: runs, tables and figures."""

@@ -1,58 +1,77 @@
-"""The ablation: what each part of the network brings, by leaving it out, and how far another seed gets."""
+"""Tables of an ablation: the effect of leaving out or changing one part, next to the effect of another seed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from tidefield.compare.results import Results
-from tidefield.compare.run import OTHER_SEED, WHOLE
-from tidefield.compare.table import Table, shown
+from tidefield.compare.run import OTHER_SEED, WHOLE, Settings
+from tidefield.compare.tables import Table, shown, write_figures, write_tables
 from tidefield.variants import VARIANTS
 
 LEAST_DB = 0.05
-"""What is less says nothing, even if two seeds happened to agree better."""
+"""A smaller difference counts as noise, even if two seeds happen to agree better."""
 WITHIN = "within the noise"
-_METRICS = (("psnr_seen", "{:.2f}"), ("psnr_seen_cc", "{:.2f}"), ("ssim_seen", "{:.4f}"), ("lpips_vgg_seen", "{:.4f}"))
+_METRICS = (
+    ("psnr_seen", "PSNR, dB", "{:.2f}"),
+    ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
+    ("ssim_seen", "SSIM", "{:.4f}"),
+    ("lpips_vgg_seen", "LPIPS, VGG", "{:.4f}"),
+)
 
 
 def variants(chosen: Sequence[str]) -> tuple[str, ...]:
-    """The network as it is, once more with another seed, and the variants of it; all of them where none is chosen."""
+    """The whole network, the same with another seed, and its variants; all of these where none is chosen."""
     return (WHOLE, OTHER_SEED, *(chosen or VARIANTS))
 
 
 def ablation_tables(results: Results) -> list[Table]:
-    """One for each scene of which something is there."""
-    there = {scene for scene, _ in results.by}
-    return [_table(results, scene) for scene in results.scenes if scene in there]
+    """One table for each scene that has results."""
+    measured = {scene for scene, _ in results.by}
+    return [_table(results, scene) for scene in results.scenes if scene in measured]
 
 
-def verdicts(results: Results) -> list[str]:
-    """What the tables say of all scenes together, as sentences: which parts matter, and which bring nothing."""
-    told: dict[str, list[str]] = {}
+def summarise(results: Results) -> list[str]:
+    """What the tables of all scenes show together, as sentences: which parts matter, and which bring nothing."""
+    groups: dict[str, list[str]] = {}
     for method in results.methods:
         if method not in (WHOLE, OTHER_SEED):
-            each = (_verdict(results, scene, method) for scene in results.scenes)
-            found = {verdict for verdict in each if verdict is not None}
+            each = (_effect(results, scene, method) for scene in results.scenes)
+            found = {effect for effect in each if effect is not None}
             beyond = found - {WITHIN}
             if found and len(beyond) < 2:
-                told.setdefault(next(iter(beyond), WITHIN), []).append(method)
+                groups.setdefault(next(iter(beyond), WITHIN), []).append(method)
     sentences = {
-        "worse": "Worse than the whole, and nowhere better",
-        "better": "Better than the whole, and nowhere worse",
-        WITHIN: "Nowhere to be told from another seed, so that what was changed brings nothing in this time",
+        "worse": "Worse than the whole network, and nowhere better",
+        "better": "Better than the whole network, and nowhere worse",
+        WITHIN: "Not distinguishable from another seed on any scene, so the change has no effect in this time",
     }
-    return [f"{said}: {', '.join(told[verdict])}." for verdict, said in sentences.items() if verdict in told]
+    return [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
+
+
+def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path]:
+    """Write the tables and figures of an ablation, complete or not, over older ones.
+
+    Returns:
+        The files.
+    """
+    tables = ablation_tables(results)
+    return [
+        *write_tables("ablation", "Ablation", tables, summarise(results), results, settings, out),
+        write_figures("ablation", results, settings, out),
+    ]
 
 
 def _difference(results: Results, scene: str, method: str) -> float | None:
-    """PSNR beside that of the network as it is, dB."""
+    """PSNR minus that of the whole network, dB."""
     own, whole = (results.metric(scene, name, "psnr_seen") for name in (method, WHOLE))
     return None if own is None or whole is None or method == WHOLE else own - whole
 
 
-def _verdict(results: Results, scene: str, method: str) -> str | None:
-    """Better, worse or within the noise, which is what another seed makes, and at least `LEAST_DB`."""
+def _effect(results: Results, scene: str, method: str) -> str | None:
+    """Better, worse or within the noise, which is the difference of another seed, and at least `LEAST_DB`."""
     difference, other = (_difference(results, scene, name) for name in (method, OTHER_SEED))
     if difference is None:
         return None
@@ -60,33 +79,30 @@ def _verdict(results: Results, scene: str, method: str) -> str | None:
 
 
 def _table(results: Results, scene: str) -> Table:
-    """A line for each variant, and what it says beside the network as it is."""
-    columns = ["variant", "PSNR, dB", "PSNR after the colour fit, dB", "SSIM", "LPIPS, VGG", "rays/s", "difference, dB"]
-    rows = []
-    for method in results.methods:
-        result = results.by.get((scene, method))
-        if result is not None:
-            values = [result.metric(metric) for metric, _ in _METRICS]
-            rows.append(
-                [
-                    method,
-                    *(shown(value, style) for value, (_, style) in zip(values, _METRICS, strict=True)),
-                    f"{result.evaluation['rays_per_second']:,.0f}",
-                    _shown_difference(results, scene, method),
-                ]
-            )
-    budgets = {_budget(result.process.get("settings", {})) for (at, _), result in results.by.items() if at == scene}
+    """A line for each variant; metrics that no variant has are left out."""
+    found = {method: results.by[scene, method] for method in results.methods if (scene, method) in results.by}
+    metrics = [of for of in _METRICS if any(result.metric(of[0]) is not None for result in found.values())]
+    rows = [
+        [
+            method,
+            *(shown(result.metric(metric), style) for metric, _, style in metrics),
+            f"{result.evaluation['rays_per_second']:,.0f}",
+            _shown_difference(results, scene, method),
+        ]
+        for method, result in found.items()
+    ]
+    budgets = {_budget(result.process.get("settings", {})) for result in found.values()}
     title = f"{scene}, {' or '.join(sorted(budgets))}, pixels that two training photographs or more see"
-    return Table(title, columns, rows)
+    return Table(title, ["variant", *(title for _, title, _ in metrics), "rays/s", "difference, dB"], rows)
 
 
 def _budget(settings: Mapping[str, Any]) -> str:
     """How a variant was trained."""
     steps, minutes = settings.get("steps"), settings.get("minutes")
-    begun = " from random weights" if settings.get("from_scratch") else ""
-    return (f"{minutes:g} min" if minutes is not None else f"{steps} steps") + begun
+    start = " from random weights" if settings.get("from_scratch") else ""
+    return (f"{minutes:g} min" if minutes is not None else f"{steps} steps") + start
 
 
 def _shown_difference(results: Results, scene: str, method: str) -> str:
-    within = _verdict(results, scene, method) == WITHIN and method != OTHER_SEED
+    within = _effect(results, scene, method) == WITHIN and method != OTHER_SEED
     return shown(_difference(results, scene, method), "{:+.2f}") + (f", {WITHIN}" if within else "")

@@ -1,4 +1,4 @@
-"""What a comparison has measured so far, read from its folder or from the JSON that it left."""
+"""Read the results of a comparison from its folder, or from the JSON that it left."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Result:
     folder: Path | None = None
 
     def metric(self, name: str) -> float | None:
-        """A mean over the held-out photographs."""
-        return self.evaluation["mean"][name]
+        """A mean over the held-out photographs; None where it was not measured."""
+        return self.evaluation["mean"].get(name)
 
     @property
     def trained_minutes(self) -> float | None:
@@ -50,11 +50,11 @@ class Result:
 
 @dataclass(frozen=True)
 class Results:
-    """All that is there.
+    """All results.
 
     Attributes:
         scenes, methods: names, in the order of the tables.
-        by: results by scene and method; what has not been measured is not in it.
+        by: results by scene and method; what has not been measured is missing.
     """
 
     scenes: tuple[str, ...]
@@ -73,7 +73,7 @@ class Results:
 
 
 def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Results:
-    """What the folder of a comparison holds of these."""
+    """Read the results of these scenes and methods from the folder of a comparison."""
     found = {}
     for scene in scenes:
         for method in methods:
@@ -86,7 +86,7 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
 
 
 def figures_of(results: Results) -> list[dict[str, Any]]:
-    """All results as JSON, but for those of single photographs and for where the scenes lie on this machine."""
+    """All results as JSON, without those of single photographs and without the scenes' paths on this machine."""
     return [
         {
             "scene": scene,
@@ -104,12 +104,12 @@ def _portable(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_figures(files: Sequence[Path], scenes: Sequence[str], methods: Sequence[str]) -> Results:
-    """What comparisons left as JSON (`figures_of`), all together; of what several have measured, the last one counts.
+    """Read results that comparisons stored as JSON (`figures_of`); of a result in several files the last one counts.
 
     Args:
-        files: comparison.json or ablation.json; those that are not there hold nothing.
-        scenes: that come first, if they are there.
-        methods: that are wanted.
+        files: comparison.json or ablation.json; missing files are skipped.
+        scenes: the order of the tables' first scenes; other scenes follow by name.
+        methods: to read.
     """
     found = {}
     for file in files:

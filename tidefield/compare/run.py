@@ -1,31 +1,44 @@
-"""Every method on every scene, in processes of their own, one after another.
+"""Run every method on every scene, each in a process of its own, one after another, and measure its time and memory.
 
-OUT/runs/SCENE/METHOD/ holds what `tidefield train` and `tidefield evaluate` write there, and process.json: what they
-took. What has an evaluation.json is not repeated; a training that was broken off begins anew, so that its figures are
-those of one process.
+OUT/runs/SCENE/METHOD/ holds what `tidefield train` and `tidefield evaluate` write there, and process.json: the time and
+memory that they used. What has an evaluation.json is not repeated; an interrupted training is started again, so that
+its figures are those of one process.
+
+Needs a Unix system. Imports nothing heavy: at its start, a process is charged with the peak memory of the one that
+started it, so the measuring process must stay small.
 """
 
 from __future__ import annotations
 
+import os
 import shlex
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tidefield.compare.record import Runner, tidefield
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_json
 from tidefield.machine import describe
+from tidefield.methods import METHODS
 
-UNTRAINED = ("plane-sweep", "sparse-depth", "nearest")
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
-"""Our network, and once more for the noise of an ablation."""
-PEERS = ("nerfacto", "nerf", "splatfacto")
-ZERO_SHOT, PAPER_ZERO_SHOT = "zero-shot", "paper-zero-shot"
-METHODS = (WHOLE, ZERO_SHOT, "paper", PAPER_ZERO_SHOT, *PEERS, *UNTRAINED)
-"""What can be compared; in an ablation, the variants of our network, too."""
-_NOT_TRAINED = (ZERO_SHOT, PAPER_ZERO_SHOT, *UNTRAINED)
+"""Our network, and the same with another seed, for the noise of an ablation."""
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Wall-clock seconds of a process, and the most memory that it held resident at once."""
+
+    seconds: float
+    peak_memory_bytes: int
+
+
+Runner = Callable[[Sequence[str], Mapping[str, str]], Usage]
+"""Runs a command to its end, with additional environment variables."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +51,7 @@ class Settings:
         device: where everything is computed.
         seed: of weights and batches.
         preset: that "tidefield" stands for, and that variants change.
-        from_scratch: whether our presets begin with random weights.
+        from_scratch: whether our presets start from random weights.
     """
 
     minutes: float | None
@@ -50,33 +63,63 @@ class Settings:
     from_scratch: bool = False
 
 
+def tidefield(*words: object) -> list[str]:
+    """A command line of this environment's tidefield."""
+    return [sys.executable, "-m", "tidefield.cli", *map(str, words)]
+
+
+def run_measured(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+    """Run a command in a process of its own; it prints to our output.
+
+    Raises:
+        RunError: when it fails.
+    """
+    start = time.perf_counter()
+    process = subprocess.Popen(command, env={**os.environ, **environment})
+    try:
+        # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
+        _, status, usage = os.wait4(process.pid, 0)
+    except KeyboardInterrupt:
+        process.wait()  # Ctrl-C has reached it, too, and it saves before it stops.
+        raise
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RunError(
+            f"`{shlex.join(command)}` ended with status {process.returncode}: expected 0; correct what its message "
+            "says and repeat the command, which continues from there"
+        )
+    # Kilobytes on Linux, bytes on macOS.
+    return Usage(time.perf_counter() - start, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+
+
 def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict[str, list[str]]:
-    """The tidefield commands of a method on a scene, by name, in their order."""
+    """The tidefield commands of a method, or of a variant of our network, on a scene, by name, in their order."""
+    kind, preset = _kind(method), METHODS[method].preset if method in METHODS else None
     device = ["--device", settings.device]
     width = [] if settings.width is None else ["--width", str(settings.width)]
-    if method in _NOT_TRAINED:
-        presets = {ZERO_SHOT: settings.preset, PAPER_ZERO_SHOT: "paper"}
-        kind = ["--zero-shot", "--preset", presets[method]] if method in presets else ["--method", method]
-        return {"evaluate": ["evaluate", str(scene), str(folder), *kind, *width, *device]}
-    seed = ["--seed", str(settings.seed + (method == OTHER_SEED))]
+    start = ["--from-scratch"] if settings.from_scratch else []
+    if method in (WHOLE, "zero-shot"):
+        preset = settings.preset
+    if kind == "variant":
+        variant = [] if method == OTHER_SEED else ["--variant", method]
+        source = ["--preset", settings.preset, *variant, *start]
+    elif kind == "preset":
+        source = ["--preset", str(preset), *start]
+    elif kind == "zero-shot":
+        source = ["--zero-shot", "--preset", str(preset)]
+    else:
+        source = ["--method", method]
+    if kind in ("zero-shot", "untrained"):
+        return {"evaluate": ["evaluate", str(scene), str(folder), *source, *width, *device]}
     if settings.minutes is not None:
         budget = ["--minutes", f"{settings.minutes:g}", "--curve"]
     else:
         budget = ["--steps", str(settings.steps)]
+    seed = ["--seed", str(settings.seed + (method == OTHER_SEED))]
     return {
-        "train": ["train", str(scene), str(folder), *_kind(method, settings), *budget, *width, *device, *seed],
+        "train": ["train", str(scene), str(folder), *source, *budget, *width, *device, *seed],
         "evaluate": ["evaluate", str(folder), *device],
     }
-
-
-def _kind(method: str, settings: Settings) -> list[str]:
-    if method in PEERS:
-        return ["--method", method]
-    begin = ["--from-scratch"] if settings.from_scratch else []
-    if method == "paper":
-        return ["--preset", "paper", *begin]
-    variant = [] if method in (WHOLE, OTHER_SEED) else ["--variant", method]
-    return ["--preset", settings.preset, *variant, *begin]
 
 
 def compare(
@@ -95,7 +138,7 @@ def compare(
         settings: for all.
         out: the comparison's folder.
         run: runs a command.
-        say: tells where we are.
+        say: reports progress.
 
     Raises:
         RunError: a command failed, or the folder holds results of other settings.
@@ -106,20 +149,25 @@ def compare(
     for number, (name, scene, method) in enumerate(jobs, start=1):
         folder, title = out / RUNS / name / method, f"{name}, {method} ({number} of {len(jobs)})"
         if (folder / EVALUATION_FILE).exists():
-            say(f"{title}: is there")
+            say(f"{title}: done before")
             continue
         for step, words in commands(scene, folder, method, settings).items():
             say(f"{title}: {step}")
-            shown = commands(Path("SCENE"), Path("RUN"), method, settings)[step]
-            _step(folder, step, words, shown, _record(scene, method, settings), run)
+            recorded = commands(Path("SCENE"), Path("RUN"), method, settings)[step]
+            _step(folder, step, words, recorded, _record(scene, method, settings), run)
+
+
+def _kind(method: str) -> str:
+    """The kind of a method, or "variant" for variants of our network and for its other seed."""
+    return METHODS[method].kind if method in METHODS else "variant"
 
 
 def _record(scene: Path, method: str, settings: Settings) -> dict[str, object]:
-    """What a result depends on; of what is not trained, no budget, and of others' methods, not how ours begin."""
+    """What a result depends on: no budget where nothing is trained, and no start weights but for our presets."""
     kept = asdict(settings)
-    if method in _NOT_TRAINED:
+    if _kind(method) in ("zero-shot", "untrained"):
         kept |= {"minutes": None, "steps": None, "seed": None}
-    if method in (*PEERS, *_NOT_TRAINED):
+    if _kind(method) not in ("preset", "variant"):
         del kept["from_scratch"]
     return {**kept, "scene": str(scene.resolve())}
 
@@ -133,13 +181,13 @@ def _refuse_other_settings(folder: Path, scene: Path, method: str, settings: Set
 
 
 def _step(
-    folder: Path, name: str, words: list[str], shown: list[str], settings: dict[str, object], run: Runner
+    folder: Path, name: str, words: list[str], recorded: list[str], settings: dict[str, object], run: Runner
 ) -> None:
-    """One command, unless it is a training that has ended, and what it took; kept is how it is shown."""
+    """Run one command, unless it is a training that has ended, and store its usage with the command as `recorded`."""
     record = read_json(folder / PROCESS_FILE) or {"settings": settings}
     if name == "train" and name in record:
         return
     again = ["--overwrite"] if name == "train" and (folder / RUN_FILE).exists() else []
-    took = run(tidefield(*words, *again), {})
-    record[name] = {"command": shlex.join(["tidefield", *shown]), **asdict(took), **describe()}
+    usage = run(tidefield(*words, *again), {})
+    record[name] = {"command": shlex.join(["tidefield", *recorded]), **asdict(usage), **describe()}
     write_json(folder / PROCESS_FILE, record)

@@ -1,14 +1,21 @@
-"""The tables of a comparison: the paper's Tables 2 and 3, and what each method took."""
+"""Tables of a comparison as Markdown, LaTeX and CSV, and the files that a comparison leaves."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
-from tidefield.compare import published
-from tidefield.compare.results import Result, Results
-from tidefield.compare.table import NOTHING, Table, shown
+from tidefield.compare.results import Result, Results, figures_of
+from tidefield.compare.run import Settings
 from tidefield.evaluation.lpips import BACKBONES
+from tidefield.files import completed_file, write_json
+from tidefield.machine import describe
 
+NOTHING, MEAN = "-", "mean"
 METRICS = (
     ("psnr", "PSNR, dB", "{:.2f}", True),
     ("ssim", "SSIM", "{:.3f}", True),
@@ -17,21 +24,97 @@ METRICS = (
     ("flip", "FLIP", "{:.3f}", False),
 )
 """Name, title, style, and whether more is better."""
-VIEWS = {
+REGIONS = {
     "": "all pixels",
     "_seen": "pixels that two training photographs or more see",
     "_cc": "all pixels, after the colour fit",
     "_seen_cc": "pixels that two training photographs or more see, after the colour fit",
 }
-"""Suffixes of metrics, and what they mean."""
-MEAN = "mean"
+"""Suffixes of metrics, and over what they are taken."""
+PUBLISHED_METRICS = ("psnr", "ssim", "lpips")
+TABLE_2 = {
+    "bicycle": {"tidefield": (22.74, 0.649, 0.384), "nerfacto": (19.62, 0.497, 0.385)},
+    "bonsai": {"tidefield": (27.33, 0.872, 0.252), "nerfacto": (21.40, 0.693, 0.302)},
+    "counter": {"tidefield": (25.51, 0.798, 0.328), "nerfacto": (24.01, 0.744, 0.331)},
+    "garden": {"tidefield": (25.01, 0.745, 0.282), "nerfacto": (23.06, 0.627, 0.284)},
+    "kitchen": {"tidefield": (25.92, 0.789, 0.302), "nerfacto": (26.00, 0.791, 0.299)},
+    "room": {"tidefield": (28.54, 0.891, 0.259), "nerfacto": (22.32, 0.777, 0.303)},
+    "stump": {"tidefield": (15.97, 0.369, 0.736), "nerfacto": (15.96, 0.345, 0.727)},
+}
+"""The paper's Table 2: PSNR, SSIM and LPIPS on scenes of mip-NeRF 360. Its Nerfacto is far below what Nerfacto's
+authors publish for the same scenes, so it is shown and not relied on."""
+TABLE_3 = {
+    "tidal_trees": {"nerfacto": (20.46, 0.685, 0.231), "tidefield": (21.77, 0.736, 0.171)},
+    "river_mouths": {"nerfacto": (25.52, 0.418, 0.189), "tidefield": (24.90, 0.463, 0.145)},
+    "ground_textures": {"nerfacto": (21.65, 0.464, 0.351), "tidefield": (22.18, 0.411, 0.209)},
+    "vegetation": {"nerfacto": (23.39, 0.771, 0.240), "tidefield": (23.27, 0.787, 0.229)},
+    "deep_water": {"nerfacto": (20.49, 0.429, 0.384), "tidefield": (20.34, 0.443, 0.383)},
+}
+"""The paper's Table 3: the same on its own tidal flats, which are not public; our categories only share the names."""
+NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
+"""Nerfacto's default number of steps and of rays a batch in nerfstudio 1.1.5, and the rays a batch that it gets on CPUs
+(`baselines/nerfstudio/worker.py`)."""
+_ESCAPES = str.maketrans({"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text; the first column is words, the others are figures.
+
+    Attributes:
+        title: may be empty.
+        columns: the header.
+        rows: the cells.
+        bold: (row, column) of cells to emphasise.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    bold: frozenset[tuple[int, int]] = frozenset()
+
+    def markdown(self) -> str:
+        """A heading, where there is a title, and the table."""
+        rows = [[f"**{c}**" if (i, j) in self.bold else c for j, c in enumerate(r)] for i, r in enumerate(self.rows)]
+        lines = [self.columns, ["---", *["---:"] * (len(self.columns) - 1)], *rows]
+        heading = [f"### {self.title}", ""] if self.title else []
+        return "\n".join([*heading, *(f"| {' | '.join(line)} |" for line in lines)])
+
+    def latex(self) -> str:
+        """A table environment; needs the package booktabs."""
+        rows = [
+            [rf"\textbf{{{_tex(c)}}}" if (i, j) in self.bold else _tex(c) for j, c in enumerate(row)]
+            for i, row in enumerate(self.rows)
+        ]
+        head, *body = (" & ".join(line) + r" \\" for line in ([*map(_tex, self.columns)], *rows))
+        begin = [r"\begin{table}", rf"\caption{{{_tex(self.title)}}}"]
+        begin.append(rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}")
+        end = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+        return "\n".join([*begin, r"\toprule", head, r"\midrule", *body, *end])
+
+    def csv(self) -> str:
+        """With a header; cells without a value are empty."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([["" if cell == NOTHING else cell for cell in row] for row in self.rows])
+        return text.getvalue()
+
+
+def _tex(text: str) -> str:
+    return text.translate(_ESCAPES)
+
+
+def shown(value: float | int | None, style: str) -> str:
+    """A number as text, or a dash where there is none."""
+    return NOTHING if value is None else style.format(value)
 
 
 def all_tables(results: Results) -> list[Table]:
-    """The paper's tables, where the scenes are among its, then every metric, then what each method took."""
+    """The paper's tables where the scenes are among its, then every metric, then time and memory."""
     papers = (
-        paper_table(results, published.TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
-        paper_table(results, published.TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
+        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
+        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
     )
     return [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
 
@@ -41,7 +124,7 @@ def missing_metrics(results: Results) -> list[str]:
     missing: dict[str, list[str]] = {}
     for metric, *_ in METRICS:
         for result in results.by.values():
-            reason = result.evaluation["mean"]["reasons"].get(metric)
+            reason = result.evaluation["mean"].get("reasons", {}).get(metric)
             if reason is not None and metric not in missing.setdefault(reason, []):
                 missing[reason].append(metric)
     return [f"No {', '.join(metrics)}: {reason}." for reason, metrics in missing.items()]
@@ -55,18 +138,18 @@ def lpips_weights(results: Results) -> list[str]:
         for metric, sha256 in result.evaluation.get("lpips_weights", {}).items()
         for _, file in [BACKBONES[metric]]
     }
-    told = {True: "as it is published", False: "which is another file than the published one"}
+    origin = {True: "the published file", False: "which is another file than the published one"}
     return [
-        f"LPIPS with {file}, {told[sha256.startswith(file[-12:-4])]} (SHA-256 {sha256})."
+        f"LPIPS with {file}, {origin[sha256.startswith(file[-12:-4])]} (SHA-256 {sha256})."
         for file, sha256 in sorted(found)
     ]
 
 
-def quality_tables(results: Results) -> list[Table]:
-    """One for each metric and each way to look at it; the best of a line stands out."""
+def quality_tables(results: Results, regions: Mapping[str, str] = REGIONS) -> list[Table]:
+    """One for each metric and region; the best of a line stands out."""
     return [
         _quality(results, metric + suffix, f"{title}, {over}", style, more)
-        for suffix, over in VIEWS.items()
+        for suffix, over in regions.items()
         for metric, title, style, more in METRICS
         if any(result.metric(metric + suffix) is not None for result in results.by.values())
     ]
@@ -90,20 +173,23 @@ def _quality(results: Results, name: str, title: str, style: str, more: bool) ->
 def paper_table(
     results: Results, figures: Mapping[str, Mapping[str, tuple[float, float, float]]], title: str
 ) -> Table | None:
-    """Measured figures beside published ones, as the paper arranges them; None where no scene is among them."""
+    """Measured figures next to published ones, as the paper arranges them; None where no scene is among them."""
     scenes = [scene for scene in results.scenes if scene in figures]
     if not scenes:
         return None
-    ours = [method for method in ("tidefield", "nerfacto") if method in results.methods]
+    measured = [method for method in ("tidefield", "nerfacto") if method in results.methods]
     columns, rows = ["scene"], [[scene] for scene in (*scenes, MEAN)]
     for k, (metric, style) in enumerate((("psnr", "{:.2f}"), ("ssim", "{:.3f}"), ("lpips_vgg", "{:.3f}"))):
-        for method in ours:
-            columns.append(f"{metric.partition('_')[0].upper()} {method}")
+        name = PUBLISHED_METRICS[k].upper()
+        if not any(results.metric(scene, method, metric) is not None for scene in scenes for method in measured):
+            continue
+        for method in measured:
+            columns.append(f"{name} {method}")
             values = [results.metric(s, method, metric) for s in scenes] + [results.mean(method, metric, scenes)]
             for row, value in zip(rows, values, strict=True):
                 row.append(shown(value, style))
         for method in ("tidefield", "nerfacto"):
-            columns.append(f"{published.METRICS[k].upper()} published, {'paper' if method == 'tidefield' else method}")
+            columns.append(f"{name} published, {'paper' if method == 'tidefield' else method}")
             stated = [figures[scene][method][k] for scene in scenes]
             for row, value in zip(rows, [*stated, sum(stated) / len(stated)], strict=True):
                 row.append(style.format(value))
@@ -111,7 +197,7 @@ def paper_table(
 
 
 def cost_table(results: Results) -> Table:
-    """What each method took."""
+    """Time, speed and memory of each method."""
     columns = ["scene, method", "training, min", "steps", "s per frame", "rays/s", "memory, GB (train, evaluate)"]
     rows = [
         [f"{scene}, {method}", *_cost(results.by[scene, method])]
@@ -119,7 +205,28 @@ def cost_table(results: Results) -> Table:
         for method in results.methods
         if (scene, method) in results.by
     ]
-    return Table("What it took; evaluating with the networks of LPIPS, where they are there", columns, rows)
+    return Table(
+        "Time and memory (of an evaluation, the networks of LPIPS included where they were used)", columns, rows
+    )
+
+
+def nerfacto_limits(results: Results) -> list[str]:
+    """How Nerfacto was run, as a sentence, where it has results: on CPUs it is far from its defaults."""
+    steps = [result.steps for (_, method), result in results.by.items() if method == "nerfacto" and result.steps]
+    devices = {
+        result.process.get("settings", {}).get("device")
+        for (_, method), result in results.by.items()
+        if method == "nerfacto"
+    }
+    if not steps or devices != {"cpu"}:
+        return []
+    least, most = min(steps) / NERFACTO_STEPS, max(steps) / NERFACTO_STEPS
+    return [
+        f"Nerfacto ran on CPUs, with {NERFACTO_CPU_RAYS:,} rays a batch instead of its default of {NERFACTO_RAYS:,}; "
+        f"within the budget it made {min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default "
+        f"of {NERFACTO_STEPS:,}. Its figures are those of a method at the start of its training, and nothing is said "
+        "here about Nerfacto trained to its end on a GPU."
+    ]
 
 
 def _cost(result: Result) -> Sequence[str]:
@@ -131,3 +238,76 @@ def _cost(result: Result) -> Sequence[str]:
         f"{result.evaluation['rays_per_second']:,.0f}",
         ", ".join(NOTHING if value is None else f"{value / 1e9:.2f}" for value in memory),
     ]
+
+
+def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
+    """Write tables, figures, curves and comparison.json into the comparison's folder, over older ones.
+
+    Returns:
+        The files.
+    """
+    from tidefield.compare.figures import side_by_side, write_curves
+    from tidefield.data.load import load_scene
+
+    files = write_tables("tables", "Comparison", all_tables(results), [], results, settings, out)
+    files.append(write_figures("comparison", results, settings, out))
+    for name, path in scenes.items():
+        figure = side_by_side(results, name, load_scene(path, width=settings.width))
+        if figure is not None:
+            file = out / "figures" / f"{name}.png"
+            with completed_file(file, overwrite=True) as partial:
+                figure.save(partial)
+            files.append(file)
+    curves = out / "curves.png"
+    if any(result.curve for result in results.by.values()):
+        with completed_file(curves, overwrite=True) as partial:
+            write_curves(results, partial)
+        files.append(curves)
+    else:
+        curves.unlink(missing_ok=True)
+    return files
+
+
+def write_tables(
+    stem: str, title: str, tables: list[Table], remarks: list[str], results: Results, settings: Settings, out: Path
+) -> list[Path]:
+    """Write tables with their circumstances as STEM.md, STEM.tex and STEM.csv; returns the files."""
+    texts = {
+        ".md": _page(
+            title,
+            tables,
+            [*nerfacto_limits(results), *remarks, *lpips_weights(results), *missing_metrics(results)],
+            settings,
+        ),
+        ".tex": "\n\n".join(table.latex() for table in tables) + "\n",
+        ".csv": "\n".join(f"{table.title}\n{table.csv()}" for table in tables),
+    }
+    files = [out / f"{stem}{suffix}" for suffix in texts]
+    for file, text in zip(files, texts.values(), strict=True):
+        with completed_file(file, overwrite=True) as partial:
+            partial.write_text(text, encoding="utf-8")
+    return files
+
+
+def write_figures(stem: str, results: Results, settings: Settings, out: Path) -> Path:
+    """Write all figures with their settings and the machine as STEM.json; returns the file."""
+    path = out / f"{stem}.json"
+    write_json(path, {"settings": asdict(settings), **describe(), "results": figures_of(results)})
+    return path
+
+
+def _page(title: str, tables: list[Table], remarks: list[str], settings: Settings) -> str:
+    made: dict[str, Any] = describe()
+    machine = made["machine"]
+    budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
+    lines = [
+        f"# {title}",
+        "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
+        f"and {budget} of training, one after another.",
+        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
+        f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
+        f"{machine['torch']}; {made['date']}.",
+        *remarks,
+        *(table.markdown() for table in tables),
+    ]
+    return "\n\n".join(lines) + "\n"

@@ -1,8 +1,8 @@
-"""Trains one of nerfstudio's methods, or renders with it: runs in nerfstudio's own environment.
+"""Train one of nerfstudio's methods, or render with it: runs in nerfstudio's own environment.
 
-Imports nothing of Tidefield. `worker.py train JOB.json`, `worker.py render JOB.json`, or `worker.py check` to see
-whether all is there. The parent writes the job (see `tidefield.baselines.nerfstudio.driver`), and this program prints
-nothing to standard output but its answers, one JSON object a line.
+Imports nothing of Tidefield. `worker.py train JOB.json`, `worker.py render JOB.json`, or `worker.py check` to test
+whether all is installed. The parent writes the job (see `tidefield.baselines.nerfstudio.driver`), and this program
+prints nothing to standard output but its answers, one JSON object a line.
 """
 
 from __future__ import annotations
@@ -55,30 +55,8 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     config = method_configs[job["method"]]
-    config.data = Path(job["data"])
-    config.output_dir, config.experiment_name, config.timestamp = Path(job["out"]), "nerfstudio", "run"
-    config.vis = "tensorboard"
-    config.machine.seed = job["seed"]
-    config.machine.device_type = job["device"].split(":")[0]
-    config.machine.num_devices = 1
-    config.max_num_iterations = job["steps"] or 10**9
-    config.steps_per_save = 10**9  # we save when the budget is used, ...
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = (
-        10**9
-    )  # ... and judge
+    configure(config, job, has_tiny_cuda_nn())
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=Path(job["data"]), downscale_factor=1)
-    model = config.pipeline.model
-    if hasattr(model, "camera_optimizer"):
-        model.camera_optimizer.mode = "off"
-    if hasattr(model, "use_appearance_embedding"):
-        model.use_appearance_embedding = False
-    if hasattr(model, "implementation") and not has_tiny_cuda_nn():
-        model.implementation = "torch"
-    if job["device"] == "cpu" and hasattr(model, "eval_num_rays_per_chunk"):
-        # The same pictures: its 32,768 rays at once take 11 GB, and on a CPU several times as long.
-        model.eval_num_rays_per_chunk = 2048
-        # In minutes, a CPU makes too few steps of its 4,096 rays for it to learn anything; more and smaller ones help.
-        config.pipeline.datamanager.train_num_rays_per_batch = 1024
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
         # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
@@ -94,6 +72,37 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     return trainer
 
 
+def configure(config: Any, job: dict[str, Any], tiny_cuda_nn: bool) -> None:
+    """Change a method's default configuration to what the job asks for.
+
+    The camera optimiser and the appearance embedding are off: held-out photographs have neither. On CPUs a batch has
+    1,024 rays instead of nerfstudio's 4,096, so figures from CPUs are not those of the defaults.
+    """
+    config.data = Path(job["data"])
+    config.output_dir, config.experiment_name, config.timestamp = Path(job["out"]), "nerfstudio", "run"
+    config.vis = "tensorboard"
+    config.machine.seed = job["seed"]
+    config.machine.device_type = job["device"].split(":")[0]
+    config.machine.num_devices = 1
+    config.max_num_iterations = job["steps"] or 10**9
+    config.steps_per_save = 10**9  # we save when the budget is used, ...
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = (
+        10**9
+    )  # ... and judge
+    model = config.pipeline.model
+    if hasattr(model, "camera_optimizer"):
+        model.camera_optimizer.mode = "off"
+    if hasattr(model, "use_appearance_embedding"):
+        model.use_appearance_embedding = False
+    if hasattr(model, "implementation") and not tiny_cuda_nn:
+        model.implementation = "torch"
+    if job["device"] == "cpu" and hasattr(model, "eval_num_rays_per_chunk"):
+        # The same pictures: its 32,768 rays at once take 11 GB, and on a CPU several times as long.
+        model.eval_num_rays_per_chunk = 2048
+        # In minutes, a CPU makes too few steps of its 4,096 rays for it to learn anything; more and smaller ones help.
+        config.pipeline.datamanager.train_num_rays_per_batch = 1024
+
+
 def has_tiny_cuda_nn() -> bool:
     try:
         import tinycudann  # noqa: F401
@@ -107,14 +116,14 @@ def train(job: dict[str, Any]) -> None:
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
     trainer = make_trainer(job)
-    cameras = [World(trainer, camera) for camera in job["curve_cameras"]]
-    begun, paused, due, last = time.perf_counter(), 0.0, list(job["curve_seconds"]), 0
+    cameras = [ModelCamera(trainer, camera) for camera in job["curve_cameras"]]
+    started, paused, due, last = time.perf_counter(), 0.0, list(job["curve_seconds"]), 0
 
     def after(step: int) -> None:
         nonlocal paused, last
         last = step
         now = time.perf_counter()
-        elapsed = now - begun - paused
+        elapsed = now - started - paused
         more = {}
         if due and elapsed >= due[0]:
             due[:] = [seconds for seconds in due if seconds > elapsed]
@@ -134,14 +143,37 @@ def train(job: dict[str, Any]) -> None:
         trainer.save_checkpoint(last)
     answer(
         step=last + 1,
-        seconds=time.perf_counter() - begun - paused,
+        seconds=time.perf_counter() - started - paused,
         done=True,
         rays=trainer.pipeline.datamanager.get_train_rays_per_batch(),
         checkpoint=str(sorted(trainer.checkpoint_dir.glob("step-*.ckpt"))[-1].relative_to(job["out"])),
     )
 
 
-class World:
+def model_pose(T_world_camera: list[list[float]], transform: torch.Tensor, scale: float) -> torch.Tensor:
+    """Convert an OpenCV pose (3 x 4) into nerfstudio's: OpenGL's axes, in the frame of its data parser.
+
+    Args:
+        transform: the data parser's rotation and translation of the world, 3 x 4.
+        scale: its scale, applied after the transform.
+    """
+    pose = torch.eye(4)
+    pose[:3] = torch.tensor(T_world_camera) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    pose = (transform.float() @ pose)[:3]
+    pose[:, 3] *= scale
+    return pose
+
+
+def z_depth(depth: np.ndarray, scale: float, ray_length: np.ndarray | None) -> np.ndarray:
+    """Convert a depth in the model's frame into z-depth in world units.
+
+    Args:
+        ray_length: of rays whose z-depth is 1, where the depth is a distance along the ray; None where it is z-depth.
+    """
+    return (depth / scale / (1.0 if ray_length is None else ray_length)).astype(np.float32)
+
+
+class ModelCamera:
     """A camera of the exported scene in the model's own frame."""
 
     def __init__(self, trainer: Any, camera: dict[str, Any]) -> None:
@@ -149,10 +181,7 @@ class World:
 
         outputs = trainer.pipeline.datamanager.train_dataparser_outputs
         self.model, self.scale = trainer.pipeline.model, float(outputs.dataparser_scale)
-        pose = torch.eye(4)
-        pose[:3] = torch.tensor(camera["T_world_camera"]) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))
-        pose = (outputs.dataparser_transform.float() @ pose)[:3]
-        pose[:, 3] *= self.scale
+        pose = model_pose(camera["T_world_camera"], outputs.dataparser_transform, self.scale)
         (fx, fy), (cx, cy), (width, height) = camera["focal_px"], camera["principal_px"], camera["size_px"]
         self.camera = Cameras(
             camera_to_worlds=pose[None],
@@ -179,9 +208,9 @@ class World:
         seconds = time.perf_counter() - start
         depth, opacity = (outputs[name][..., 0].float().cpu().numpy() for name in ("depth", "accumulation"))
         along_ray = not hasattr(self.model, "gauss_params")  # splats give z-depth, rays the distance
-        depth = depth / self.scale / (self.length if along_ray else 1.0)
+        depth = z_depth(depth, self.scale, self.length if along_ray else None)
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, colour=colour, depth=depth.astype(np.float32), opacity=opacity)
+        np.savez(path, colour=colour, depth=depth, opacity=opacity)
         return seconds
 
 
@@ -191,7 +220,7 @@ def render(job: dict[str, Any]) -> None:
     answer(ready=True)
     for line in sys.stdin:
         camera = json.loads(line)
-        answer(seconds=World(trainer, camera).render(Path(camera["file"])))
+        answer(seconds=ModelCamera(trainer, camera).render(Path(camera["file"])))
 
 
 def check(_: dict[str, Any]) -> None:
