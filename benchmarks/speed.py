@@ -46,7 +46,7 @@ PARTS = {
     "RayTransformer": "ray transformer",
     "ColourBlend": "colour",
 }
-"""Stages by the class names of the network's parts."""
+"""Stages by the class names of the network's parts, or of their bases."""
 STAGES = (*PARTS.values(), "backward", "optimiser", REST)
 
 
@@ -255,7 +255,7 @@ def stage_clock(
         stack.enter_context(sequential())
         stack.enter_context(patch.object(Tensor, "backward", timed_backward))
         for module in network.modules():
-            if stage := PARTS.get(type(module).__name__):
+            if stage := next((PARTS[kind.__name__] for kind in type(module).__mro__ if kind.__name__ in PARTS), None):
                 hooks = [
                     module.register_forward_pre_hook(lambda *_, stage=stage: clock.begin(stage)),
                     module.register_forward_hook(lambda *_: clock.end()),

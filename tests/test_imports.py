@@ -18,6 +18,7 @@ RANK = {
     "train": 4,
     "baselines": 5,
     "methods": 6,
+    "api": 7,
     "compare": 7,
     "commands": 8,
     "cli": 9,
@@ -73,6 +74,9 @@ def test_every_folder_has_its_place_in_the_order():
 @pytest.mark.parametrize("name", BY_NAME)
 def test_imports_point_downward(name: str):
     own = [*name.split("."), ""][1]
+    # The package's own interface is imported when it is first used; nothing below may use it.
+    if name == "tidefield":
+        return
     for imported in imports(BY_NAME[name]):
         if imported.split(".")[0] != "tidefield" or imported == "tidefield":
             continue

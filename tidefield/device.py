@@ -56,6 +56,8 @@ def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
 @cache
 def _cpu_gains_by_bfloat16() -> bool:
     """Whether convolutions in bfloat16 take less time here: tried, since some CPUs with bfloat16 take twice as long."""
+    if "AVX512" not in torch.backends.cpu.get_cpu_capability():  # bfloat16 came with a later AVX-512
+        return False
     images, weight = torch.ones(1, 64, 64, 64).contiguous(memory_format=torch.channels_last), torch.ones(64, 64, 3, 3)
     least = {torch.float32: math.inf, torch.bfloat16: math.inf}
     # The first try prepares the kernels; in turns, so that what else the machine does meets both.

@@ -20,13 +20,13 @@ from torch import nn
 from benchmarks import frames, memory, speed, table
 from benchmarks.__main__ import main
 from tidefield import cli
-from tidefield.commands import views
+from tidefield.commands import render
 from tidefield.compare.run import Usage, run_measured
 from tidefield.config import PAPER, SWIFT, Config, EncoderConfig
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.model.network import Network
+from tidefield.model.network import make_network
 from tidefield.parallel import in_parallel, sequential
 from tidefield.train.checkpoint import write_weights
 
@@ -35,9 +35,9 @@ CPU = torch.device("cpu")
 
 def tiny(preset: str) -> Config:
     config = {"paper": PAPER, "swift": SWIFT}[preset]
-    stage = replace(config.network.stages[-1], stride=1, samples=4, feature_channels=8, hidden=8)
+    one = replace(config.network.passes[-1], stride=1, samples=4, feature_channels=8, hidden=8)
     encoder = EncoderConfig((8, 8, 8, 8), (1, 1, 1), instance_norm=False)
-    network = replace(config.network, encoder=encoder, stages=(stage,), views=2)
+    network = replace(config.network, encoder=encoder, passes=(one,), views=2)
     train = replace(config.train, tiles=1, tile_px=8, crop_px=config.train.crop_px and 32)
     return replace(config, network=network, train=train)
 
@@ -120,7 +120,7 @@ def test_the_measuring_process_stays_small() -> None:
 def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(memory, "SURVEY_WIDTH", 32)
-    monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
+    monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
     asked = []
 
     def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
@@ -128,7 +128,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         scene = load_scene(folder.parent / "scene")
         assert (scene.cameras.width, scene.cameras.height) == (96, 72)
         assert scene.names[scene.test[0]] == command[command.index("--camera") + 1]
-        monkeypatch.setattr(views, "render", lambda options, console: asked.append(options.camera))
+        monkeypatch.setattr(render, "render", lambda options, console: asked.append(options.camera))
         monkeypatch.setattr(sys, "argv", ["tidefield", *command[3:]])
         cli.main()
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents
@@ -162,7 +162,7 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(frames, "PRESETS", {"swift": small})
     monkeypatch.setattr(frames, "COUNTS", (12,))
     monkeypatch.setattr(frames, "SIZE_PX", (32, 24))
-    write_weights(tmp_path / "w.safetensors", Network(small.network), small, {})
+    write_weights(tmp_path / "w.safetensors", make_network(small.network), small, {})
     asked = []
 
     def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:

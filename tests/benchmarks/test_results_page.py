@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tidefield.train.weights import sha256, write_weights
 
 from benchmarks import card, table
 from benchmarks.table import by_length, length_tables
@@ -20,7 +19,8 @@ from tidefield.evaluation.lpips import BACKBONES
 from tidefield.evaluation.metrics import SUFFIXES
 from tidefield.files import read_json, write_json
 from tidefield.methods import names
-from tidefield.model.network import Network
+from tidefield.model.network import make_network
+from tidefield.train.checkpoint import weights_sha256, write_weights
 
 FOUR = ("caliterra", "swindale", "turin_lot", "fern")
 
@@ -163,7 +163,7 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
         "real": ["brighton_beach"],
         "validation": points,
     }
-    write_weights(file, Network(SWIFT.network), SWIFT, {**recorded, **this_machine.describe()})
+    write_weights(file, make_network(SWIFT.network), SWIFT, {**recorded, **this_machine.describe()})
     with pytest.raises(RunError, match="no zero-shot results"):
         card.write_card(file, [tmp_path / "comparison.json"])
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
@@ -177,10 +177,12 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
         "| swindale ² | 24.50 | 21.25 | - | - | - |",
     ):
         assert line in text.splitlines(), line
-    assert f"SHA-256 `{sha256(file)}`" in text
+    assert f"SHA-256 `{weights_sha256(file)}`" in text
     assert "in 2.0 hours" in text
     assert card.BY_DIRECTION not in text
-    write_weights(file, Network(SWIFT.network), SWIFT, {**recorded, "real": ["elsewhere"], **this_machine.describe()})
+    write_weights(
+        file, make_network(SWIFT.network), SWIFT, {**recorded, "real": ["elsewhere"], **this_machine.describe()}
+    )
     with pytest.raises(RunError, match="learned from elsewhere"):
         card.write_card(file, [tmp_path / "comparison.json"])
 
@@ -188,7 +190,7 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
 def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
     file = tmp_path / "paper.safetensors"
     recorded = {"steps": 10, "seconds": 60.0, "seed": 0, "processes": 1, "real": [], "validation": []}
-    write_weights(file, Network(PAPER.network), PAPER, {**recorded, **this_machine.describe()})
+    write_weights(file, make_network(PAPER.network), PAPER, {**recorded, **this_machine.describe()})
     keep_result(tmp_path / "comparison.json", "swindale", "paper-zero-shot", 20.5)
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
     text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()

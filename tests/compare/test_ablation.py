@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 from comparisons import Children, evaluation, quiet
 from scenes_on_disk import PINHOLE, survey, write_colmap
-from tidefield.options import Ablate
 
+from tidefield.commands.ablate import Ablate
 from tidefield.compare.ablation import ablation_tables, summarise, variants, write_ablation
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
-from tidefield.config import PAPER, SWIFT, EncoderConfig, config_from_json, config_to_json
+from tidefield.config import PAPER, SWIFT, EncoderConfig, NerfConfig, config_from_json, config_to_json
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
-from tidefield.model.network import Network
+from tidefield.model.network import make_network
 from tidefield.variants import VARIANTS, vary
 
 SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, preset="paper")
@@ -26,9 +26,12 @@ SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, pr
 def test_a_variant_is_a_network_that_a_run_can_store(name: str, preset):
     varied = vary(preset, name)
     assert config_from_json(json.loads(json.dumps(config_to_json(varied)))) == varied
+    if name == "no-neighbours":
+        assert isinstance(varied, NerfConfig), "without neighbouring views what is left is classical NeRF"
+        return
     assert varied.train == preset.train
     small = replace(varied.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), instance_norm=False))
-    assert sum(p.numel() for p in Network(small).parameters()) > 0
+    assert sum(p.numel() for p in make_network(small).parameters()) > 0
     itself = {f"degree-{preset.network.harmonics_degree}", f"views-{preset.network.views}"}
     assert (varied == preset) == (name in itself)
 

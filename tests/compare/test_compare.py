@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_wall as wall
-import tidefield.commands.peers
 from comparisons import SETTINGS, Children, quiet
 from PIL import Image
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
-from tidefield.options import Compare
 
 from tidefield import cli
+from tidefield.commands.compare import Compare, make_settings
+from tidefield.commands.compare import compare as compare_command
 from tidefield.compare.figures import most_different, side_by_side, write_curves
 from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
 from tidefield.compare.results import figures_of, read_figures, read_results
@@ -31,6 +31,7 @@ from tidefield.compare.tables import (
     quality_tables,
     write_comparison,
 )
+from tidefield.config import Budget
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError
@@ -264,11 +265,10 @@ def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("method", METHODS)
 def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest.MonkeyPatch):
     called, asked = [], commands(Path("data"), Path("run"), method, SETTINGS)
-    monkeypatch.setattr(cli, "_begin", lambda verbosity: None)
+    monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
     for name, words in asked.items():
-        _, module, function = cli.COMMANDS[name]
-        where = f"tidefield.commands.{module}.{function}"
-        monkeypatch.setattr(where, lambda *args, name=name, **options: called.append(name))
+        module, _, function = cli.COMMANDS[name]
+        monkeypatch.setattr(module, function, lambda *args, name=name, **options: called.append(name))
         monkeypatch.setattr(sys, "argv", ["tidefield", *words])
         cli.main()
     assert called == list(asked)
@@ -278,19 +278,16 @@ def test_missing_software_is_reported_before_anything_is_trained(
     disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    monkeypatch.setattr("tidefield.commands.peers.run_measured", lambda *_: pytest.fail("something was run"))
+    monkeypatch.setattr("tidefield.compare.run.run_measured", lambda *_: pytest.fail("something was run"))
     for method, message in (
         ("nerfacto", "run `tidefield baselines install nerfacto`"),
         ("splatfacto", "expected CUDA"),
     ):
         options = Compare((disk,), methods=("tidefield", method), out=tmp_path / "out", device="cpu")
         with pytest.raises(RunError, match=message):
-            tidefield.commands.peers.compare(options, Console(quiet=True))
-    monkeypatch.setattr("tidefield.commands.peers.find_spec", lambda name: None)
-    with pytest.raises(RunError, match="matplotlib is not installed"):
-        tidefield.commands.peers.compare(Compare((disk,)), Console(quiet=True))
+            compare_command(options, Console(quiet=True))
 
 
 def test_the_record_says_which_device_auto_was() -> None:
-    settings = tidefield.commands.peers._settings(Compare(device="auto"), from_scratch=False)
+    settings = make_settings(Budget(), None, "auto", 0, from_scratch=False)
     assert settings.device == str(choose_device("auto"))

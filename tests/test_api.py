@@ -1,0 +1,53 @@
+"""The Python interface, as README shows it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from scenes_on_disk import PINHOLE, survey, write_colmap
+
+import tidefield
+from tidefield.commands.train import Train, train
+from tidefield.config import Budget
+from tidefield.errors import RunError
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    return tmp_path
+
+
+def test_trained_weights_render_a_scene_by_photograph_name(folder: Path) -> None:
+    scene = tidefield.load_scene(str(folder / "flats"), width=48)
+    camera = scene.cameras[scene.names[0]]
+    view = tidefield.zero_shot(scene, device="cpu")(camera)
+    assert isinstance(view, tidefield.Rendering)
+    assert view.colour.shape == (camera.height, camera.width, 3)
+    with pytest.raises(RunError, match="no preset 'quick'"):
+        tidefield.zero_shot(scene, "quick")
+    with pytest.raises(RunError, match="not a weights file"):
+        tidefield.zero_shot(scene, weights=str(folder / "none.safetensors"))
+
+
+def test_a_run_is_opened_with_its_scene_and_renders_as_it_was_trained(folder: Path) -> None:
+    options = Train(folder / "flats", folder / "run", budget=Budget(steps=2), width=48, device="cpu")
+    train(options, Console(quiet=True))
+    with tidefield.open_run(str(folder / "run"), device="cpu") as run:
+        view = run(run.scene.cameras[0])
+        assert repr(run) == "OpenRun('run', swift, 2 steps)"
+    untrained = tidefield.zero_shot(run.scene, device="cpu")(run.scene.cameras[0])
+    assert not torch.equal(view.colour, untrained.colour)
+
+
+def test_all_names_exist_and_importing_the_package_is_light() -> None:
+    assert all(getattr(tidefield, name) is not None for name in tidefield.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'utils'"):
+        _ = tidefield.utils  # type: ignore[attr-defined]
+    code = "import sys, tidefield; assert 'torch' not in sys.modules; print(tidefield.__version__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == tidefield.__version__
