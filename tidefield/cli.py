@@ -44,6 +44,7 @@ The usual order of commands:
   tidefield train SCENE RUN         learn the scene
   tidefield evaluate RUN            measure quality on held-out photographs
   tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+
 tidefield demo does all of it on a built-in scene."""
 
 

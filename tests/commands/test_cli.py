@@ -148,11 +148,13 @@ def test_the_demonstration_makes_all_that_it_names(
         return make_survey(category, seed, views, width=width // 10, supersample=1)
 
     monkeypatch.setattr(synthetic, "make_survey", smaller)
-    monkeypatch.setattr(demo, "FRAMES", 4)
+    monkeypatch.setattr(demo, "FRAMES", 2)
+    monkeypatch.setattr(demo, "FLIGHT_SIZE", (64, 36))
+    monkeypatch.setattr(demo, "TRAINING_WIDTH", 32)
     out = tmp_path / "demo"
     call("demo", out, "--minutes", 0.01, "--device", "cpu")
     named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("Written:")[1].strip().splitlines()]
-    names = ["scene", "run/evaluation.json", "side-by-side.png", "run/pictures", "fly-through.mp4"]
+    names = ["scene", "first-view.png", "run/evaluation.json", "side-by-side.png", "run/pictures", "flight.mp4"]
     assert named == [out / name for name in names]
     assert all(path.exists() for path in named)
 
