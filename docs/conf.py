@@ -18,12 +18,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 project = "Tidefield"
 author = "The Tidefield developers"
-copyright = author  # noqa: A001 - Sphinx's name
+copyright = author
 release = tidefield.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build", "measured"]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
+# The levels of generated pages.
+suppress_warnings = ["myst.header"]
 html_theme = "furo"
 html_title = "Tidefield"
 # jaxtyping's shapes are no Python types: they stay as they are written, and are not looked up.
@@ -41,7 +43,7 @@ class CommandHelp(Directive):
     optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": _python_path()}
+        environment = {**os.environ, "COLUMNS": "84", "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": _python_path()}
         command = [sys.executable, "-m", "tidefield.cli", *self.arguments, "--help"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         text = done.stdout.replace(str(Path.home()), "~")
