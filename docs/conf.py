@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 from docutils import nodes
@@ -15,6 +16,8 @@ import tidefield
 from tidefield.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
+COLUMNS = 84
+"""Characters in a line of `--help`: as many as fit on a page of the site."""
 
 project = "Tidefield"
 author = "The Tidefield developers"
@@ -24,10 +27,12 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["_build", "measured"]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
-# The levels of generated pages.
+# Generated pages go from headings of level 1 to level 3.
 suppress_warnings = ["myst.header"]
 html_theme = "furo"
 html_title = "Tidefield"
+# Single backticks in docstrings are code.
+default_role = "code"
 # jaxtyping's shapes are no Python types: they stay as they are written, and are not looked up.
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
@@ -43,11 +48,23 @@ class CommandHelp(Directive):
     optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        environment = {**os.environ, "COLUMNS": "84", "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": _python_path()}
+        environment = {
+            **os.environ,
+            "COLUMNS": str(COLUMNS),
+            "NO_COLOR": "1",
+            "TERM": "dumb",
+            "PYTHONPATH": _python_path(),
+        }
         command = [sys.executable, "-m", "tidefield.cli", *self.arguments, "--help"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        text = done.stdout.replace(str(Path.home()), "~")
+        text = "\n".join(_wrapped(line) for line in done.stdout.splitlines())
         return [nodes.literal_block(text, text, language="text")]
+
+
+def _wrapped(line: str) -> str:
+    """Break a long line of text; boxes are as wide as COLUMNS already."""
+    indent = " " * (len(line) - len(line.lstrip()) + 2) if line.startswith(" ") else ""
+    return "\n".join(textwrap.wrap(line, COLUMNS, subsequent_indent=indent, drop_whitespace=False)) or line
 
 
 def _python_path() -> str:
