@@ -64,7 +64,7 @@ class CommandHelp(Directive):
 def _wrapped(line: str) -> str:
     """Break a long line of text; boxes are as wide as COLUMNS already."""
     indent = " " * (len(line) - len(line.lstrip()) + 2) if line.startswith(" ") else ""
-    return "\n".join(textwrap.wrap(line, COLUMNS, subsequent_indent=indent, drop_whitespace=False)) or line
+    return "\n".join(textwrap.wrap(line, COLUMNS, subsequent_indent=indent)) or line
 
 
 def _python_path() -> str:
