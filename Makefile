@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt
 REQUIRED := pyproject.toml constraints.txt $(VENV)/.made
 
-.PHONY: demo test bench lint clean help
+.PHONY: demo test bench lint docs clean help
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test     the tests (ARGS=... for pytest)"
 	@echo "make bench    the benchmarks (ARGS=... for them)"
 	@echo "make lint     ruff and pyright"
+	@echo "make docs     the site, in docs/_build/html"
 	@echo "make clean    remove the virtual environment, which the next target makes again"
 	@echo "PYTHON=python3.12 chooses another Python than python3, before the environment is made."
 
@@ -34,6 +35,10 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# -W: a warning is an error; --keep-going: all of them are printed.
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
 clean:
 	rm -rf $(VENV)
 
@@ -51,4 +56,8 @@ $(VENV)/.installed: $(REQUIRED)
 
 $(VENV)/.installed-dev: $(REQUIRED)
 	$(PIP) -e '.[dev]'
+	touch $(VENV)/.installed $@
+
+$(VENV)/.installed-docs: $(REQUIRED)
+	$(PIP) -e '.[docs]'
 	touch $(VENV)/.installed $@
