@@ -8,8 +8,9 @@ from typing import Any
 
 from benchmarks.table import SCENES, marked, notes
 from tidefield.compare.results import Results, read_figures
-from tidefield.compare.tables import METRICS, Table, lpips_weights, shown
+from tidefield.compare.tables import Table, lpips_weights, shown
 from tidefield.errors import RunError
+from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file
 from tidefield.methods import METHODS, names
 from tidefield.train.checkpoint import describe_weights, weights_sha256
@@ -120,9 +121,9 @@ def _quality(results: Results) -> list[Table]:
     """A table for each measured metric, of the scenes on which these weights were measured."""
     scenes = [scene for scene in results.scenes if (scene, results.methods[0]) in results.by]
     tables = []
-    for metric, title, style, _ in METRICS:
-        rows = [[scene, *(results.metric(scene, method, metric) for method in results.methods)] for scene in scenes]
+    for name, metric in METRICS.items():
+        rows = [[scene, *(results.metric(scene, method, name) for method in results.methods)] for scene in scenes]
         if any(value is not None for row in rows for value in row[1:]):
-            cells = [[marked(str(row[0])), *(shown(value, style) for value in row[1:])] for row in rows]
-            tables.append(Table(title, ["scene", *results.methods], cells))
+            cells = [[marked(str(row[0])), *(shown(value, metric.style) for value in row[1:])] for row in rows]
+            tables.append(Table(metric.title, ["scene", *results.methods], cells))
     return tables

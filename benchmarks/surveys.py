@@ -24,7 +24,7 @@ from tidefield.machine import describe
 
 UNCORRECTED = "_uneven"
 """Ends the name of a scene that was prepared with --colour off."""
-METRICS = (
+MEASURED = (
     ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
     ("psnr_seen", "PSNR, dB", "{:.2f}"),
     ("ssim_seen_cc", "SSIM after the colour fit", "{:.4f}"),
@@ -133,7 +133,7 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
     rows = []
     for survey in surveys:
         found = [_run(folder, survey + suffix) for folder, suffix in columns.values()]
-        for metric, title, style in METRICS:
+        for metric, title, style in MEASURED:
             rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])
         rows.append([f"{survey}: steps of training", *(shown(result and result.steps, "{:,}") for result in found)])
     if not any(cell != NOTHING for row in rows for cell in row[1:]):
@@ -193,12 +193,12 @@ def _colour(record: dict[str, Any], when: str) -> str | None:
 def _time(records: dict[str, dict[str, Any]]) -> Table:
     columns = ["", *records]
     rows: list[list[str]] = []
-    stages = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
-    for stage in stages:
-        cells = []
-        for record in records.values():
-            times = {} if record["report"] is None else record["report"]["processing_statistics"]["steps_times"]
-            cells.append(f"{times[stage]:.0f}" if stage in times else NOTHING)
+    from tidefield.survey.prepare import STAGES
+
+    reports = [record["report"] for record in records.values()]
+    times = [{} if report is None else report["processing_statistics"]["steps_times"] for report in reports]
+    for stage in STAGES:
+        cells = [f"{of[stage]:.0f}" if stage in of else NOTHING for of in times]
         rows.append([f"prepare: {stage}, s", *cells])
     rows.append(["prepare: all, s", *(_seconds(r["usage"]) for r in records.values())])
     rows.append(["prepare: peak memory, GB", *(_memory(r["usage"]) for r in records.values())])

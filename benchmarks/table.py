@@ -13,7 +13,6 @@ from tidefield.compare.ablation import ablation_tables, summarise, variants
 from tidefield.compare.results import Result, Results, read_figures
 from tidefield.compare.run import WHOLE
 from tidefield.compare.tables import (
-    METRICS,
     REGIONS,
     TABLE_3,
     Table,
@@ -26,6 +25,7 @@ from tidefield.compare.tables import (
     shown,
 )
 from tidefield.errors import RunError
+from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, read_json
 from tidefield.machine import describe
 from tidefield.methods import names
@@ -219,12 +219,12 @@ def length_tables(lengths: ByLength) -> list[Table]:
     shared = [scene for scene in dict.fromkeys(counted) if counted.count(scene) > 2]
     columns = {name: scenes for name, scenes in lengths.items() if set(scenes) & set(shared)}
     tables = []
-    for metric, title, style, more in METRICS:
-        values = [[(of[s].metric(metric) if s in of else None) for of in columns.values()] for s in shared]
+    for name, metric in METRICS.items():
+        values = [[(of[s].metric(name) if s in of else None) for of in columns.values()] for s in shared]
         if any(value is not None for row in values for value in row):
-            rows = [[s, *(shown(v, style) for v in row)] for s, row in zip(shared, values, strict=True)]
-            better = "more" if more else "less"
-            tables.append(Table(f"{title}, all pixels ({better} is better)", ["scene", *columns], rows))
+            rows = [[s, *(shown(v, metric.style) for v in row)] for s, row in zip(shared, values, strict=True)]
+            better = "more" if metric.more_is_better else "less"
+            tables.append(Table(f"{metric.title}, all pixels ({better} is better)", ["scene", *columns], rows))
     return tables
 
 

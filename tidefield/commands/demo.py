@@ -28,8 +28,8 @@ FRAMES, FRAMES_PER_SECOND = 32, 8
 FLIGHT_SIZE = 640, 360
 FIELD_OF_VIEW_DEG = 40.0
 """Vertical."""
-EYES = ((8.0, -30.0, 29.0), (20.0, -6.0, 26.0), (14.0, 14.0, 24.0))
-TARGETS = ((21.0, 2.0, 0.0), (26.0, 20.0, 0.0), (16.0, 37.0, 0.0))
+EYES = ((30.0, -24.0, 29.0), (27.0, -4.0, 26.0), (22.0, 9.0, 25.0))
+TARGETS = ((18.0, 6.0, 0.0), (20.0, 24.0, 0.0), (15.0, 31.0, 0.0))
 """Where the flight along the creek is at its start, in its middle and at its end, and the ground it looks at: metres
 east, north and above the mud of the built-in scene."""
 
@@ -97,9 +97,7 @@ def creek_flight() -> dict[str, Any]:
     time = np.linspace(0, 1, FRAMES)
     time = (time**2 * (3 - 2 * time))[:, None]
     through = [2 * (time - 0.5) * (time - 1), 4 * time * (1 - time), 2 * time * (time - 0.5)]
-    eyes, targets = (
-        sum(w * np.array(point) for w, point in zip(through, points, strict=True)) for points in (EYES, TARGETS)
-    )
+    eyes, targets = (np.concatenate(through, axis=1) @ np.array(points) for points in (EYES, TARGETS))
     frames = []
     for eye, target in zip(eyes, targets, strict=True):
         backward = (eye - target) / np.linalg.norm(eye - target)

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Stage = Literal["quality", "features", "pairs", "matches", "poses", "georeference", "images"]
-
 
 @dataclass(frozen=True)
 class Prepare:
@@ -46,8 +44,8 @@ class Prepare:
     """Most features to find in a photograph."""
     feature_width: int = 2400
     """Longer side in pixels to which larger photographs are reduced to find features."""
-    redo: Stage | None = None
-    """Repeat this stage, and all that follow."""
+    redo: str | None = None
+    """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 

@@ -12,18 +12,11 @@ from typing import Any
 from tidefield.compare.results import Result, Results, figures_of
 from tidefield.compare.run import Settings
 from tidefield.evaluation.lpips import BACKBONES
+from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json
 from tidefield.machine import describe
 
 NOTHING, MEAN = "-", "mean"
-METRICS = (
-    ("psnr", "PSNR, dB", "{:.2f}", True),
-    ("ssim", "SSIM", "{:.3f}", True),
-    ("lpips_alex", "LPIPS, AlexNet", "{:.3f}", False),
-    ("lpips_vgg", "LPIPS, VGG", "{:.3f}", False),
-    ("flip", "FLIP", "{:.3f}", False),
-)
-"""Name, title, style, and whether more is better."""
 REGIONS = {
     "": "all pixels",
     "_seen": "pixels that two training photographs or more see",
@@ -122,7 +115,7 @@ def all_tables(results: Results) -> list[Table]:
 def missing_metrics(results: Results) -> list[str]:
     """Why some metrics have no value, as sentences."""
     missing: dict[str, list[str]] = {}
-    for metric, *_ in METRICS:
+    for metric in METRICS:
         for result in results.by.values():
             reason = result.evaluation["mean"].get("reasons", {}).get(metric)
             if reason is not None and metric not in missing.setdefault(reason, []):
@@ -148,10 +141,10 @@ def lpips_weights(results: Results) -> list[str]:
 def quality_tables(results: Results, regions: Mapping[str, str] = REGIONS) -> list[Table]:
     """One for each metric and region; the best of a line stands out."""
     return [
-        _quality(results, metric + suffix, f"{title}, {over}", style, more)
+        _quality(results, name + suffix, f"{metric.title}, {over}", metric.style, metric.more_is_better)
         for suffix, over in regions.items()
-        for metric, title, style, more in METRICS
-        if any(result.metric(metric + suffix) is not None for result in results.by.values())
+        for name, metric in METRICS.items()
+        if any(result.metric(name + suffix) is not None for result in results.by.values())
     ]
 
 

@@ -1,9 +1,9 @@
-"""Load a Scene from a folder in one of five layouts."""
+"""Load a Scene from a folder in one of several layouts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +26,59 @@ from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 
-_LAYOUTS = """expected one of
-  images/ and sparse/0/ with cameras, images, points3D (.bin or .txt)    a COLMAP model
-  transforms.json and the photographs that it names                      nerfstudio, instant-ngp
-  transforms_train.json, transforms_test.json and their pictures         a Blender scene
-  images/ and poses_bounds.npy                                           LLFF
-  reconstruction.json or opensfm/reconstruction.json, and images/        OpenSfM, ODM
-; estimate poses of the photographs first (`tidefield prepare` or COLMAP), or give the folder that holds these"""
+
+@dataclass(frozen=True)
+class Layout:
+    """One way to lay out a scene in a folder.
+
+    Attributes:
+        files: by which it is recognised.
+        program: whose layout it is.
+        find: what of it a folder holds, such as the folder of the model; None where it does not have this layout.
+        read: (root, what was found, allow_missing) to the posed photographs.
+    """
+
+    files: str
+    program: str
+    find: Callable[[Path], Path | None]
+    read: Callable[[Path, Path, bool], PosedPhotographs]
+
+
+def _file(name: str) -> Callable[[Path], Path | None]:
+    return lambda root: root / name if (root / name).is_file() else None
+
+
+LAYOUTS = (
+    Layout(
+        "images/ and sparse/0/ with cameras, images, points3D (.bin or .txt)",
+        "a COLMAP model",
+        lambda root: find_colmap(root, "sparse/0", "sparse"),
+        read_colmap,
+    ),
+    Layout(
+        "transforms.json and the photographs that it names",
+        "nerfstudio, instant-ngp",
+        _file("transforms.json"),
+        lambda root, _, allow_missing: read_transforms(root, allow_missing),
+    ),
+    Layout(
+        "transforms_train.json, transforms_test.json and their pictures",
+        "a Blender scene",
+        _file("transforms_train.json"),
+        lambda root, _, allow_missing: read_blender(root, allow_missing),
+    ),
+    Layout("images/ and poses_bounds.npy", "LLFF", _file("poses_bounds.npy"), lambda root, *_: read_llff(root)),
+    Layout(
+        "reconstruction.json or opensfm/reconstruction.json, and images/", "OpenSfM, ODM", find_opensfm, read_opensfm
+    ),
+    Layout(
+        "images/ and colmap/sparse/0/",
+        "a COLMAP model of nerfstudio",
+        lambda root: find_colmap(root, "colmap/sparse/0"),
+        read_colmap,
+    ),
+)
+"""In this order; the first one found is read. A new layout is a line here and its reader in data/readers/."""
 _FEWEST = 3
 _SMALLEST_WIDTH = 16
 _WHITE = (1.0, 1.0, 1.0)
@@ -49,7 +95,7 @@ def load_scene(
     """Load a scene: poses, sparse points, and undistorted photographs at the working resolution.
 
     Args:
-        root: a folder in one of the five layouts, which is recognised by its files.
+        root: a folder in one of `LAYOUTS`, which is recognised by its files.
         width: of every photograph in pixels, with its aspect kept; photographs are never enlarged. None keeps their
             own widths.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
@@ -92,7 +138,7 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Read the poses and lenses of a folder's photographs, sorted by their names, without decoding them.
 
     Args:
-        root: a folder in one of the five layouts; a COLMAP model is preferred where there are several.
+        root: a folder in one of `LAYOUTS`; a COLMAP model is preferred where there are several.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
 
     Raises:
@@ -125,21 +171,20 @@ def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
 def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Read the layout that the folder's files show."""
     if not root.is_dir():
-        raise SceneError(f"{root} is {'a file' if root.exists() else 'missing'}: {_LAYOUTS}")
-    if model := find_colmap(root, "sparse/0", "sparse"):
-        return read_colmap(root, model, allow_missing)
-    if (root / "transforms.json").is_file():
-        return read_transforms(root, allow_missing)
-    if (root / "transforms_train.json").is_file():
-        return read_blender(root, allow_missing)
-    if (root / "poses_bounds.npy").is_file():
-        return read_llff(root)
-    if reconstruction := find_opensfm(root):
-        return read_opensfm(root, reconstruction, allow_missing)
-    if model := find_colmap(root, "colmap/sparse/0"):
-        return read_colmap(root, model, allow_missing)
-    found = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
-    raise SceneError(f"{root} has no posed photographs (found: {list_names(found, 8) or 'nothing'}): {_LAYOUTS}")
+        raise SceneError(f"{root} is {'a file' if root.exists() else 'missing'}: {_expected()}")
+    for layout in LAYOUTS:
+        if (found := layout.find(root)) is not None:
+            return layout.read(root, found, allow_missing)
+    names = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
+    raise SceneError(f"{root} has no posed photographs (found: {list_names(names, 8) or 'nothing'}): {_expected()}")
+
+
+def _expected() -> str:
+    lines = "\n".join(f"  {layout.files:<70} {layout.program}" for layout in LAYOUTS)
+    return (
+        f"expected one of\n{lines}\n; estimate poses of the photographs first (`tidefield prepare` or COLMAP), or give "
+        "the folder that holds these"
+    )
 
 
 def _sorted(posed: PosedPhotographs) -> PosedPhotographs:

@@ -16,7 +16,7 @@ from jaxtyping import Float64, UInt8
 
 from tidefield.data.ply import write_ply
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import NERFSTUDIO_MODEL, Lens
 
 TRANSFORMS_FILE = "transforms.json"
 CLOUD_FILE = "sparse_pc.ply"
@@ -56,10 +56,10 @@ def write_transforms_file(
     Raises:
         RunError: a file exists already, or cannot be written.
     """
-    calibrations = [_calibration(lens) for lens in lenses]
+    calibrations = [lens.nerfstudio_keys() for lens in lenses]
     is_shared = len(set(lenses)) == 1
     train, test = ([files[i] for i in part] for part in split)
-    top: dict[str, Any] = {"camera_model": "OPENCV", **(calibrations[0] if is_shared else {}), **(header or {})}
+    top: dict[str, Any] = {"camera_model": NERFSTUDIO_MODEL, **(calibrations[0] if is_shared else {}), **(header or {})}
     if len(xyz_world):
         write_ply(folder / CLOUD_FILE, xyz_world, rgb, overwrite)
         top["ply_file_path"] = CLOUD_FILE
@@ -74,8 +74,3 @@ def write_transforms_file(
     ]
     with completed_file(folder / TRANSFORMS_FILE, overwrite=overwrite) as partial:
         partial.write_text(json.dumps(top, indent=1, allow_nan=False), encoding="utf-8")
-
-
-def _calibration(lens: Lens) -> dict[str, int | float]:
-    pinhole = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    return {**pinhole, **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=True))}

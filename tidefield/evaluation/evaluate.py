@@ -30,7 +30,6 @@ from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar
 
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
-_TITLES = {"psnr": "PSNR dB", "ssim": "SSIM", "lpips_alex": "LPIPS AlexNet", "lpips_vgg": "LPIPS VGG", "flip": "FLIP"}
 _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_cc": "doubly seen, colour fit"}
 
 
@@ -191,10 +190,9 @@ def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
     table.add_column("mean")
     for column in _COLUMNS.values():
         table.add_column(column, justify="right")
-    for metric in METRICS:
-        values = [report["mean"][metric + suffix] for suffix in _COLUMNS]
-        digits = 2 if metric == "psnr" else 3
-        table.add_row(_TITLES[metric], *("-" if value is None else f"{value:.{digits}f}" for value in values))
+    for name, metric in METRICS.items():
+        values = [report["mean"][name + suffix] for suffix in _COLUMNS]
+        table.add_row(metric.title, *("-" if value is None else metric.style.format(value) for value in values))
     return table
 
 

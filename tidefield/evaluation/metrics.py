@@ -8,7 +8,7 @@ numbers are those of the paper. Libraries are imported where they are used: torc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,13 +18,30 @@ from torch import Tensor
 
 from tidefield.evaluation.lpips import BACKBONES, SMALLEST_PX, Lpips, prepare_torchvision
 
-METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "flip")
 SUFFIXES = ("", "_seen", "_cc", "_seen_cc")
 """Over all pixels, over the doubly seen ones, and both after a colour fit to the same pixels."""
 PSNR_LIMIT_DB = 100.0
 """PSNR of identical images, which is infinite and has no place in JSON; 8-bit images that differ stay far below it."""
 
 Image8 = UInt8[Tensor, "H W 3"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One metric, as evaluation measures it and tables show it.
+
+    Attributes:
+        title: of its rows and columns.
+        style: format of its values.
+        more_is_better: or less.
+        pixel_map: its value around each pixel, of (image, truth); a masked value is the mean over the mask. None where
+            `_score_image` measures it in another way.
+    """
+
+    title: str
+    style: str
+    more_is_better: bool
+    pixel_map: Callable[[Image8, Image8], Float[Tensor, "H W"]] | None = None
 
 
 @dataclass
@@ -75,11 +92,12 @@ def _score_image(
             add_missing(metric, suffix, "two training photographs see none of this photograph's pixels")
     if not masks:
         return
-    ssim, flip = ssim_map(image, truth), flip_map(image, truth)
     for suffix, mask in masks.items():
         scores.values["psnr" + suffix] = psnr(image, truth, mask)
-        scores.values["ssim" + suffix] = float(ssim[mask].mean())
-        scores.values["flip" + suffix] = float(flip[mask].mean())
+    for name, metric in METRICS.items():
+        if metric.pixel_map is not None:
+            values = metric.pixel_map(image, truth)
+            scores.values.update({name + suffix: float(values[mask].mean()) for suffix, mask in masks.items()})
     for metric in BACKBONES:
         network = networks[metric]
         if min(image.shape[:2]) < SMALLEST_PX:
@@ -147,3 +165,13 @@ def fit_colours(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> Imag
     design = torch.nn.functional.pad(image.double(), (0, 1), value=1.0)
     fit = np.linalg.lstsq(design[mask].numpy(), truth[mask].double().numpy(), rcond=None)[0]
     return (design @ torch.from_numpy(fit)).clamp(0, 255).round().to(torch.uint8)
+
+
+METRICS = {
+    "psnr": Metric("PSNR, dB", "{:.2f}", more_is_better=True),
+    "ssim": Metric("SSIM", "{:.3f}", more_is_better=True, pixel_map=ssim_map),
+    "lpips_alex": Metric("LPIPS, AlexNet", "{:.3f}", more_is_better=False),
+    "lpips_vgg": Metric("LPIPS, VGG", "{:.3f}", more_is_better=False),
+    "flip": Metric("FLIP", "{:.3f}", more_is_better=False, pixel_map=flip_map),
+}
+"""The metrics by name, in the order of the tables."""

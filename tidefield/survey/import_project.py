@@ -136,7 +136,7 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
 
 def _camera(lens: Lens, number: int) -> pycolmap.Camera:
     """Make the simplest camera of COLMAP that has all of the lens's terms."""
-    model = "FULL_OPENCV" if lens.k3 else "OPENCV" if lens.is_distorted else "PINHOLE"
+    model = lens.colmap_model
     parameters = colmap_parameters(lens, model)
     return pycolmap.Camera(camera_id=number, model=model, width=lens.width, height=lens.height, params=parameters)
 

@@ -35,6 +35,10 @@ COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
 
 
+STAGES = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
+"""In their order."""
+
+
 @dataclass(frozen=True)
 class PrepareOptions:
     """Options of `prepare`.
@@ -89,6 +93,8 @@ def prepare(
     _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
     database, model = work / "database.db", work / "model"
+    if options.redo not in (None, *STAGES):
+        raise RunError(f"there is no stage {options.redo!r}: expected one of {', '.join(STAGES)}; name one of these")
     stages = Stages(work, _fingerprint(survey), options.redo)
 
     quality = stages.run("quality", {}, [], lambda _: judge_quality(survey, console))
