@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt
 REQUIRED := pyproject.toml constraints.txt $(VENV)/.made
 
-.PHONY: demo test bench lint docs clean help
+.PHONY: demo test bench lint docs lowest clean help
 .DELETE_ON_ERROR:
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make bench    the benchmarks (ARGS=... for them)"
 	@echo "make lint     ruff and pyright"
 	@echo "make docs     the site, in docs/_build/html"
+	@echo "make lowest   the main job with the lowest promised versions, in $(VENV)-lowest"
 	@echo "make clean    remove the virtual environment, which the next target makes again"
 	@echo "PYTHON=python3.12 chooses another Python than python3, before the environment is made."
 
@@ -39,8 +40,18 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
+# The main job with the lowest versions of the dependencies that pyproject.toml promises, in an environment of its own.
+lowest: $(VENV)/.installed-dev $(VENV)-lowest/.installed
+	.ci/smoke.sh $(CURDIR)/$(VENV)-lowest/bin/python
+
+$(VENV)-lowest/.installed: $(REQUIRED) $(VENV)/.installed-dev
+	$(PYTHON) -m venv $(VENV)-lowest
+	$(BIN)/python .ci/lowest.py > $(VENV)-lowest/constraints.txt
+	$(VENV)-lowest/bin/python -m pip --disable-pip-version-check install -c $(VENV)-lowest/constraints.txt -e .
+	touch $@
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-lowest
 
 $(VENV)/.made:
 	@command -v $(PYTHON) > /dev/null || \
@@ -55,7 +66,7 @@ $(VENV)/.installed: $(REQUIRED)
 	touch $@
 
 $(VENV)/.installed-dev: $(REQUIRED)
-	$(PIP) -e '.[dev]'
+	$(PIP) -e '.[dev]' -e ./weights/paper
 	touch $(VENV)/.installed $@
 
 $(VENV)/.installed-docs: $(REQUIRED)

@@ -1,4 +1,4 @@
-"""The card that lies beside shipped weights: what they are, from the file itself and from what was measured."""
+"""The card of shipped weights, from the file itself and from stored measurements."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LICENCES = {
 
 
 def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
-    """Write PRESET.md beside the weights.
+    """Write PRESET.md next to the weights.
 
     Args:
         weights: of `tidefield pretrain`.

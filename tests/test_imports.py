@@ -86,7 +86,7 @@ def test_imports_point_downward(name: str):
             continue
         assert own not in FOR_ALL, f"{name} is for all to import, but imports {imported}"
         assert own in RANK, f"{name} imports {imported}, but is imported by everything"
-        assert RANK[theirs] < RANK[own], f"{name} imports {imported}, which lies above it or beside it"
+        assert RANK[theirs] < RANK[own], f"{name} imports {imported}, which lies above it or on its level"
 
 
 def imported_with(name: str) -> set[str]:

@@ -1,6 +1,6 @@
 """Presets and what they are made of: plain values, no behaviour, no heavy imports.
 
-A run stores its `Config` as JSON beside its weights; `config_from_json` reads it back.
+A run stores its `Config` as JSON next to its weights; `config_from_json` reads it back.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What goes wrong in a user's hands, as exceptions that a command prints without a traceback.
+"""Errors that a user can fix; commands print them without a traceback.
 
-Every message says what was found, what was expected and what to do about it.
+Every message says what was found, what was expected and what to do.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 
 class TidefieldError(Exception):
-    """Base of every error that a user can mend; commands print it and exit with status 2."""
+    """Base of every error that a user can fix; commands print it and exit with status 2."""
 
 
 class SceneError(TidefieldError):

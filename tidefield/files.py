@@ -1,4 +1,4 @@
-"""Files appear under their final names only when they are complete."""
+"""Atomic files and folders: they appear under their final names only when they are complete."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _USERS_TO_MEND = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.E
 
 
 def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
-    """Raises: RunError when there is something under one of the names already.
+    """Raise a RunError when one of the names exists already.
 
     Args:
-        replaceable: whether the command that asks has an --overwrite.
+        replaceable: whether the command has an --overwrite.
     """
     for path in paths:
         if os.path.lexists(path):
@@ -32,7 +32,7 @@ def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
 
 @contextmanager
 def writing_to(path: Path) -> Iterator[None]:
-    """Tells a user who writes to a place that cannot be written to, or is full, what to do.
+    """Turn the system's errors of a place that cannot be written to, or is full, into one clear error.
 
     Raises:
         RunError: instead of the system's own errors.
@@ -51,7 +51,7 @@ def writing_to(path: Path) -> Iterator[None]:
 
 @contextmanager
 def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it takes the final name when the block ends, and goes when it fails.
+    """A temporary name next to `path` to write to; renamed to `path` when the block ends, deleted when it fails.
 
     Raises:
         RunError: `path` is there already and must not be overwritten, or its folder cannot be written to.
@@ -75,7 +75,7 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def completed_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path` to fill; it takes the final name when the block ends, and goes when it fails.
+    """A temporary folder next to `path` to fill; renamed to `path` when the block ends, deleted when it fails.
 
     Raises:
         RunError: `path` is there already, or the folder that it would be in cannot be written to.

@@ -1,4 +1,4 @@
-"""How far a long job is: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of long jobs: a bar on a terminal, a line every ten seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LINE_SECONDS = 10.0
 
 
 class ProgressBar:
-    """Shows what share of a job is done, and how long the rest will take.
+    """Shows the share of a job that is done, and the time left.
 
     On a terminal a bar that goes away with the job. In a file or a pipe a line every ten seconds, as a message of this
     module's logger, which --quiet silences; a job that ends sooner leaves no line.
@@ -46,16 +46,16 @@ class ProgressBar:
         self._bar.stop()
 
     def __call__(self, done: int | float, whole: int | float, note: str | None = None) -> None:
-        """Show that so much of the whole is done.
+        """Show progress.
 
         Args:
-            note: what to say of it; `done of whole` if None.
+            note: the text; `done of whole` if None.
         """
         now, share = monotonic(), done / whole
         line = f"{done} of {whole}" if note is None else note
         if self._first is None:
             self._first = now, share
-        # From what this process itself has seen: a job that goes on may have begun elsewhere.
+        # From this process's own progress: a job that is continued may have started elsewhere.
         since, share_then = self._first
         if share_then < share < 1:
             line += f"  {_clock((now - since) * (1 - share) / (share - share_then))} left"

@@ -166,13 +166,13 @@ def test_progress_is_told_where_there_is_no_terminal(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     command = "evaluate", scene, tmp_path / "floor", "--method", "sparse-depth", "--width", 40, "--overwrite"
     call(*command)
-    told = capfd.readouterr()
-    assert re.search(r"^\d\d:\d\d:\d\d Reading photographs: 9 of 9$", told.err, flags=re.MULTILINE)
-    assert re.search(r"^\d\d:\d\d:\d\d Evaluating: 2 of 2$", told.err, flags=re.MULTILINE)
-    assert "Evaluating" not in told.out
+    printed = capfd.readouterr()
+    assert re.search(r"^\d\d:\d\d:\d\d Reading photographs: 9 of 9$", printed.err, flags=re.MULTILINE)
+    assert re.search(r"^\d\d:\d\d:\d\d Evaluating: 2 of 2$", printed.err, flags=re.MULTILINE)
+    assert "Evaluating" not in printed.out
     call(*command, "-q")
-    told = capfd.readouterr()
-    assert (told.out, told.err) == ("", "")
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "")
 
 
 def test_help_does_not_import_torch() -> None:

@@ -124,7 +124,7 @@ def test_instance_norms_take_away_contrast():
 
 
 def test_finer_outputs_hold_finer_detail():
-    """Stripes one pixel wide can be told from grey only by a map that reads the input at full resolution."""
+    """Stripes one pixel wide can be distinguished from grey only by a map that reads the input at full resolution."""
     encoder = randomise(Encoder(SMALL, ALL))
     stripes = picture(64, 64).clone()
     stripes[..., ::2], stripes[..., 1::2] = 0.2, 0.8

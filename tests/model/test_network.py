@@ -151,8 +151,8 @@ def test_what_no_neighbour_sees_is_continued_from_beside_it():
     seen = in_frame(others, *others.project(points)).any(0).reshape(36, 48)
     assert 0.2 < seen.float().mean() < 0.8
     edge = int(seen[18].nonzero().max())
-    beside = view.colour[:, edge - 6 : edge - 1].mean((0, 1))
-    assert (view.colour[:, edge + 3 :].mean((0, 1)) - beside).abs().max() < 0.15
+    nearby = view.colour[:, edge - 6 : edge - 1].mean((0, 1))
+    assert (view.colour[:, edge + 3 :].mean((0, 1)) - nearby).abs().max() < 0.15
     assert (view.depth[:, edge + 3 :] - wall.DEPTH).abs().max() < 0.2
     assert not Renderer(network(PAPER.network).eval(), at, PAPER, CPU).fills_unseen
 

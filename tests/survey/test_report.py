@@ -335,12 +335,12 @@ def test_the_report_warns_of_low_overlap_and_of_a_changed_focal_length(tmp_path)
     read = found.survey.photographs
     lens = replace(read[0].lens, focal_px=500.0)
     survey = replace(found.survey, photographs=tuple(replace(p, lens=lens) for p in read))
-    said = " ".join(write_report(replace(found, survey=survey), tmp_path).numbers["tidefield"]["remarks"])
-    assert "seen by three photographs or more" in said
-    assert "forward overlap, 40%" in said
-    assert "side overlap, 25%" in said
-    assert "focal length came out +20%" in said
-    assert "No surveyed points" in said
+    remarks = " ".join(write_report(replace(found, survey=survey), tmp_path).numbers["tidefield"]["remarks"])
+    assert "seen by three photographs or more" in remarks
+    assert "forward overlap, 40%" in remarks
+    assert "side overlap, 25%" in remarks
+    assert "focal length came out +20%" in remarks
+    assert "No surveyed points" in remarks
 
 
 def test_the_report_of_a_good_survey_with_check_points_has_no_warnings(tmp_path):

@@ -1,4 +1,4 @@
-"""Eq. 5 and the terms beside it, against brute-force twins."""
+"""Eq. 5 and the further terms, against brute-force twins."""
 
 from dataclasses import replace
 

@@ -228,9 +228,9 @@ def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
     with safe_open(file, framework="pt") as stored:
         assert json.loads(stored.metadata()["tidefield"])["steps"] == 5
         assert {stored.get_tensor(name).dtype for name in stored.keys()} == {torch.float16}  # noqa: SIM118
-    begun = SceneTrainer(SMALL, scene, 2, CPU, file)
+    started = SceneTrainer(SMALL, scene, 2, CPU, file)
     for name, value in trainer.network.state_dict().items():
-        assert torch.equal(begun.network.state_dict()[name], value.half().float()), name
+        assert torch.equal(started.network.state_dict()[name], value.half().float()), name
     fewer = replace(SMALL, network=replace(SMALL.network, views=2))
     read_weights(file, make_network(fewer.network))
     assert len(weights_sha256(file)) == 64

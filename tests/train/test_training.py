@@ -84,16 +84,16 @@ def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkey
         pairs = zip(network.parameters(), shipped.parameters(), strict=True)
         return read_run(tmp_path / name), max((a - b).abs().max().item() for a, b in pairs)
 
-    begun, far = moved("begun")
-    assert begun.weights == weights_sha256(tmp_path / "swift.safetensors")
-    assert isinstance(begun.config, Config)
-    assert begun.config.train.warm_up == 200
+    started, far = moved("started")
+    assert started.weights == weights_sha256(tmp_path / "swift.safetensors")
+    assert isinstance(started.config, Config)
+    assert started.config.train.warm_up == 200
     assert far < 1e-4, "two steps of a two-hundred-step rise"
     fresh, far = moved("fresh", from_scratch=True)
     assert (fresh.weights, fresh.config) == (None, SMALL)
     assert far > 1e-2
     given, _ = moved("given", weights=tmp_path / "swift.safetensors")
-    assert given.weights == begun.weights
+    assert given.weights == started.weights
     with pytest.raises(RunError, match="starts without"):
         moved("both", weights=tmp_path / "swift.safetensors", from_scratch=True)
 

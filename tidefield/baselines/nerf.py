@@ -2,7 +2,7 @@
 2020), the paper's "conventional NeRF": one multi-layer perceptron for a coarse and one for a fine pass along each ray.
 
 Sizes and rates are the authors'. Where their code departs from their equations we follow the code, which made their
-figures: positions enter beside their encoding, and frequencies go without the factor pi. Exposures are evened out as
+figures: positions enter next to their encoding, and frequencies go without the factor pi. Exposures are corrected as
 for every other method here.
 
 Alphabet: R rays, M samples of a ray, P points.

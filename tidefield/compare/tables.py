@@ -217,8 +217,8 @@ def nerfacto_limits(results: Results) -> list[str]:
     return [
         f"Nerfacto ran on CPUs, with {NERFACTO_CPU_RAYS:,} rays a batch instead of its default of {NERFACTO_RAYS:,}; "
         f"within the budget it made {min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default "
-        f"of {NERFACTO_STEPS:,}. Its figures are those of a method at the start of its training, and nothing is said "
-        "here about Nerfacto trained to its end on a GPU."
+        f"of {NERFACTO_STEPS:,}. Its figures are those of a method at the start of its training, and they are "
+        "no evidence about Nerfacto trained to its end on a GPU."
     ]
 
 

@@ -36,7 +36,7 @@ from tidefield.model.sampling import Intervals, Samples, Tiles, histogram, place
 from tidefield.model.views import Encoded, Gathered, Views, maps_from_images, upsample_twice
 
 LOGIT_LIMIT = 12.0
-"""Of opacities: beyond it a sample is opaque, or empty, for all that single precision tells."""
+"""Of opacities: beyond it a sample is opaque, or empty, as far as single precision can represent it."""
 UNSEEN_SCORE = -30.0
 """Score of a sample that no view sees."""
 COLOUR_NOISE = 1e-4

@@ -104,7 +104,9 @@ def install(overwrite: bool, console: Console) -> None:
     checked = subprocess.run([str(_interpreter()), str(WORKER), "check"], capture_output=True, text=True, check=False)
     if checked.returncode:
         why = checked.stderr.strip().splitlines()[-1:] or ["no message"]
-        raise RunError(f"nerfstudio was installed into {folder} but does not start ({why[0]}): expected it to; tell us")
+        raise RunError(
+            f"nerfstudio was installed into {folder} but does not start ({why[0]}): expected it to; report it"
+        )
     _complete().touch()
 
 

@@ -1,0 +1,1 @@
+"""Trained weights of Tidefield's preset `paper`: `paper.safetensors`, next to this file."""
