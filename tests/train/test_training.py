@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,8 @@ import textured_wall as wall
 import torch
 from networks import SMALL
 from rich.console import Console
+from safetensors import safe_open
+from safetensors.torch import save_file
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield.commands import train as train_command
@@ -188,3 +191,40 @@ def test_gradients_are_clipped_to_a_norm_of_one(scene: Scene) -> None:
     trainer.step(Budget(steps=10))
     norms = [p.grad.norm() for p in trainer.network.parameters() if p.grad is not None]
     assert torch.stack(norms).norm().item() == pytest.approx(1.0, rel=1e-3)
+
+
+def test_runs_of_version_0_1_are_read_with_converted_names(scene: Scene, tmp_path: Path) -> None:
+    today = json.loads(json.dumps(config_to_json(SMALL)))
+    network = today["network"]
+    network = {
+        **{name: network[name] for name in ("encoder", "views", "heads", "harmonics_degree", "without")},
+        **{"stages": network["passes"], "doubt": network["uniform_fraction"]},
+        **{"as_printed": False, "fold": True, "field": None},
+    }
+    old = {**today, "network": network, "train": {**today["train"], "field_learning_rate": 1e-2}}
+    assert config_from_json(old) == SMALL
+    with pytest.raises(RunError, match="per-scene field"):
+        config_from_json({**old, "network": {**network, "field": {"levels": 12}}})
+
+    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    trainer.step(Budget(steps=5))
+    trainer.save(tmp_path)
+    with safe_open(tmp_path / CHECKPOINT_FILE, framework="pt") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    older = {}
+    for name, value in tensors.items():
+        name = re.sub(r"^network\.passes\.", "network.stages.", name).replace(".view_weight.", ".trust.")
+        for now, then in (("log_metric", "metric"), ("agreement", "match"), ("prior_height", "guide_height")):
+            name = name.replace(f".{now}", f".{then}")
+        name = name.replace(".prior_steepness", ".guide_steepness").replace(".prior_features.", ".guide.")
+        name = name.replace(".single_view_steepness", ".lone_steepness").replace(
+            "transformer.position", "transformer.place"
+        )
+        older[name] = value
+    assert len(set(older) - set(tensors)) > 20
+    save_file(older, tmp_path / CHECKPOINT_FILE, metadata=metadata)
+    again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
+    again.resume(tmp_path)
+    for name, value in weights(trainer).items():
+        assert torch.equal(value, weights(again)[name]), name
+    assert trainer.step(Budget(steps=5)) == again.step(Budget(steps=5))
