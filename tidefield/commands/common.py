@@ -26,14 +26,12 @@ Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
 
 
-def choice(*method_names: str) -> Any:
-    """An option that takes one of some methods' names."""
-    return arg(constructor=literal_type_from_choices(method_names))
-
-
-TrainedMethod = Annotated[str, choice("tidefield", *names("nerf", "nerfstudio"))]
-UntrainedMethod = Annotated[str, choice(*names("untrained"))]
-AnyMethod = Annotated[str, choice(*names())]
+if TYPE_CHECKING:
+    TrainedMethod = UntrainedMethod = AnyMethod = str
+else:
+    TrainedMethod = literal_type_from_choices(["tidefield", *names("nerf", "nerfstudio")])
+    UntrainedMethod = literal_type_from_choices(names("untrained"))
+    AnyMethod = literal_type_from_choices(names())
 
 
 @dataclass(frozen=True)
