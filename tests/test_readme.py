@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -149,3 +150,10 @@ def test_the_reference_lists_the_whole_interface_from_python() -> None:
     names = [name for name in tidefield.__all__ if name != "__version__"]
     assert names
     assert [name for name in names if f":: tidefield.{name}\n" not in page] == []
+
+
+def test_readme_of_the_package_has_no_links_that_lead_nowhere() -> None:
+    shown = metadata("tidefield")["Description"] or metadata("tidefield").get_payload()
+    assert isinstance(shown, str)
+    assert "## Use" in shown
+    assert re.findall(r"\]\((?!https://)", shown) == []
