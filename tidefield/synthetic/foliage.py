@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tidefield.synthetic.grids import Extent, box_pairs
+from tidefield.synthetic.grids import box_pairs
 from tidefield.synthetic.rays import Parallel, View, dot, normalised
 from tidefield.synthetic.shading import Light
 
@@ -181,7 +181,7 @@ class Plants:
         """Find, for every ray of a view, depth and number of the first primitive it meets; inf and -1 where none."""
         # Depth in the upper and the primitive in the lower half of one integer: the least is the nearest, and
         # ties have one answer whatever the order of writing.
-        nearest = torch.full((view.columns * view.rows,), _MISS, device=view.device)
+        nearest = torch.full((view.columns * view.rows,), _MISS)
         leaves, stems = self.leaves, self.stems
         for primitives, boxes, first_number in (
             (leaves.planes(), _boxes(view, (leaves.centre,), leaves.radius), 0),
@@ -200,7 +200,7 @@ class Plants:
         self, light: Light, shadows: Shadows, view: View, ray: Int[Tensor, " P"], primitive: Int[Tensor, " P"]
     ) -> Float[Tensor, "3 P"]:
         """Shade the primitives that numbered rays meet; diffuse, so the same from all sides."""
-        radiance = torch.empty(3, len(ray), device=view.device)
+        radiance = torch.empty(3, len(ray))
         is_stem = primitive >= len(self.leaves)
         leaf, stem = torch.nonzero(~is_stem)[:, 0], torch.nonzero(is_stem)[:, 0]
         leaves, stems = self.leaves[primitive[leaf]], self.stems[primitive[stem] - len(self.leaves)]
@@ -236,9 +236,8 @@ class Shadows:
     depth: Float[Tensor, "H W"]
 
     @staticmethod
-    def cast(plants: Plants, extent: Extent, low_m: float, high_m: float, light: Light) -> Shadows:
-        """Compute shadows for all points over an extent between two heights."""
-        view = Parallel.along_sun(extent, low_m, high_m, light.sun, extent.cell_m)
+    def cast(plants: Plants, view: Parallel) -> Shadows:
+        """Compute the shadows in a view from the sun."""
         depth, _ = plants.nearest(view)
         return Shadows(view, depth.reshape(view.rows, view.columns))
 

@@ -24,7 +24,7 @@ _BARK = np.array([[0.210, 0.180, 0.145], [0.130, 0.105, 0.080], [0.300, 0.270, 0
 
 def marsh_map(settings: Settings, terrain: Terrain, random: np.random.Generator) -> Float[Tensor, "H W"]:
     """Map how densely plants cover the ground, 0 to 1: patches on ground that most tides leave dry."""
-    noise = Noise.make(random, channels=2)
+    noise = Noise(random, channels=2)
     pattern = noise.fractal(terrain.extent.nodes(), 24.0, 5, gain=0.6)[0].reshape(terrain.ground.shape)
     above = terrain.ground - settings.tide_m
     dry = smoothstep(0.2, 0.55, above) * (terrain.water_depth == 0)
@@ -60,7 +60,7 @@ def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> lis
     stray = 0.012 * (water == 0)
     base = base[:, random.random(count) < np.maximum(marsh, stray)]
     count = base.shape[1]
-    hue = Noise.make(random, channels=2).fractal(torch.from_numpy(base[:2]), 14.0, 3).numpy()
+    hue = Noise(random, channels=2).fractal(torch.from_numpy(base[:2]), 14.0, 3).numpy()
     tall = np.clip(0.55 + 0.45 * hue[1] + 0.15 * random.normal(size=count), 0.22, 1.05)
     spread = np.clip(0.36 * tall + 0.1 * random.normal(size=count), 0.14, 0.55)
     kind = np.clip(np.floor((hue[0] * 0.9 + 0.5) * 3.2 + random.normal(0, 0.7, count)), 0, 4).astype(int)

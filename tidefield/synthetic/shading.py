@@ -73,7 +73,7 @@ class Light:
         """Compute the radiance of the sky in unit directions, without the sun's disc."""
         up = direction[2].clamp(min=0.02)
         low = (1 - up) ** 3
-        zenith, horizon = (self.sky_rgb.new_tensor(c)[:, None] for c in ([0.13, 0.24, 0.46], [0.62, 0.70, 0.80]))
+        zenith, horizon = (torch.tensor(c)[:, None] for c in ([0.13, 0.24, 0.46], [0.62, 0.70, 0.80]))
         # Clouds lie on a plane: their pattern depends on where the ray would cross it.
         across = direction[:2] / (up + 0.15)
         cloud = smoothstep(-0.1, 0.5, self.noise.fractal(across, 0.9, 3)[0]) * 0.55
@@ -234,7 +234,7 @@ class Ground:
         if 1.5 * finest < _RIPPLE_WAVELENGTH_M:
             cos, sin = math.cos(self.ripple_heading), math.sin(self.ripple_heading)
             wave = torch.cos((xy[0] * cos + xy[1] * sin) * (2 * math.pi / _RIPPLE_WAVELENGTH_M) + bend)
-            slope = slope + (strength * share * wave) * xy.new_tensor([[cos], [sin]])
+            slope = slope + (strength * share * wave) * torch.tensor([[cos], [sin]])
             tint = tint * (1 - 0.07 * ripple * share * wave)
         return slope, tint.clamp(min=0.25), 0.25 * strength * (1 - share)
 
@@ -253,7 +253,7 @@ class Ground:
             # Waves on deep water: the square of the frequency is g k.
             turn = 1.9 * k - math.sqrt(9.81 * number) * seconds
             phase = number * (xy[0] * cos + xy[1] * sin) + (3.0 * warp[k % 4] + 0.8 * fine[(k + 1) % 4]) + turn
-            slope = slope + (amplitude * share * torch.cos(phase)) * xy.new_tensor([[cos], [sin]])
+            slope = slope + (amplitude * share * torch.cos(phase)) * torch.tensor([[cos], [sin]])
             variance = variance + 0.5 * amplitude**2 * (1 - share)
         # Waves that cross are never as regular as their sum.
         slope = slope + (0.9 * amplitude * resolved(1.3, footprint_m)) * fine[0:2] + (0.9 * amplitude) * warp[0:2]
@@ -269,13 +269,11 @@ def _normal(slope: Tensor) -> Tensor:
 
 def _water_body(albedo: Tensor, depth: Tensor, silt: Tensor, foam: Tensor, light: Light, sunlit: Tensor) -> Tensor:
     """Compute the light that comes back out of the water: the bed through it, and the silt in it."""
-    turbid, clear, absorption = (
-        albedo.new_tensor(c)[:, None] for c in (_TURBID_WATER, _CLEAR_WATER, _ABSORPTION_PER_M)
-    )
+    turbid, clear, absorption = (torch.tensor(c)[:, None] for c in (_TURBID_WATER, _CLEAR_WATER, _ABSORPTION_PER_M))
     body = torch.lerp(clear, turbid, silt)
     through = torch.exp(-absorption * depth * (0.8 + 2.5 * silt))
     upwelling = (albedo * through + body * (1 - through)) * (1 - foam) + _FOAM * foam
-    level = depth.new_tensor([0.0, 0.0, 1.0])[:, None]
+    level = torch.tensor([0.0, 0.0, 1.0])[:, None]
     # Shadows are soft on water: silt scatters light into them.
     return upwelling * light.diffuse(level, 0.3 + 0.7 * sunlit, torch.ones_like(depth))
 
@@ -298,7 +296,7 @@ def make_ground(
         shade: share of the sun that plants let through.
         random: draws the patterns.
     """
-    noise = Noise.make(random, channels=4)
+    noise = Noise(random, channels=4)
     nodes = terrain.extent.nodes()
     shape = (terrain.extent.rows, terrain.extent.columns)
     large = noise.fractal(nodes, 26.0, 4).reshape(4, *shape)
@@ -314,9 +312,10 @@ def make_ground(
     # Rough water foams.
     foam = foam * float(np.clip((settings.wave_slope - 0.035) / 0.03, 0, 1)) * smoothstep(0.1, 0.4, terrain.water_depth)
     ripple = terrain.ripple * (1 - marsh)
-    maps = [*surface.gradient(), *albedo, wet, terrain.water_depth, silt, foam, ripple, sunlit, openness]
+    north, east = torch.gradient(surface.values[0], spacing=terrain.extent.cell_m)
+    maps = [east, north, *albedo, wet, terrain.water_depth, silt, foam, ripple, sunlit, openness]
     raster, heading = Raster(terrain.extent, torch.stack(maps)), float(random.uniform(0, math.pi))
-    return Ground(raster, heading, settings.shells, settings.wave_slope, Noise.make(random, channels=4))
+    return Ground(raster, heading, settings.shells, settings.wave_slope, Noise(random, channels=4))
 
 
 def _wetness(settings: Settings, terrain: Terrain, pattern: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:

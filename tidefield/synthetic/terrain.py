@@ -49,7 +49,7 @@ class Terrain:
 
 def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator) -> Terrain:
     """Build humps and hollows, creeks, sand waves and pools."""
-    noise = Noise.make(random, channels=4)
+    noise = Noise(random, channels=4)
     nodes = extent.nodes()
     broad = noise.fractal(nodes, 38.0, 4)
     fine = noise.fractal(nodes + 500, 7.0, 4)
@@ -162,13 +162,9 @@ def _carve(reaches: _Reaches, extent: Extent) -> Raster:
     margin = reaches.half_width + 2 * banks
     low = torch.minimum(reaches.start, reaches.end) - margin
     high = torch.maximum(reaches.start, reaches.end) + margin
-    west_south = torch.tensor([[extent.west_m], [extent.south_m]])
-    limit = torch.tensor([[extent.columns - 1], [extent.rows - 1]])
-    first = torch.ceil((low - west_south) / extent.cell_m).clamp(min=0)
-    last = torch.minimum(torch.floor((high - west_south) / extent.cell_m), limit).maximum(first - 1)
     axis = reaches.end - reaches.start
     table = torch.cat([reaches.start, axis / (axis**2).sum(0), axis, reaches.half_width[None], banks[None]])
-    for i, node in box_pairs(torch.cat([first, last]).long(), extent.columns):
+    for i, node in box_pairs(extent.boxes(low, high), extent.columns):
         x0, y0, ax, ay, bx, by, half_width, bank = table[:, i]
         x, y = nodes[0, node] - x0, nodes[1, node] - y0
         along = (x * ax + y * ay).clamp(0, 1)
@@ -176,7 +172,7 @@ def _carve(reaches: _Reaches, extent: Extent) -> Raster:
         depth = reaches.depth[i] * smoothstep(half_width + 0.8 * bank, 0.3 * half_width, distance)
         carved.scatter_reduce_(0, node, depth, "amax")
         near.scatter_reduce_(0, node, smoothstep(half_width + 2 * bank, 0.5 * half_width, distance), "amax")
-    return Raster.of(extent, carved, near)
+    return Raster(extent, torch.stack([carved, near]).reshape(2, extent.rows, extent.columns))
 
 
 def _add_pools(
@@ -213,11 +209,6 @@ def _add_pools(
 
 def _nodes_around(extent: Extent, centre: tuple[float, float], reach_m: float) -> Int[Tensor, " K"]:
     """Number the nodes in a square around a point."""
-
-    def span(at: float, start_m: float, count: int) -> Tensor:
-        first = max(0, math.ceil((at - reach_m - start_m) / extent.cell_m))
-        last = min(count - 1, math.floor((at + reach_m - start_m) / extent.cell_m))
-        return torch.arange(first, max(first, last) + 1).clamp(max=count - 1)
-
-    column, row = span(centre[0], extent.west_m, extent.columns), span(centre[1], extent.south_m, extent.rows)
-    return (row[:, None] * extent.columns + column).reshape(-1)
+    middle = torch.tensor(centre, dtype=torch.float64)[:, None]
+    [(_, node)] = box_pairs(extent.boxes(middle - reach_m, middle + reach_m), extent.columns)
+    return node
