@@ -8,8 +8,8 @@ import torch
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.synthetic import grids
-from tidefield.synthetic.foliage import Leaves, Plants, Stems
 from tidefield.synthetic.grids import Extent, Noise, Raster, box_pairs, resolved, smoothstep
+from tidefield.synthetic.plants import Leaves, Plants, Stems
 from tidefield.synthetic.rays import Parallel, Pinhole, height_field_depth
 
 EXTENT = Extent(-6.0, -5.0, 61, 51, 0.2)
@@ -92,7 +92,7 @@ def test_height_field_depths_match_small_steps() -> None:
         view = Pinhole(make_camera(24, tilt))
         ray = torch.arange(view.columns * view.rows)
         origin, direction = view.rays(ray)
-        depth = height_field_depth(raster, origin, direction)
+        depth = height_field_depth(raster, (origin, direction))
         walk = torch.arange(5, 30, 0.004)[:, None]
         points = origin[:, None] + direction[:, None] * walk
         gap = points[2] - raster.sample(points[:2].reshape(2, -1))[0].reshape(points.shape[1:])
@@ -108,7 +108,7 @@ def test_height_field_depths_match_small_steps() -> None:
 
 def test_rising_and_level_rays_miss_the_ground() -> None:
     direction = torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.0, 0.3], [0.0, 0.5, 0.4]])
-    depth = height_field_depth(bumpy_surface(), torch.tensor([[0.0], [0.0], [5.0]]), direction)
+    depth = height_field_depth(bumpy_surface(), (torch.tensor([[0.0], [0.0], [5.0]]), direction))
     assert torch.isinf(depth).all()
 
 

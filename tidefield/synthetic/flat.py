@@ -12,9 +12,8 @@ from torch import Tensor
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.parallel import in_parallel
-from tidefield.synthetic.foliage import Plants, Shadows
 from tidefield.synthetic.grids import Extent, Noise, Raster, blurred
-from tidefield.synthetic.plants import grow, marsh_map
+from tidefield.synthetic.plants import Plants, Shadows, grow, marsh_map
 from tidefield.synthetic.rays import Parallel, Pinhole, View, height_field_depth, normalised
 from tidefield.synthetic.settings import Settings
 from tidefield.synthetic.shading import Ground, Light, make_ground, to_srgb
@@ -86,7 +85,7 @@ class TidalFlat:
         """Compute the depth of the first surface along every ray of a view; inf where there is none."""
         depth, _ = self.plants.nearest(view)
         for ray in torch.arange(len(depth)).split(_RAYS):
-            depth[ray] = torch.minimum(depth[ray], height_field_depth(self.surface, *view.rays(ray)))
+            depth[ray] = torch.minimum(depth[ray], height_field_depth(self.surface, view.rays(ray)))
         return depth
 
     def _radiance(self, view: View, seconds: float = 0.0, diffuse: bool = False) -> Float[Tensor, "3 R"]:
@@ -94,8 +93,8 @@ class TidalFlat:
         nearest, primitive = self.plants.nearest(view)
         radiance = torch.empty(3, len(nearest))
         for ray in torch.arange(len(nearest)).split(_RAYS):
-            origin, direction = view.rays(ray)
-            depth = height_field_depth(self.surface, origin, direction)
+            origin, direction = rays = view.rays(ray)
+            depth = height_field_depth(self.surface, rays)
             onward = normalised(direction)
             reached = depth.clamp(max=_FAR_M)
             points = origin + direction * reached

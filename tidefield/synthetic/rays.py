@@ -25,6 +25,9 @@ _STEPS_BETWEEN_CHECKS = 4
 _MISSED_M = 0.01
 """Rays that are still further from the surface after the last step run along it and count as sky."""
 
+Rays = tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]
+"""Origins and directions, world; the same for all rays where there is one column."""
+
 
 def dot(a: Float[Tensor, "3 #P"], b: Float[Tensor, "3 #P"]) -> Float[Tensor, " P"]:
     """Compute scalar products of planar vectors."""
@@ -51,8 +54,8 @@ class Pinhole:
     def rows(self) -> int:
         return self.camera.height * self.split
 
-    def rays(self, ray: Int[Tensor, " R"]) -> tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]:
-        """Return origins and directions of numbered rays, world."""
+    def rays(self, ray: Int[Tensor, " R"]) -> Rays:
+        """Return numbered rays."""
         (cx, cy), (fx, fy) = self.camera.principal_px[0].tolist(), self.camera.focal_px[0].tolist()
         u, v = (ray % self.columns + 0.5) / self.split, (ray // self.columns + 0.5) / self.split
         x, y = (u - cx) / fx, (v - cy) / fy
@@ -116,8 +119,8 @@ class Parallel:
         corner = right * least[0] + down * least[1] + forward * (least[2] - 1)
         return Parallel(corner, right, down, forward, columns, rows, extent.cell_m)
 
-    def rays(self, ray: Int[Tensor, " R"]) -> tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]:
-        """Return origins and directions of numbered rays, world."""
+    def rays(self, ray: Int[Tensor, " R"]) -> Rays:
+        """Return numbered rays."""
         u, v = (ray % self.columns) * self.cell_m, (ray // self.columns) * self.cell_m
         return self.corner[:, None] + self.right[:, None] * u + self.down[:, None] * v, self.forward[:, None]
 
@@ -141,9 +144,7 @@ class Parallel:
 View = Pinhole | Parallel
 
 
-def height_field_depth(
-    height: Raster, origin: Float[Tensor, "3 #R"], direction: Float[Tensor, "3 #R"]
-) -> Float[Tensor, " R"]:
+def height_field_depth(height: Raster, rays: Rays) -> Float[Tensor, " R"]:
     """Find the depth at which rays from above first meet a height field; inf for rays that do not.
 
     The surface is the bilinear interpolation of its raster, so "exact" is well defined. From a point `gap` above the
@@ -151,6 +152,7 @@ def height_field_depth(
     gap / (L |d_xy| - d_z): that is the step (sphere tracing with a Lipschitz bound for height fields; Hart, 1996). The
     gap shrinks by a constant factor with every step, so no bisection is needed to finish.
     """
+    origin, direction = rays
     falling = direction[2] < -1e-3
     fall = torch.where(falling, direction[2], -1.0)
     rate = 1 / (height.max_slope * torch.hypot(direction[0], direction[1]) - fall)
