@@ -122,13 +122,6 @@ def test_max_slope_is_a_tight_bound() -> None:
     assert 0.8 * raster.max_slope < rise.max() < 1.001 * raster.max_slope
 
 
-def test_box_pairs_list_every_cell_once() -> None:
-    boxes = torch.tensor([[1, 3, 2], [0, 2, 5], [2, 3, 1], [1, 4, 9]])
-    pairs = [torch.stack(pair, dim=1) for pair in box_pairs(boxes, columns=10)]
-    expected = {(0, r * 10 + c) for r in (0, 1) for c in (1, 2)} | {(1, r * 10 + 3) for r in (2, 3, 4)}
-    assert sorted(map(tuple, torch.cat(pairs).tolist())) == sorted(expected)
-
-
 def test_raster_interpolates_nodes_exactly_and_extends_its_border() -> None:
     raster = bumpy_surface()
     nodes = EXTENT.nodes()
@@ -137,16 +130,21 @@ def test_raster_interpolates_nodes_exactly_and_extends_its_border() -> None:
     assert torch.allclose(outside[0, 0], raster.values[0, 0, 0])
 
 
-def test_blocks_of_box_pairs_do_not_change_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("pairs_at_once", [17, 1 << 20])
+def test_box_pairs_list_every_cell_once_in_order(pairs_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grids, "_PAIRS", pairs_at_once)
     random = torch.Generator().manual_seed(3)
     first = torch.randint(0, 20, (2, 30), generator=random)
     boxes = torch.cat([first, first + torch.randint(-1, 6, (2, 30), generator=random)])
-    at_once = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
-    monkeypatch.setattr(grids, "_PAIRS", 17)
-    in_blocks = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
-    assert len(at_once) == 1
-    assert len(in_blocks) > 10
-    assert torch.equal(torch.cat(in_blocks, dim=1), at_once[0])
+    blocks = [torch.stack(pair, dim=1) for pair in box_pairs(boxes, columns=40)]
+    expected = [
+        [i, row * 40 + column]
+        for i, (u0, v0, u1, v1) in enumerate(boxes.T.tolist())
+        for row in range(v0, v1 + 1)
+        for column in range(u0, u1 + 1)
+    ]
+    assert torch.cat(blocks).tolist() == expected
+    assert len(blocks) > 10 if pairs_at_once == 17 else len(blocks) == 1
 
 
 def test_smoothstep_rises_falls_and_is_symmetric() -> None:

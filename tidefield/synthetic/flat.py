@@ -118,11 +118,7 @@ def _averaged(radiance: Float[Tensor, "3 R"], view: View, split: int) -> Float[T
 
 
 def make_flat(
-    settings: Settings,
-    extent: Extent,
-    sun_elevation_deg: float,
-    sun_azimuth_deg: float,
-    random: np.random.Generator,
+    settings: Settings, extent: Extent, sun_elevation_deg: float, sun_azimuth_deg: float, random: np.random.Generator
 ) -> TidalFlat:
     """Build a flat over an extent."""
     terrain = make_terrain(settings, extent, random)
@@ -131,8 +127,9 @@ def make_flat(
     light = Light.make(sun_elevation_deg, sun_azimuth_deg, Noise(random, channels=1))
     surface = terrain.surface
     low, high = float(surface.values.min()), max(float(surface.values.max()), plants.highest_m)
-    shadows = Shadows.cast(plants, Parallel.along_sun(extent, low, high, light.sun))
-    nodes = torch.cat([extent.nodes(), surface.values.reshape(1, -1)])
-    shade = blurred(shadows.sunlit(nodes).reshape(terrain.ground.shape), 1)
+    from_sun = Parallel.along_sun(extent, low, high, light.sun)
+    shadows = Shadows(from_sun, plants.nearest(from_sun)[0])
+    points = torch.cat([extent.nodes(), surface.values.reshape(1, -1)])
+    shade = blurred(shadows.sunlit(points).reshape(terrain.ground.shape), 1)
     ground = make_ground(settings, terrain, marsh, light.sun, shade, random)
     return TidalFlat(surface, ground, plants, light, shadows)

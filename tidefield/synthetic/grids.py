@@ -37,10 +37,11 @@ class Extent:
     cell_m: float
 
     @staticmethod
-    def around(west_m: float, south_m: float, east_m: float, north_m: float, cell_m: float) -> Extent:
+    def around(south_west_m: list[float], north_east_m: list[float], cell_m: float) -> Extent:
         """Return the smallest grid of nodes that covers a rectangle, border included."""
-        columns, rows = (int(-(-side // cell_m)) + 1 for side in (east_m - west_m, north_m - south_m))
-        return Extent(west_m, south_m, columns, rows, cell_m)
+        sides = (high - low for low, high in zip(south_west_m, north_east_m, strict=True))
+        columns, rows = (int(-(-side // cell_m)) + 1 for side in sides)
+        return Extent(south_west_m[0], south_west_m[1], columns, rows, cell_m)
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -193,32 +193,20 @@ def _boxes(view: View, points: tuple[Float[Tensor, "3 N"], ...], radius: Float[T
 
 @dataclass(frozen=True)
 class Shadows:
-    """A shadow map: the plants as seen from the sun.
-
-    Attributes:
-        view: its rays.
-        depth: depth of the first plant along them; inf where there is none.
-    """
+    """A shadow map: the depths of the first plants in a view from the sun, inf where there are none."""
 
     view: Parallel
-    depth: Float[Tensor, "H W"]
-
-    @staticmethod
-    def cast(plants: Plants, view: Parallel) -> Shadows:
-        """Compute the shadows in a view from the sun."""
-        depth, _ = plants.nearest(view)
-        return Shadows(view, depth.reshape(view.rows, view.columns))
+    depth: Float[Tensor, " R"]
 
     def sunlit(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, " P"]:
         """Compute the share of the sun that plants let through to points: four map cells compared, interpolated."""
         u, v, depth = self.view.project(points)
-        u = u.clamp(0, self.view.columns - 1.001)
-        v = v.clamp(0, self.view.rows - 1.001)
+        u, v = u.clamp(0, self.view.columns - 1.001), v.clamp(0, self.view.rows - 1.001)
         column, row = u.floor(), v.floor()
         fu, fv = u - column, v - row
         first = (row * self.view.columns + column).long()
-        flat = self.depth.reshape(-1)
-        lit = [(flat[first + k] + _BIAS_M > depth).float() for k in (0, 1, self.view.columns, self.view.columns + 1)]
+        corners = (0, 1, self.view.columns, self.view.columns + 1)
+        lit = [(self.depth[first + k] + _BIAS_M > depth).float() for k in corners]
         return torch.lerp(torch.lerp(lit[0], lit[1], fu), torch.lerp(lit[2], lit[3], fu), fv)
 
 

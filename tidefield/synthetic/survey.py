@@ -111,10 +111,11 @@ def make_survey(
     if flight.wetness is not None:
         settings = replace(settings, wetness=flight.wetness)
     cameras = _fly(flight, views, width, random)
-    elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
     extent = _ground_extent(cameras, flight)
-    azimuth = float(random.uniform(0, 360))
-    [flat] = in_parallel([partial(make_flat, settings, extent, float(elevation), azimuth, random)], "cpu")
+    elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
+    azimuth = random.uniform(0, 360)
+    # As a task of its own: then the flat does not depend on the number of cores.
+    [flat] = in_parallel([partial(make_flat, settings, extent, elevation, azimuth, random)], "cpu")
     # In single precision, on which the photographs of a seed depend.
     seconds = torch.tensor([i * flight.water_motion for i in range(views)]).tolist()
 
@@ -145,7 +146,7 @@ def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) ->
             position = position + random.normal(0, 0.012, 3) * flight.altitude_m
             tilt = random.uniform(25, 45) if random.random() < flight.oblique_share else 0.0
             turn = random.normal(0, flight.jitter_deg, 3) + np.array([tilt, 0.0, 0.0])
-            poses.append(np.column_stack([_nadir(heading) @ _rotation(np.radians(turn)), position]))
+            poses.append(np.column_stack([_attitude(heading, np.radians(turn)), position]))
     # Exposure, and a third of its spread for the colour balance.
     log_gain = random.normal(0, 1, (views, 1)) + random.normal(0, 1 / 3, (views, 3))
     return Cameras(
@@ -158,33 +159,30 @@ def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) ->
     )
 
 
-def _nadir(heading: float) -> np.ndarray:
-    """Rotate camera to world for a view straight down, its top towards a heading clockwise from north."""
+def _attitude(heading: float, turn: np.ndarray) -> np.ndarray:
+    """Rotate camera to world: a view straight down, its top towards a heading clockwise from north, then turned.
+
+    The turns are about the camera's x, y and z axes in this order; about x tilts the view towards the image's top.
+    """
     sin, cos = math.sin(heading), math.cos(heading)
-    return np.array([[cos, -sin, 0.0], [-sin, -cos, 0.0], [0.0, 0.0, -1.0]])
-
-
-def _rotation(angles: np.ndarray) -> np.ndarray:
-    """Rotate about the camera's x, y and z axes in turn; about x tilts the view towards the image's top."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
+    (cx, cy, cz), (sx, sy, sz) = np.cos(turn), np.sin(turn)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    return np.array([[cos, -sin, 0], [-sin, -cos, 0], [0, 0, -1]]) @ (about_z @ about_y @ about_x)
 
 
 def _ground_extent(cameras: Cameras, flight: Flight) -> Extent:
     """Bound the ground in the photographs, out to four flight heights, with a margin for shadows and crowns."""
-    width, height = cameras.width, cameras.height
-    corners = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    direction = cameras.directions_world(corners.expand(len(cameras), -1, -1))
+    corners = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]]) * cameras.size_px[:, None].float()
+    direction = cameras.directions_world(corners)
     below = cameras.position_world[:, None, 2:] + 3.0
     run = direction[..., :2] / (-direction[..., 2:]).clamp(min=1e-3)
     length = run.norm(dim=-1, keepdim=True)
     run = run * (length.clamp(max=4.0) / length)
     ground = (cameras.position_world[:, None, :2] + run * below).reshape(-1, 2)
-    (west, south), (east, north) = (ground.amin(0) - 4).tolist(), (ground.amax(0) + 4).tolist()
-    return Extent.around(west, south, east, north, min(flight.altitude_m * _CELL_PER_ALTITUDE, _LARGEST_CELL_M))
+    cell_m = min(flight.altitude_m * _CELL_PER_ALTITUDE, _LARGEST_CELL_M)
+    return Extent.around((ground.amin(0) - 4).tolist(), (ground.amax(0) + 4).tolist(), cell_m)
 
 
 def _near_far(depth: Float[Tensor, "V H W"]) -> Float[Tensor, "V 2"]:

@@ -63,8 +63,8 @@ def _reconstruction(survey: Survey, names: list[str]) -> pycolmap.Reconstruction
         image = pycolmap.Image(name=name, keypoints=uv[rows].astype(np.float64), camera_id=1, image_id=i + 1)
         pose = cameras.T_world_camera[i].double().numpy()
         rotation = pose[:, :3].T
-        camera_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
-        model.add_image_with_trivial_frame(image, camera_from_world)
+        T_camera_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        model.add_image_with_trivial_frame(image, T_camera_world)
     order = np.argsort(point, kind="stable")
     tracks = np.split(order, np.nonzero(np.diff(point[order]))[0] + 1) if len(order) else []
     for track, xyz, error in zip(tracks, points.xyz_world.double().numpy(), points.error_px.tolist(), strict=True):
@@ -85,7 +85,7 @@ def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
     """Write orthophoto, surface and truth.json of the surveyed ground, at about the photographs' resolution."""
     cameras, whole = survey.cameras, survey.flat.surface.extent
     cell = float((cameras.position_world[:, 2] / cameras.focal_px[:, 0]).median())
-    extent = Extent.around(whole.west_m, whole.south_m, whole.east_m, whole.north_m, cell)
+    extent = Extent.around([whole.west_m, whole.south_m], [whole.east_m, whole.north_m], cell)
     colour, height_m = survey.flat.map(extent)
     _write_picture(folder / "orthophoto.png", (colour * 255).round().to(torch.uint8))
     np.save(folder / "surface.npy", height_m.numpy())
