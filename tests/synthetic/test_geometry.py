@@ -8,8 +8,8 @@ import torch
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.synthetic import grids
-from tidefield.synthetic.foliage import Leaves, Plants, Stems
 from tidefield.synthetic.grids import Extent, Noise, Raster, box_pairs, resolved, smoothstep
+from tidefield.synthetic.plants import Leaves, Plants, Stems
 from tidefield.synthetic.rays import Parallel, Pinhole, height_field_depth
 
 EXTENT = Extent(-6.0, -5.0, 61, 51, 0.2)
@@ -17,7 +17,8 @@ EXTENT = Extent(-6.0, -5.0, 61, 51, 0.2)
 
 def bumpy_surface() -> Raster:
     x, y = EXTENT.nodes()
-    return Raster.of(EXTENT, 0.8 * torch.sin(1.3 * x) * torch.cos(0.9 * y) + 0.3 * torch.sin(4 * x + y))
+    z = 0.8 * torch.sin(1.3 * x) * torch.cos(0.9 * y) + 0.3 * torch.sin(4 * x + y)
+    return Raster(EXTENT, z.reshape(1, EXTENT.rows, EXTENT.columns))
 
 
 def random_plants(random: np.random.Generator) -> Plants:
@@ -69,7 +70,7 @@ def test_plant_depths_match_brute_force() -> None:
     views = [
         Pinhole(make_camera(), split=2),
         Parallel.straight_down(EXTENT, 8.0),
-        Parallel.along_sun(EXTENT, -2.0, 5.0, sun / sun.norm(), 0.25),
+        Parallel.along_sun(EXTENT, -2.0, 5.0, sun / sun.norm()),
     ]
     for view in views:
         depth, number = plants.nearest(view)
@@ -91,7 +92,7 @@ def test_height_field_depths_match_small_steps() -> None:
         view = Pinhole(make_camera(24, tilt))
         ray = torch.arange(view.columns * view.rows)
         origin, direction = view.rays(ray)
-        depth = height_field_depth(raster, raster.max_slope(), origin, direction)
+        depth = height_field_depth(raster, (origin, direction))
         walk = torch.arange(5, 30, 0.004)[:, None]
         points = origin[:, None] + direction[:, None] * walk
         gap = points[2] - raster.sample(points[:2].reshape(2, -1))[0].reshape(points.shape[1:])
@@ -107,9 +108,7 @@ def test_height_field_depths_match_small_steps() -> None:
 
 def test_rising_and_level_rays_miss_the_ground() -> None:
     direction = torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.0, 0.3], [0.0, 0.5, 0.4]])
-    depth = height_field_depth(
-        bumpy_surface(), bumpy_surface().max_slope(), torch.tensor([[0.0], [0.0], [5.0]]), direction
-    )
+    depth = height_field_depth(bumpy_surface(), (torch.tensor([[0.0], [0.0], [5.0]]), direction))
     assert torch.isinf(depth).all()
 
 
@@ -120,14 +119,7 @@ def test_max_slope_is_a_tight_bound() -> None:
     angle = torch.rand(4000, generator=random) * 2 * math.pi
     step = 0.01 * torch.stack([angle.cos(), angle.sin()])
     rise = (raster.sample(xy + step)[0] - raster.sample(xy)[0]).abs() / 0.01
-    assert 0.8 * raster.max_slope() < rise.max() < 1.001 * raster.max_slope()
-
-
-def test_box_pairs_list_every_cell_once() -> None:
-    boxes = torch.tensor([[1, 3, 2], [0, 2, 5], [2, 3, 1], [1, 4, 9]])
-    pairs = [torch.stack(pair, dim=1) for pair in box_pairs(boxes, columns=10)]
-    expected = {(0, r * 10 + c) for r in (0, 1) for c in (1, 2)} | {(1, r * 10 + 3) for r in (2, 3, 4)}
-    assert sorted(map(tuple, torch.cat(pairs).tolist())) == sorted(expected)
+    assert 0.8 * raster.max_slope < rise.max() < 1.001 * raster.max_slope
 
 
 def test_raster_interpolates_nodes_exactly_and_extends_its_border() -> None:
@@ -138,16 +130,21 @@ def test_raster_interpolates_nodes_exactly_and_extends_its_border() -> None:
     assert torch.allclose(outside[0, 0], raster.values[0, 0, 0])
 
 
-def test_blocks_of_box_pairs_do_not_change_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("pairs_at_once", [17, 1 << 20])
+def test_box_pairs_list_every_cell_once_in_order(pairs_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grids, "_PAIRS", pairs_at_once)
     random = torch.Generator().manual_seed(3)
     first = torch.randint(0, 20, (2, 30), generator=random)
     boxes = torch.cat([first, first + torch.randint(-1, 6, (2, 30), generator=random)])
-    at_once = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
-    monkeypatch.setattr(grids, "_PAIRS", 17)
-    in_blocks = [torch.stack(pair) for pair in box_pairs(boxes, columns=40)]
-    assert len(at_once) == 1
-    assert len(in_blocks) > 10
-    assert torch.equal(torch.cat(in_blocks, dim=1), at_once[0])
+    blocks = [torch.stack(pair, dim=1) for pair in box_pairs(boxes, columns=40)]
+    expected = [
+        [i, row * 40 + column]
+        for i, (u0, v0, u1, v1) in enumerate(boxes.T.tolist())
+        for row in range(v0, v1 + 1)
+        for column in range(u0, u1 + 1)
+    ]
+    assert torch.cat(blocks).tolist() == expected
+    assert len(blocks) > 10 if pairs_at_once == 17 else len(blocks) == 1
 
 
 def test_smoothstep_rises_falls_and_is_symmetric() -> None:
@@ -165,7 +162,7 @@ def test_detail_fades_out_around_the_nyquist_limit() -> None:
 
 
 def test_noise_is_periodic_bounded_and_takes_its_lattice_values() -> None:
-    noise = Noise.make(np.random.default_rng(5), channels=3)
+    noise = Noise(np.random.default_rng(5), channels=3)
     xy = torch.rand(2, 500, generator=torch.Generator().manual_seed(0)) * 200
     values = noise.octave(xy, 2.0, 0)
     assert values.shape == (3, 500)

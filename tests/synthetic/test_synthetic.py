@@ -99,7 +99,7 @@ def test_dry_ground_has_the_same_colour_in_all_photographs() -> None:
 
 def test_only_wet_ground_and_water_are_specular() -> None:
     flat = survey().flat
-    xy = flat.extent.nodes()[:, ::37]
+    xy = flat.surface.extent.nodes()[:, ::37]
     wet, deep = wetness_and_depth(survey(), xy)
     footprint = torch.full_like(wet, 0.1)
     radiance = []
@@ -118,8 +118,8 @@ def test_only_wet_ground_and_water_are_specular() -> None:
 def test_orthophoto_matches_a_camera_far_above() -> None:
     scene, cell = survey("vegetation"), 0.25
     extent = Extent(-12.0, -9.0, 97, 73, cell)
-    ortho = scene.flat.orthophoto(extent)
-    assert (ortho.north_m, ortho.colour.shape) == (9.0, (73, 97, 3))
+    map_colour, map_height = scene.flat.map(extent)
+    assert map_colour.shape == (73, 97, 3)
     far = 3000.0
     camera = Cameras(
         T_world_camera=torch.tensor([[[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, far]]]),
@@ -129,12 +129,12 @@ def test_orthophoto_matches_a_camera_far_above() -> None:
         near_far=torch.tensor([[1.0, 2 * far]]),
         gain=torch.ones(1, 3),
     )
-    colour, depth = scene.flat.render(camera)
+    colour, depth = scene.flat.photograph(camera)
     wet, deep = wetness_and_depth(scene, extent.nodes())
     dry = ((wet < 0.35) & (deep == 0)).reshape(73, 97).flip(0)
     assert dry.float().mean() > 0.2
-    assert (colour[0] - ortho.colour)[dry].abs().mean() < 0.01
-    assert ((far - depth[0]) - ortho.height_m).abs().median() < 2e-3
+    assert (colour - map_colour)[dry].abs().mean() < 0.01
+    assert ((far - depth) - map_height).abs().median() < 2e-3
 
 
 @pytest.mark.parametrize("category", list(CATEGORIES))
@@ -159,8 +159,8 @@ def test_categories_differ_as_their_names_say() -> None:
     water, plants = {}, {}
     for category in CATEGORIES:
         flat = survey(category).flat
-        water[category] = float((flat.ground.sample(flat.extent.nodes()).water_depth_m > 0.02).float().mean())
-        plants[category] = len(flat.plants.leaves) / flat.extent.columns / flat.extent.rows
+        water[category] = float((flat.ground.sample(flat.surface.extent.nodes()).water_depth_m > 0.02).float().mean())
+        plants[category] = len(flat.plants.leaves) / flat.surface.extent.columns / flat.surface.extent.rows
     assert max(water, key=lambda c: water[c]) == "deep_water"
     assert water["deep_water"] > 0.35
     assert max(plants, key=lambda c: plants[c]) == "vegetation"
@@ -173,8 +173,9 @@ def test_gains_and_moving_water_are_optional() -> None:
     gain = scene.cameras.gain
     assert gain.std() > 0.03
     plain = replace(scene.cameras, gain=torch.ones_like(gain))
-    still, _ = scene.flat.render(plain, supersample=1)
-    moved, _ = scene.flat.render(plain, supersample=1, seconds=torch.tensor([0.0, 1.5, 3.0]))
+    still, moved = (
+        torch.stack([scene.flat.photograph(plain[i], 1, seconds=i * step)[0] for i in range(3)]) for step in (0.0, 1.5)
+    )
     expected = (moved * gain[:, None, None]).clamp(0, 1)
     assert (scene.photographs.float() / 255 - expected).abs().max() < 0.51 / 255
     changed = (moved - still).abs().amax(-1) > 1e-6
@@ -189,10 +190,10 @@ def test_gains_and_moving_water_are_optional() -> None:
 def test_a_small_photograph_averages_a_large_one() -> None:
     scene = survey("river_mouths")
     camera = scene.cameras[[5]]
-    large, _ = scene.flat.render(camera.resized(384, 288), supersample=1)
-    small, _ = scene.flat.render(camera.resized(96, 72), supersample=2)
-    average = torch.nn.functional.avg_pool2d(large[0].permute(2, 0, 1), 4).permute(1, 2, 0)
-    error = (average - small[0]).abs()
+    large, _ = scene.flat.photograph(camera.resized(384, 288), supersample=1)
+    small, _ = scene.flat.photograph(camera.resized(96, 72), supersample=2)
+    average = torch.nn.functional.avg_pool2d(large.permute(2, 0, 1), 4).permute(1, 2, 0)
+    error = (average - small).abs()
     assert error.mean() < 0.02
     assert np.isclose(float(average.mean()), float(small.mean()), atol=0.01)
 
@@ -201,11 +202,11 @@ def test_oblique_photographs_may_contain_sky() -> None:
     scene = survey()
     pose = torch.tensor([[[1.0, 0, 0, 0], [0, -0.2588, 0.9659, -60.0], [0, -0.9659, -0.2588, 20.0]]])
     camera = replace(scene.cameras[[0]], T_world_camera=pose)
-    colour, depth = scene.flat.render(camera, supersample=1)
-    assert torch.isinf(depth[0, 0]).all()
-    assert torch.isfinite(depth[0, -1]).all()
+    colour, depth = scene.flat.photograph(camera, supersample=1)
+    assert torch.isinf(depth[0]).all()
+    assert torch.isfinite(depth[-1]).all()
     assert torch.isfinite(colour).all()
-    assert (colour[0, 0, :, 2] > colour[0, -1, :, 2]).float().mean() > 0.9
+    assert (colour[0, :, 2] > colour[-1, :, 2]).float().mean() > 0.9
 
 
 def test_near_and_far_ignore_the_sky() -> None:
@@ -230,7 +231,6 @@ def test_flight_options_reach_the_flat_and_the_poses() -> None:
 
 def test_plants_cast_shadows() -> None:
     flat = survey("vegetation").flat
-    sunlit = flat.shadows.sunlit(torch.cat([flat.extent.nodes(), flat.surface.values.reshape(1, -1)]))
-    assert 0.02 < float((sunlit < 0.5).float().mean()) < 0.6
-    high = torch.cat([flat.extent.nodes(), torch.full_like(flat.surface.values.reshape(1, -1), flat.highest_m + 1)])
-    assert flat.shadows.sunlit(high).min() == 1
+    nodes, height = flat.surface.extent.nodes(), flat.surface.values.reshape(1, -1)
+    assert 0.02 < float((flat.shadows.sunlit(torch.cat([nodes, height])) < 0.5).float().mean()) < 0.6
+    assert flat.shadows.sunlit(torch.cat([nodes, torch.full_like(height, flat.highest_m + 1)])).min() == 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -36,10 +37,11 @@ class Extent:
     cell_m: float
 
     @staticmethod
-    def around(west_m: float, south_m: float, east_m: float, north_m: float, cell_m: float) -> Extent:
+    def around(south_west_m: list[float], north_east_m: list[float], cell_m: float) -> Extent:
         """Return the smallest grid of nodes that covers a rectangle, border included."""
-        columns, rows = (int(-(-side // cell_m)) + 1 for side in (east_m - west_m, north_m - south_m))
-        return Extent(west_m, south_m, columns, rows, cell_m)
+        sides = (high - low for low, high in zip(south_west_m, north_east_m, strict=True))
+        columns, rows = (int(-(-side // cell_m)) + 1 for side in sides)
+        return Extent(south_west_m[0], south_west_m[1], columns, rows, cell_m)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -54,12 +56,19 @@ class Extent:
     def north_m(self) -> float:
         return self.south_m + self.size_m[1]
 
-    def nodes(self, device: torch.device | str | None = None) -> Float[Tensor, "2 P"]:
+    def nodes(self) -> Float[Tensor, "2 P"]:
         """Return all nodes, row by row from the south-west."""
-        x = torch.arange(self.columns, device=device) * self.cell_m + self.west_m
-        y = torch.arange(self.rows, device=device) * self.cell_m + self.south_m
-        y, x = torch.meshgrid(y, x, indexing="ij")
-        return torch.stack([x.reshape(-1), y.reshape(-1)])
+        x = torch.arange(self.columns) * self.cell_m + self.west_m
+        y = torch.arange(self.rows) * self.cell_m + self.south_m
+        return torch.stack(torch.meshgrid(x, y, indexing="xy")).reshape(2, -1)
+
+    def boxes(self, low: Float[Tensor, "2 N"], high: Float[Tensor, "2 N"]) -> Int[Tensor, "4 N"]:
+        """Bound the nodes between corners, metres: first column and row, last column and row; last < first if none."""
+        south_west = low.new_tensor([[self.west_m], [self.south_m]])
+        first = torch.ceil((low - south_west) / self.cell_m).clamp(min=0)
+        most = low.new_tensor([[self.columns - 1], [self.rows - 1]])
+        last = torch.minimum(torch.floor((high - south_west) / self.cell_m), most).maximum(first - 1)
+        return torch.cat([first, last]).long()
 
 
 @dataclass(frozen=True)
@@ -68,11 +77,6 @@ class Raster:
 
     extent: Extent
     values: Float[Tensor, "C H W"]
-
-    @staticmethod
-    def of(extent: Extent, *channels: Float[Tensor, " P"]) -> Raster:
-        """Build a raster from one value per node and channel, in the order of `Extent.nodes`."""
-        return Raster(extent, torch.stack(channels).reshape(-1, extent.rows, extent.columns))
 
     def sample(self, xy: Float[Tensor, "2 P"]) -> Float[Tensor, "C P"]:
         """Interpolate bilinearly at ground points; points beyond the border take its values."""
@@ -83,13 +87,9 @@ class Raster:
         # Corners aligned: the outer nodes lie on the extent's border.
         return F.grid_sample(self.values[None], grid, padding_mode="border", align_corners=True)[0, :, 0]
 
-    def gradient(self) -> Float[Tensor, "2 H W"]:
-        """Compute the slope of the first channel, east and north, by central differences."""
-        north, east = torch.gradient(self.values[0], spacing=self.extent.cell_m)
-        return torch.stack([east, north])
-
+    @cached_property
     def max_slope(self) -> float:
-        """Bound the slope of the bilinear surface of the first channel."""
+        """A bound on the slope of the bilinear surface of the first channel."""
         z = self.values[0]
         east, north = z.diff(dim=1).abs() / self.extent.cell_m, z.diff(dim=0).abs() / self.extent.cell_m
         east = torch.maximum(east[1:], east[:-1])
@@ -126,8 +126,8 @@ def box_pairs(boxes: Int[Tensor, "4 N"], columns: int) -> Iterator[tuple[Int[Ten
         chunk = kept[start:end]
         box = torch.repeat_interleave(chunk, count[chunk])
         first = cumulative[start:end] - count[chunk] - done
-        within = torch.arange(len(box), device=boxes.device) - torch.repeat_interleave(first, count[chunk])
-        row = torch.div(within, width[box], rounding_mode="floor")
+        within = torch.arange(len(box)) - torch.repeat_interleave(first, count[chunk])
+        row = within // width[box]
         yield box, (v0[box] + row) * columns + u0[box] + within - row * width[box]
         start = end
 
@@ -146,7 +146,6 @@ def resolved(wavelength_m: float, footprint_m: Float[Tensor, "*P"]) -> Float[Ten
     return smoothstep(1.5, 3.0, wavelength_m / footprint_m)
 
 
-@dataclass(frozen=True)
 class Noise:
     """A periodic lattice of independent values in [-1, 1], C per node, interpolated smoothly.
 
@@ -156,21 +155,23 @@ class Noise:
 
     table: Float[Tensor, "1 C 257 257"]
 
-    @staticmethod
-    def make(random: np.random.Generator, channels: int) -> Noise:
-        """Draw a lattice."""
+    def __init__(self, random: np.random.Generator, channels: int) -> None:
         table = random.uniform(-1, 1, (1, channels, _LATTICE_CELLS, _LATTICE_CELLS)).astype(np.float32)
-        return Noise(torch.from_numpy(np.pad(table, ((0, 0), (0, 0), (0, 1), (0, 1)), mode="wrap")))
+        self.table = torch.from_numpy(np.pad(table, ((0, 0), (0, 0), (0, 1), (0, 1)), mode="wrap"))
 
     def octave(self, xy: Float[Tensor, "2 P"], wavelength_m: float, octave: int) -> Float[Tensor, "C P"]:
         """Evaluate one octave; each `octave` number turns and shifts the lattice so that no two line up."""
         angle = octave * _GOLDEN_ANGLE
         cos, sin = math.cos(angle) / wavelength_m, math.sin(angle) / wavelength_m
-        x = _lattice_coordinate(xy[0] * cos - xy[1] * sin + 37.3 * octave)
-        y = _lattice_coordinate(xy[0] * sin + xy[1] * cos + 91.7 * octave)
-        grid = torch.stack([x, y], dim=-1)[None, None]
+        x, y = xy[0] * cos - xy[1] * sin + 37.3 * octave, xy[0] * sin + xy[1] * cos + 91.7 * octave
+        at = torch.stack([x, y], dim=-1)
+        at = at - _LATTICE_CELLS * torch.floor(at / _LATTICE_CELLS)
+        cell = torch.floor(at)
+        f = at - cell
+        # Where linear interpolation gives the cubic fade.
+        grid = (cell + f * f * (3 - 2 * f)) * (2 / _LATTICE_CELLS) - 1
         # Corners aligned: this is a lattice of nodes, not an image of pixels.
-        return F.grid_sample(self.table, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0]
+        return F.grid_sample(self.table, grid[None, None], padding_mode="border", align_corners=True)[0, :, 0]
 
     def fractal(
         self, xy: Float[Tensor, "2 P"], wavelength_m: float, octaves: int, gain: float = 0.5
@@ -180,11 +181,3 @@ class Noise:
         for k in range(1, octaves):
             total = total + gain**k * self.octave(xy, wavelength_m / 2**k, k)
         return total * (1 - gain) / (1 - gain**octaves) * 1.6
-
-
-def _lattice_coordinate(x: Tensor) -> Tensor:
-    """Return the coordinate in [-1, 1] at which linear interpolation gives the cubic fade."""
-    x = x - _LATTICE_CELLS * torch.floor(x / _LATTICE_CELLS)
-    cell = torch.floor(x)
-    f = x - cell
-    return (cell + f * f * (3 - 2 * f)) * (2 / _LATTICE_CELLS) - 1

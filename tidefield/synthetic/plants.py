@@ -1,30 +1,218 @@
-"""Plant growth: where tufts of marsh grass and mangroves stand, and the leaf sprays and stems they are built of."""
+"""Plants: leaf sprays and stems as analytic primitives, their shadows, and how they grow.
+
+Each primitive is tested against the rays of the box it covers in the view. The rays of a view are a grid already, so
+this is exact ray tracing without a search structure.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from tidefield.synthetic.foliage import Leaves, Plants, Stems
-from tidefield.synthetic.grids import Noise, Raster, smoothstep
+from tidefield.synthetic.grids import Noise, Raster, box_pairs, smoothstep
+from tidefield.synthetic.rays import Parallel, Rays, View, dot, normalised
 from tidefield.synthetic.settings import Settings
+from tidefield.synthetic.shading import Light
 from tidefield.synthetic.terrain import Terrain
 
+_BIAS_M = 0.12
+"""Plants closer than this along the sun's ray do not shade one another: a spray would shade itself."""
+_MISS = int(torch.tensor(torch.inf).view(torch.int32)) << 32
+"""Packed depth and number of a ray that meets no plant; see `Plants.nearest`."""
 # Linear albedos.
 _GRASS = np.array([[0.115, 0.150, 0.045], [0.175, 0.185, 0.060], [0.080, 0.110, 0.045], [0.260, 0.205, 0.095],
                    [0.170, 0.105, 0.055]])  # fmt: skip
 _CANOPY = np.array([[0.055, 0.105, 0.030], [0.085, 0.135, 0.035], [0.120, 0.165, 0.050], [0.060, 0.085, 0.035]])
 _BARK = np.array([[0.210, 0.180, 0.145], [0.130, 0.105, 0.080], [0.300, 0.270, 0.230]])
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Flat sprays of leaves: lobed ellipses in space.
+
+    A point centre + a * u + b * v belongs to the spray where sqrt(a^2 + b^2) is at most
+    1 - notch (1 + cos(lobes * atan2(b, a) + phase)) / 2.
+
+    Attributes:
+        u, v: half axes, perpendicular, metres.
+        openness: share of the sky that reaches the spray.
+    """
+
+    centre: Float[Tensor, "3 N"]
+    u: Float[Tensor, "3 N"]
+    v: Float[Tensor, "3 N"]
+    lobes: Float[Tensor, " N"]
+    phase: Float[Tensor, " N"]
+    notch: Float[Tensor, " N"]
+    albedo: Float[Tensor, "3 N"]
+    openness: Float[Tensor, " N"]
+
+    def __len__(self) -> int:
+        return len(self.openness)
+
+    @property
+    def radius(self) -> Float[Tensor, " N"]:
+        return torch.sqrt(torch.maximum(dot(self.u, self.u), dot(self.v, self.v)))
+
+    @cached_property
+    def planes(self) -> tuple[Float[Tensor, "3 N"], Float[Tensor, "3 N"], Float[Tensor, "3 N"]]:
+        """Unit normals on the upper side, and u and v divided by their squared lengths."""
+        normal = normalised(torch.linalg.cross(self.u, self.v, dim=0))
+        normal = torch.where(normal[2] < 0, -normal, normal)
+        return normal, self.u / dot(self.u, self.u), self.v / dot(self.v, self.v)
+
+    def _meet(self, i: Tensor, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """Intersect each ray with the plane of its spray: depth and the coordinates a, b."""
+        origin, direction = rays
+        normal, u, v = (x[:, i] for x in self.planes)
+        offset = self.centre[:, i] - origin
+        # A ray in the spray's plane misses it: the division gives inf or NaN, which no comparison accepts.
+        depth = dot(offset, normal) / dot(direction, normal)
+        q = direction * depth - offset
+        return depth, dot(q, u), dot(q, v)
+
+    def depth(self, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, " R"]:
+        """Find the depth at which each ray meets its numbered spray; inf where it misses."""
+        depth, a, b = self._meet(i, rays)
+        edge = 1 - 0.5 * self.notch[i] * (1 + torch.cos(self.lobes[i] * torch.atan2(b, a) + self.phase[i]))
+        return torch.where((a * a + b * b <= edge * edge) & (depth > 0), depth, torch.inf)
+
+    def radiance(self, light: Light, shadows: Shadows, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, "3 R"]:
+        """Shade numbered sprays where rays meet them: light passes through, and tips are brighter."""
+        (origin, direction), (depth, a, b) = rays, self._meet(i, rays)
+        normal, u, v = (x[:, i] for x in self.planes)
+        # Blades arch outwards, so each spray holds normals of many directions.
+        length_u, length_v = (torch.sqrt(dot(x, x)) for x in (self.u[:, i], self.v[:, i]))
+        arch = u * (a * length_u) + v * (b * length_v)
+        facing = dot(normalised(normal + 0.6 * arch), light.sun[:, None]).abs()
+        sun = light.sun_rgb[:, None] * ((0.25 + 0.75 * facing) * shadows.sunlit(origin + direction * depth))
+        sky = light.sky_rgb[:, None] * self.openness[i]
+        tip = 0.75 + 0.4 * torch.sqrt(a * a + b * b)
+        return self.albedo[:, i] * tip * (sun + sky)
+
+
+@dataclass(frozen=True)
+class Stems:
+    """Capsules: all points within `radius` of the line from `start` to `end`."""
+
+    start: Float[Tensor, "3 N"]
+    end: Float[Tensor, "3 N"]
+    radius: Float[Tensor, " N"]
+    albedo: Float[Tensor, "3 N"]
+
+    def depth(self, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, " R"]:
+        """Find the depth at which each ray meets its numbered capsule; inf where it misses."""
+        (origin, direction), start, radius = rays, self.start[:, i], self.radius[i]
+        axis, offset = self.end[:, i] - start, origin - start
+        aa, ad, ao = dot(axis, axis), dot(axis, direction), dot(axis, offset)
+        dd, do, oo = dot(direction, direction), dot(direction, offset), dot(offset, offset)
+        # The side: |offset + t d - axis (ao + t ad) / aa| = radius.
+        qa, qb, qc = dd - ad * ad / aa, do - ad * ao / aa, oo - ao * ao / aa - radius * radius
+        side = (-qb - torch.sqrt(qb * qb - qa * qc)) / qa
+        along = (ao + side * ad) / aa
+        nearest = torch.where((along >= 0) & (along <= 1) & (side > 0), side, torch.inf)
+        # The balls at both ends.
+        for do_end, oo_end in ((do, oo), (do - ad, oo - 2 * ao + aa)):
+            ball = (-do_end - torch.sqrt(do_end * do_end - dd * (oo_end - radius * radius))) / dd
+            nearest = torch.minimum(nearest, torch.where(ball > 0, ball, torch.inf))
+        return nearest
+
+    def radiance(self, light: Light, shadows: Shadows, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, "3 R"]:
+        """Shade numbered capsules where rays meet them."""
+        points = rays[0] + rays[1] * self.depth(i, rays)
+        start = self.start[:, i]
+        axis = self.end[:, i] - start
+        along = (dot(points - start, axis) / dot(axis, axis)).clamp(0, 1)
+        normal = (points - start - axis * along) / self.radius[i]
+        return self.albedo[:, i] * light.diffuse(normal, shadows.sunlit(points), torch.full_like(along, 0.75))
+
+
+@dataclass(frozen=True)
+class Plants:
+    """All plants of a flat; primitives are numbered leaves first, then stems."""
+
+    leaves: Leaves
+    stems: Stems
+
+    @property
+    def highest_m(self) -> float:
+        """A height that no plant exceeds; -inf without plants."""
+        leaves, stems = self.leaves, self.stems
+        tops = leaves.centre[2] + leaves.radius, stems.start[2] + stems.radius, stems.end[2] + stems.radius
+        return float(torch.cat([*tops, torch.tensor([-math.inf])]).max())
+
+    def nearest(self, view: View) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
+        """Find, for every ray of a view, depth and number of the first primitive it meets; inf and -1 where none."""
+        # Depth in the upper and the primitive in the lower half of one integer: the least is the nearest, and
+        # ties have one answer whatever the order of writing.
+        nearest = torch.full((view.columns * view.rows,), _MISS)
+        leaves, stems = self.leaves, self.stems
+        for kind, ends, first in ((leaves, (leaves.centre,), 0), (stems, (stems.start, stems.end), len(leaves))):
+            for i, ray in box_pairs(_boxes(view, ends, kind.radius), view.columns):
+                depth = kind.depth(i, view.rays(ray))
+                met = torch.isfinite(depth)
+                # Positive floats sort as their bits do.
+                packed = (depth[met].view(torch.int32).long() << 32) | (i + first)[met]
+                nearest.scatter_reduce_(0, ray[met], packed, "amin")
+        depth = (nearest >> 32).to(torch.int32).view(torch.float32)
+        return depth, torch.where(torch.isfinite(depth), nearest & 0xFFFFFFFF, -1)
+
+    def radiance(
+        self, light: Light, shadows: Shadows, view: View, ray: Int[Tensor, " P"], primitive: Int[Tensor, " P"]
+    ) -> Float[Tensor, "3 P"]:
+        """Shade the primitives that numbered rays meet; diffuse, so the same from all sides."""
+        radiance = torch.empty(3, len(ray))
+        is_leaf = primitive < len(self.leaves)
+        for kind, own, first in ((self.leaves, is_leaf, 0), (self.stems, ~is_leaf, len(self.leaves))):
+            hit = torch.nonzero(own)[:, 0]
+            radiance[:, hit] = kind.radiance(light, shadows, primitive[hit] - first, view.rays(ray[hit]))
+        return radiance
+
+
+def _boxes(view: View, points: tuple[Float[Tensor, "3 N"], ...], radius: Float[Tensor, " N"]) -> Int[Tensor, "4 N"]:
+    """Bound the rays that may meet the hulls of balls: first and last column and row; last < first where none."""
+    located = [view.locate(p, radius) for p in points]
+    low = torch.stack([uv - reach for uv, reach in located]).amin(0)
+    high = torch.stack([uv + reach for uv, reach in located]).amax(0)
+    limit = low.new_tensor([[view.columns], [view.rows]])
+    first = torch.ceil(low - 0.5).clamp(min=0)
+    last = torch.minimum(torch.floor(high - 0.5), limit - 1)
+    boxes = torch.cat([first, last])
+    # Written so that NaN, from a ball at the camera's plane, counts as empty.
+    boxes[:, ~(last >= first).all(0)] = boxes.new_tensor([[0.0], [0.0], [-1.0], [-1.0]])
+    return boxes.long()
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """A shadow map: the depths of the first plants in a view from the sun, inf where there are none."""
+
+    view: Parallel
+    depth: Float[Tensor, " R"]
+
+    def sunlit(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, " P"]:
+        """Compute the share of the sun that plants let through to points: four map cells compared, interpolated."""
+        u, v, depth = self.view.project(points)
+        u, v = u.clamp(0, self.view.columns - 1.001), v.clamp(0, self.view.rows - 1.001)
+        column, row = u.floor(), v.floor()
+        fu, fv = u - column, v - row
+        first = (row * self.view.columns + column).long()
+        corners = (0, 1, self.view.columns, self.view.columns + 1)
+        lit = [(self.depth[first + k] + _BIAS_M > depth).float() for k in corners]
+        return torch.lerp(torch.lerp(lit[0], lit[1], fu), torch.lerp(lit[2], lit[3], fu), fv)
 
 
 def marsh_map(settings: Settings, terrain: Terrain, random: np.random.Generator) -> Float[Tensor, "H W"]:
     """Map how densely plants cover the ground, 0 to 1: patches on ground that most tides leave dry."""
-    noise = Noise.make(random, channels=2)
+    noise = Noise(random, channels=2)
     pattern = noise.fractal(terrain.extent.nodes(), 24.0, 5, gain=0.6)[0].reshape(terrain.ground.shape)
     above = terrain.ground - settings.tide_m
     dry = smoothstep(0.2, 0.55, above) * (terrain.water_depth == 0)
@@ -40,7 +228,10 @@ def grow(settings: Settings, terrain: Terrain, marsh: Float[Tensor, "H W"], rand
     site = Raster(terrain.extent, torch.stack([terrain.ground, marsh, terrain.water_depth]))
     tufts = _tufts(settings, site, random)
     crowns, stems = _trees(settings, site, random)
-    return Plants(Leaves.joined([*tufts, *crowns]), Stems.joined(stems))
+    # Each part holds the fields of Leaves in their order.
+    leaves = (np.concatenate(field, axis=-1).astype(np.float32) for field in zip(*tufts, *crowns, strict=True))
+    table = torch.tensor(stems, dtype=torch.float32).reshape(-1, 10).T.contiguous()
+    return Plants(Leaves(*map(torch.from_numpy, leaves)), Stems(table[0:3], table[3:6], table[6], table[7:10]))
 
 
 def _random_places(site: Raster, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +243,7 @@ def _random_places(site: Raster, count: int, random: np.random.Generator) -> tup
     return np.stack([x, y, height]), np.stack(cover)
 
 
-def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> list[Leaves]:
+def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> list[tuple[np.ndarray, ...]]:
     """Grow rosettes of blades, three tiers high."""
     width, height = site.extent.size_m
     count = int(settings.tufts_per_m2 * width * height)
@@ -60,7 +251,7 @@ def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> lis
     stray = 0.012 * (water == 0)
     base = base[:, random.random(count) < np.maximum(marsh, stray)]
     count = base.shape[1]
-    hue = Noise.make(random, channels=2).fractal(torch.from_numpy(base[:2]), 14.0, 3).numpy()
+    hue = Noise(random, channels=2).fractal(torch.from_numpy(base[:2]), 14.0, 3).numpy()
     tall = np.clip(0.55 + 0.45 * hue[1] + 0.15 * random.normal(size=count), 0.22, 1.05)
     spread = np.clip(0.36 * tall + 0.1 * random.normal(size=count), 0.14, 0.55)
     kind = np.clip(np.floor((hue[0] * 0.9 + 0.5) * 3.2 + random.normal(0, 0.7, count)), 0, 4).astype(int)
@@ -73,7 +264,7 @@ def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> lis
         albedo = _GRASS[kind].T * random.lognormal(0, 0.16, count) * shade
         outline = random.integers(6, 13, count), random.uniform(0, 6, count), random.uniform(0.6, 0.85, count)
         u, v = u * spread * size, v * spread * size * 0.8
-        tiers.append(Leaves.of(base + np.stack(offset), u, v, *outline, albedo, np.full(count, openness)))
+        tiers.append((base + np.stack(offset), u, v, *outline, albedo, np.full(count, openness)))
     return tiers
 
 
@@ -86,26 +277,28 @@ def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
     return a * np.cos(turn) + b * np.sin(turn), b * np.cos(turn) - a * np.sin(turn)
 
 
-def _trees(settings: Settings, site: Raster, random: np.random.Generator) -> tuple[list[Leaves], list[Stems]]:
-    """Grow mangroves: crowns, and stems (at least one item, perhaps an empty one)."""
+def _trees(
+    settings: Settings, site: Raster, random: np.random.Generator
+) -> tuple[list[tuple[np.ndarray, ...]], list[list[float]]]:
+    """Grow mangroves: the leaves of each crown, and all stems."""
     width, height = site.extent.size_m
     wanted = random.poisson(settings.trees_per_ha * width * height / 1e4)
     bases, (marsh, water) = _random_places(site, 60 * wanted + 1, random)
     # In marsh first, on other dry ground where there is little of it, and now and then in shallow water.
     chance = np.where(water > 0, 0.004 * (water < 0.4), 0.02 + 0.6 * marsh)
     bases = bases[:, random.random(bases.shape[1]) < chance][:, :wanted]
-    crowns, stems = [], [Stems.of(np.zeros((3, 0)), np.zeros((3, 0)), np.zeros(0), np.zeros((3, 0)))]
+    crowns, stems = [], []
     for base in bases.T:
         tall = random.uniform(2.0, 5.0)
         radius = tall * random.uniform(0.32, 0.52)
         bare = random.random() < 0.12
-        stems.append(_trunk(base, tall, radius, bare, random))
+        stems += _trunk(base, tall, radius, bare, random)
         if not bare:
             crowns.append(_crown(base, tall, radius, random))
     return crowns, stems
 
 
-def _crown(base: np.ndarray, tall: float, radius: float, random: np.random.Generator) -> Leaves:
+def _crown(base: np.ndarray, tall: float, radius: float, random: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Place sprays on the shells of a few overlapping lobes."""
     lobes = random.integers(3, 7)
     angle, out = random.uniform(0, 2 * math.pi, lobes), random.uniform(0.2, 0.62, lobes) * radius
@@ -128,17 +321,17 @@ def _crown(base: np.ndarray, tall: float, radius: float, random: np.random.Gener
     young = smoothstep(-0.8, 0.9, direction[2])
     albedo = tone * random.lognormal(0, 0.2, count) * (0.75 + 0.5 * young)
     outline = random.integers(4, 8, count), random.uniform(0, 6, count), random.uniform(0.35, 0.65, count)
-    return Leaves.of(base[:, None] + offset, u * spray, v * spray * 0.7, *outline, albedo, 0.3 + 0.7 * young * at)
+    return base[:, None] + offset, u * spray, v * spray * 0.7, *outline, albedo, 0.3 + 0.7 * young * at
 
 
-def _trunk(base: np.ndarray, tall: float, radius: float, bare: bool, random: np.random.Generator) -> Stems:
-    """Grow a few crooked stems from one foot, and arching prop roots."""
+def _trunk(base: np.ndarray, tall: float, radius: float, bare: bool, random: np.random.Generator) -> list[list[float]]:
+    """Grow a few crooked stems from one foot, and arching prop roots; a row of numbers for each straight piece."""
     rows = []
     bark = _BARK[random.integers(0, len(_BARK))]
     for _ in range(random.integers(2, 5)):
         angle, lean = random.uniform(0, 2 * math.pi), random.uniform(0.15, 0.6) * radius
         way = np.array([math.cos(angle), math.sin(angle), 0.0])
-        joints = [base + (0.1 * way - np.array([0.0, 0.0, 0.1]))]
+        joints = [base + (0.1 * way - 0.1 * _UP)]
         pieces = max(3, round(tall / 0.8))
         for k in range(1, pieces + 1):
             s = k / pieces
@@ -149,8 +342,6 @@ def _trunk(base: np.ndarray, tall: float, radius: float, bare: bool, random: np.
     for _ in range(random.integers(3, 8)):
         angle, out = random.uniform(0, 2 * math.pi), random.uniform(0.3, 0.9) * (0.4 + 0.25 * radius)
         way = np.array([math.cos(angle), math.sin(angle), 0.0])
-        up = np.array([0.0, 0.0, 1.0])
-        joints = [base + (0.25 * out + 0.45) * up, base + 0.6 * out * way + 0.4 * up, base + out * way - 0.15 * up]
+        joints = [base + (0.25 * out + 0.45) * _UP, base + 0.6 * out * way + 0.4 * _UP, base + out * way - 0.15 * _UP]
         rows += [[*a, *b, 0.035, *(0.8 * bark)] for a, b in pairwise(joints)]
-    table = np.array(rows).T
-    return Stems.of(table[0:3], table[3:6], table[6], table[7:10])
+    return rows

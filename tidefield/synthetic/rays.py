@@ -25,6 +25,9 @@ _STEPS_BETWEEN_CHECKS = 4
 _MISSED_M = 0.01
 """Rays that are still further from the surface after the last step run along it and count as sky."""
 
+Rays = tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]
+"""Origins and directions, world; the same for all rays where there is one column."""
+
 
 def dot(a: Float[Tensor, "3 #P"], b: Float[Tensor, "3 #P"]) -> Float[Tensor, " P"]:
     """Compute scalar products of planar vectors."""
@@ -51,17 +54,12 @@ class Pinhole:
     def rows(self) -> int:
         return self.camera.height * self.split
 
-    @property
-    def device(self) -> torch.device:
-        return self.camera.T_world_camera.device
-
-    def rays(self, ray: Int[Tensor, " R"]) -> tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]:
-        """Return origins and directions of numbered rays, world."""
-        u = ((ray % self.columns) + 0.5) / self.split
-        v = (torch.div(ray, self.columns, rounding_mode="floor") + 0.5) / self.split
+    def rays(self, ray: Int[Tensor, " R"]) -> Rays:
+        """Return numbered rays."""
         (cx, cy), (fx, fy) = self.camera.principal_px[0].tolist(), self.camera.focal_px[0].tolist()
-        right, down, forward, position = self.camera.T_world_camera[0].unbind(dim=1)
+        u, v = (ray % self.columns + 0.5) / self.split, (ray // self.columns + 0.5) / self.split
         x, y = (u - cx) / fx, (v - cy) / fy
+        right, down, forward, position = self.camera.T_world_camera[0].unbind(dim=1)
         return position[:, None], right[:, None] * x + down[:, None] * y + forward[:, None]
 
     def footprint_m(self, depth: Float[Tensor, " R"]) -> Float[Tensor, " #R"]:
@@ -77,12 +75,10 @@ class Pinhole:
         """
         uv, z = self.camera.project(points.T)
         uv, z = uv[0].T * self.split, z[0]
-        focal = self.camera.focal_px[0] * self.split
-        principal = self.camera.principal_px[0] * self.split
+        focal, principal = (x[0, :, None] * self.split for x in (self.camera.focal_px, self.camera.principal_px))
         # |f (x + a) / (z + b) - f x / z| <= f r sqrt(x^2 + z^2) / (z (z - r)) for |(a, b)| <= r < z.
-        slant = torch.sqrt(1 + ((uv - principal[:, None]) / focal[:, None]) ** 2)
-        reach = focal[:, None] * radius * slant / (z - radius)
-        return uv, torch.where(z > radius, reach, torch.nan)
+        slant = torch.sqrt(1 + ((uv - principal) / focal) ** 2)
+        return uv, torch.where(z > radius, focal * radius * slant / (z - radius), torch.nan)
 
 
 @dataclass(frozen=True)
@@ -103,37 +99,30 @@ class Parallel:
     cell_m: float
 
     @staticmethod
-    def straight_down(extent: Extent, height_m: float, device: torch.device | str | None = None) -> Parallel:
+    def straight_down(extent: Extent, height_m: float) -> Parallel:
         """View an extent from above, north up: one ray through every node."""
-        axes = torch.eye(3, device=device)
-        corner = axes.new_tensor([extent.west_m, extent.north_m, height_m])
+        axes = torch.eye(3)
+        corner = torch.tensor([extent.west_m, extent.north_m, height_m])
         return Parallel(corner, axes[0], -axes[1], -axes[2], extent.columns, extent.rows, extent.cell_m)
 
     @staticmethod
-    def along_sun(extent: Extent, low_m: float, high_m: float, sun: Float[Tensor, "3"], cell_m: float) -> Parallel:
+    def along_sun(extent: Extent, low_m: float, high_m: float, sun: Float[Tensor, "3"]) -> Parallel:
         """View the box over an extent, between two heights, from the sun; `sun` is the unit vector towards it."""
         forward = -sun
-        right = torch.linalg.cross(forward, forward.new_tensor([0.0, 0.0, 1.0]))
-        right = right / right.norm() if float(right.norm()) > 1e-3 else forward.new_tensor([1.0, 0.0, 0.0])
+        right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]))
+        right = right / right.norm() if float(right.norm()) > 1e-3 else torch.tensor([1.0, 0.0, 0.0])
         down = torch.linalg.cross(forward, right)
         x, y, z = (extent.west_m, extent.east_m), (extent.south_m, extent.north_m), (low_m, high_m)
-        box = torch.cartesian_prod(*(forward.new_tensor(ends) for ends in (x, y, z)))
-        corners = box @ torch.stack([right, down, forward], dim=1)
+        corners = torch.cartesian_prod(*map(torch.tensor, (x, y, z))) @ torch.stack([right, down, forward], dim=1)
         least, most = corners.amin(0), corners.amax(0)
-        columns, rows = (int(n) + 2 for n in ((most - least)[:2] / cell_m).tolist())
+        columns, rows = (int(n) + 2 for n in ((most - least)[:2] / extent.cell_m).tolist())
         corner = right * least[0] + down * least[1] + forward * (least[2] - 1)
-        return Parallel(corner, right, down, forward, columns, rows, cell_m)
+        return Parallel(corner, right, down, forward, columns, rows, extent.cell_m)
 
-    @property
-    def device(self) -> torch.device:
-        return self.corner.device
-
-    def rays(self, ray: Int[Tensor, " R"]) -> tuple[Float[Tensor, "3 #R"], Float[Tensor, "3 #R"]]:
-        """Return origins and directions of numbered rays, world."""
-        u = (ray % self.columns) * self.cell_m
-        v = torch.div(ray, self.columns, rounding_mode="floor") * self.cell_m
-        origin = self.corner[:, None] + self.right[:, None] * u + self.down[:, None] * v
-        return origin, self.forward[:, None]
+    def rays(self, ray: Int[Tensor, " R"]) -> Rays:
+        """Return numbered rays."""
+        u, v = (ray % self.columns) * self.cell_m, (ray // self.columns) * self.cell_m
+        return self.corner[:, None] + self.right[:, None] * u + self.down[:, None] * v, self.forward[:, None]
 
     def footprint_m(self, depth: Float[Tensor, " R"]) -> Float[Tensor, " #R"]:
         """Return the distance between neighbouring rays, the same at every depth."""
@@ -155,47 +144,33 @@ class Parallel:
 View = Pinhole | Parallel
 
 
-def height_field_depth(
-    height: Raster, max_slope: float, origin: Float[Tensor, "3 #R"], direction: Float[Tensor, "3 #R"]
-) -> Float[Tensor, " R"]:
-    """Find the depth at which rays first meet a height field; inf for rays that do not.
+def height_field_depth(height: Raster, rays: Rays) -> Float[Tensor, " R"]:
+    """Find the depth at which rays from above first meet a height field; inf for rays that do not.
 
     The surface is the bilinear interpolation of its raster, so "exact" is well defined. From a point `gap` above the
     ground, a ray that falls by -d_z and runs |d_xy| per unit of depth cannot meet a surface of slope at most L within
     gap / (L |d_xy| - d_z): that is the step (sphere tracing with a Lipschitz bound for height fields; Hart, 1996). The
     gap shrinks by a constant factor with every step, so no bisection is needed to finish.
-
-    Args:
-        height: the surface, in its only channel.
-        max_slope: a bound on its slope, L.
-        origin: above the surface.
-        direction: per unit of depth.
     """
+    origin, direction = rays
     falling = direction[2] < -1e-3
     fall = torch.where(falling, direction[2], -1.0)
-    rate = 1 / (max_slope * torch.hypot(direction[0], direction[1]) - fall)
+    rate = 1 / (height.max_slope * torch.hypot(direction[0], direction[1]) - fall)
     # From where the ray enters the slab that holds the surface.
     depth = ((height.values.max() - origin[2]) / fall).clamp(min=0)
-    scale = 2 / fall.new_tensor([*height.extent.size_m, 2.0])[:, None]
-    shift = fall.new_tensor([height.extent.west_m, height.extent.south_m, 0.0])[:, None]
+    scale = 2 / torch.tensor([*height.extent.size_m, 2.0])[:, None]
+    shift = torch.tensor([height.extent.west_m, height.extent.south_m, 0.0])[:, None]
     # East and north in the raster's [-1, 1]; the height stays in metres.
-    start = (origin - shift) * scale - fall.new_tensor([1.0, 1.0, 0.0])[:, None]
+    start = (origin - shift) * scale - torch.tensor([1.0, 1.0, 0.0])[:, None]
     start, step, rate, depth = torch.broadcast_tensors(start, direction * scale, rate, depth)
-    depth, gap = _sphere_trace(height.values[None], start, step, rate[0], depth[0])
-    return torch.where(falling & (gap < _MISSED_M), depth, torch.inf)
-
-
-def _sphere_trace(
-    height: Float[Tensor, "1 1 H W"], start: Tensor, step: Tensor, rate: Tensor, depth: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Step until the gap is below the tolerance; return depths and gaps."""
+    rate, depth = rate[0], depth[0]
     depths, gaps = depth.clone(), torch.empty_like(depth)
-    active = torch.arange(len(depth), device=depth.device)
-    at = torch.empty(1, 1, len(depth), 2, device=depth.device)
+    active = torch.arange(len(depth))
+    at = torch.empty(1, 1, len(depth), 2)
     for k in range(_STEPS):
         torch.addcmul(start[0], depth, step[0], out=at[0, 0, :, 0])
         torch.addcmul(start[1], depth, step[1], out=at[0, 0, :, 1])
-        below = F.grid_sample(height, at, padding_mode="border", align_corners=True)[0, 0, 0]
+        below = F.grid_sample(height.values[None], at, padding_mode="border", align_corners=True)[0, 0, 0]
         gap = torch.addcmul(start[2], depth, step[2]).sub_(below).clamp_(min=0)
         depth = torch.addcmul(depth, gap, rate)
         if k % _STEPS_BETWEEN_CHECKS == _STEPS_BETWEEN_CHECKS - 1:
@@ -205,4 +180,4 @@ def _sphere_trace(
                 break
             active, start, step, rate, depth = active[keep], start[:, keep], step[:, keep], rate[keep], depth[keep]
             at = at[:, :, : len(keep)].contiguous()
-    return depths, gaps
+    return torch.where(falling & (gaps < _MISSED_M), depths, torch.inf)

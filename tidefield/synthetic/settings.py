@@ -52,34 +52,29 @@ _TIDAL_TREES = Settings(
     branch_orders=3, branch_spacing_m=8.5, ripple_m=0.05, pools_per_ha=14.0, tufts_per_m2=2.4, marsh_share=0.12,
     trees_per_ha=40.0, sand=0.2, algae=0.35, shells=0.25, wetness=0.5, wave_slope=0.03,
 )  # fmt: skip
-_RIVER_MOUTHS = replace(
-    _TIDAL_TREES, tide_m=-0.5, tilt_m=1.5, relief_m=0.28, channel_half_width_m=7.0, channel_depth_m=1.5,
-    channel_spacing_m=48.0, branch_orders=1, branch_spacing_m=24.0, ripple_m=0.09, pools_per_ha=22.0, marsh_share=0.08,
-    trees_per_ha=6.0, sand=0.65, algae=0.15, wetness=0.6, wave_slope=0.05,
-)  # fmt: skip
-_GROUND_TEXTURES = replace(
-    _TIDAL_TREES, tide_m=-0.55, tilt_m=0.4, relief_m=0.22, channel_half_width_m=1.3, channel_depth_m=0.6,
-    channel_spacing_m=70.0, branch_orders=1, branch_spacing_m=16.0, ripple_m=0.12, pools_per_ha=70.0, marsh_share=0.03,
-    trees_per_ha=0.0, sand=0.55, algae=0.5, shells=0.8, wetness=0.45, wave_slope=0.02,
-)  # fmt: skip
-_VEGETATION = replace(
-    _TIDAL_TREES, tide_m=-0.7, tilt_m=0.6, relief_m=0.25, channel_half_width_m=2.0, channel_depth_m=1.1,
-    branch_orders=2, branch_spacing_m=15.0, ripple_m=0.03, pools_per_ha=25.0, tufts_per_m2=3.6, marsh_share=0.55,
-    trees_per_ha=60.0, sand=0.1, algae=0.6, shells=0.1, wetness=0.4, wave_slope=0.02,
-)  # fmt: skip
-_DEEP_WATER = replace(
-    _TIDAL_TREES, tide_m=0.1, tilt_m=5.0, relief_m=0.6, channel_half_width_m=4.0, channel_depth_m=0.9,
-    channel_spacing_m=75.0, branch_orders=2, branch_spacing_m=14.0, ripple_m=0.08, pools_per_ha=12.0, marsh_share=0.12,
-    trees_per_ha=5.0, sand=0.5, algae=0.25, wetness=0.7, wave_slope=0.06,
-)  # fmt: skip
-
 CATEGORIES: dict[str, Settings] = {
     "tidal_trees": _TIDAL_TREES,
-    "river_mouths": _RIVER_MOUTHS,
-    "ground_textures": _GROUND_TEXTURES,
-    "vegetation": _VEGETATION,
-    "deep_water": _DEEP_WATER,
-}
+    "river_mouths": replace(
+        _TIDAL_TREES, tide_m=-0.5, tilt_m=1.5, relief_m=0.28, channel_half_width_m=7.0, channel_depth_m=1.5,
+        channel_spacing_m=48.0, branch_orders=1, branch_spacing_m=24.0, ripple_m=0.09, pools_per_ha=22.0,
+        marsh_share=0.08, trees_per_ha=6.0, sand=0.65, algae=0.15, wetness=0.6, wave_slope=0.05,
+    ),
+    "ground_textures": replace(
+        _TIDAL_TREES, tide_m=-0.55, tilt_m=0.4, relief_m=0.22, channel_half_width_m=1.3, channel_depth_m=0.6,
+        channel_spacing_m=70.0, branch_orders=1, branch_spacing_m=16.0, ripple_m=0.12, pools_per_ha=70.0,
+        marsh_share=0.03, trees_per_ha=0.0, sand=0.55, algae=0.5, shells=0.8, wetness=0.45, wave_slope=0.02,
+    ),
+    "vegetation": replace(
+        _TIDAL_TREES, tide_m=-0.7, tilt_m=0.6, relief_m=0.25, channel_half_width_m=2.0, channel_depth_m=1.1,
+        branch_orders=2, branch_spacing_m=15.0, ripple_m=0.03, pools_per_ha=25.0, tufts_per_m2=3.6, marsh_share=0.55,
+        trees_per_ha=60.0, sand=0.1, algae=0.6, shells=0.1, wetness=0.4, wave_slope=0.02,
+    ),
+    "deep_water": replace(
+        _TIDAL_TREES, tide_m=0.1, tilt_m=5.0, relief_m=0.6, channel_half_width_m=4.0, channel_depth_m=0.9,
+        channel_spacing_m=75.0, branch_orders=2, branch_spacing_m=14.0, ripple_m=0.08, pools_per_ha=12.0,
+        marsh_share=0.12, trees_per_ha=5.0, sand=0.5, algae=0.25, wetness=0.7, wave_slope=0.06,
+    ),
+}  # fmt: skip
 """Tidal trees are the creeks that branch like trees over a flat; ours carry some mangroves too."""
 
 

@@ -54,10 +54,10 @@ class Light:
     def make(elevation_deg: float, azimuth_deg: float, noise: Noise) -> Light:
         """Build the light of a sun at an elevation above the horizon and an azimuth clockwise from north."""
         elevation, azimuth = math.radians(elevation_deg), math.radians(azimuth_deg)
-        level = math.cos(elevation)
-        sun = torch.tensor([level * math.sin(azimuth), level * math.cos(azimuth), math.sin(elevation)])
+        level, up = math.cos(elevation), math.sin(elevation)
+        sun = torch.tensor([level * math.sin(azimuth), level * math.cos(azimuth), up])
         # A low sun is redder and weaker: a rough fit to the air's transmission at three wavelengths.
-        air_mass = 1 / max(math.sin(elevation), 0.08)
+        air_mass = 1 / max(up, 0.08)
         sun_rgb = torch.exp(-torch.tensor([0.10, 0.16, 0.26]) * (air_mass - 1)) * torch.tensor([1.05, 1, 0.9])
         return Light(sun, 1.3 * sun_rgb, torch.tensor([0.22, 0.255, 0.305]), noise)
 
@@ -72,14 +72,13 @@ class Light:
     def sky(self, direction: Float[Tensor, "3 P"]) -> Float[Tensor, "3 P"]:
         """Compute the radiance of the sky in unit directions, without the sun's disc."""
         up = direction[2].clamp(min=0.02)
-        low = (1 - up) ** 3
-        zenith, horizon = (self.sky_rgb.new_tensor(c)[:, None] for c in ([0.13, 0.24, 0.46], [0.62, 0.70, 0.80]))
+        zenith, horizon = (torch.tensor(c)[:, None] for c in ([0.13, 0.24, 0.46], [0.62, 0.70, 0.80]))
         # Clouds lie on a plane: their pattern depends on where the ray would cross it.
         across = direction[:2] / (up + 0.15)
         cloud = smoothstep(-0.1, 0.5, self.noise.fractal(across, 0.9, 3)[0]) * 0.55
         near_sun = dot(direction, self.sun[:, None]).clamp(min=0)
         glow = 0.5 * near_sun**8 + 1.2 * near_sun**60
-        clear = zenith + (horizon - zenith) * low
+        clear = zenith + (horizon - zenith) * (1 - up) ** 3
         return clear + (0.85 - clear) * cloud + glow * self.sun_rgb[:, None]
 
     def specular(
@@ -91,11 +90,8 @@ class Light:
     ) -> Float[Tensor, "3 P"]:
         """Compute what a wet surface reflects of sky and sun (Fresnel after Schlick, facets after GGX).
 
-        Args:
-            normal: unit.
-            to_eye: unit.
-            roughness: root-mean-square slope of the facets that are too small to be drawn.
-            sunlit: share of the sun that is not in shadow.
+        Normals and directions are unit vectors; `roughness` is the root-mean-square slope of the facets that are too
+        small to be drawn, `sunlit` the share of the sun that is not in shadow.
         """
         facing = dot(normal, to_eye).clamp(min=0.02)
         reflected = 2 * facing * normal - to_eye
@@ -103,8 +99,7 @@ class Light:
         half = normalised(to_eye + self.sun[:, None])
         # GGX by tangents: alpha^2 / (pi (cos^2 (alpha^2 - 1) + 1)^2), with alpha^2 twice the slope's variance.
         alpha2 = 2 * roughness**2 + 2e-4
-        cos2 = dot(normal, half).clamp(min=0) ** 2
-        facets = alpha2 / (math.pi * (cos2 * (alpha2 - 1) + 1) ** 2)
+        facets = alpha2 / (math.pi * (dot(normal, half).clamp(min=0) ** 2 * (alpha2 - 1) + 1) ** 2)
         facing_sun = dot(normal, self.sun[:, None]).clamp(min=0.02)
         # Visibility of facets: the usual rational form for smooth surfaces, 1 / (4 max(cos, cos)).
         shape = facets / (4 * torch.maximum(facing, facing_sun))
@@ -183,8 +178,6 @@ class Ground:
         """Compute the radiance of ground points: mud, wet mud and water with all their fine detail.
 
         Args:
-            light: sun and sky.
-            xy: points.
             to_eye: unit vectors; None for the diffuse part alone (for maps).
             footprint_m: distance between neighbouring samples; finer detail is averaged.
             seconds: time at which wavelets are seen.
@@ -234,7 +227,7 @@ class Ground:
         if 1.5 * finest < _RIPPLE_WAVELENGTH_M:
             cos, sin = math.cos(self.ripple_heading), math.sin(self.ripple_heading)
             wave = torch.cos((xy[0] * cos + xy[1] * sin) * (2 * math.pi / _RIPPLE_WAVELENGTH_M) + bend)
-            slope = slope + (strength * share * wave) * xy.new_tensor([[cos], [sin]])
+            slope = slope + (strength * share * wave) * torch.tensor([[cos], [sin]])
             tint = tint * (1 - 0.07 * ripple * share * wave)
         return slope, tint.clamp(min=0.25), 0.25 * strength * (1 - share)
 
@@ -253,7 +246,7 @@ class Ground:
             # Waves on deep water: the square of the frequency is g k.
             turn = 1.9 * k - math.sqrt(9.81 * number) * seconds
             phase = number * (xy[0] * cos + xy[1] * sin) + (3.0 * warp[k % 4] + 0.8 * fine[(k + 1) % 4]) + turn
-            slope = slope + (amplitude * share * torch.cos(phase)) * xy.new_tensor([[cos], [sin]])
+            slope = slope + (amplitude * share * torch.cos(phase)) * torch.tensor([[cos], [sin]])
             variance = variance + 0.5 * amplitude**2 * (1 - share)
         # Waves that cross are never as regular as their sum.
         slope = slope + (0.9 * amplitude * resolved(1.3, footprint_m)) * fine[0:2] + (0.9 * amplitude) * warp[0:2]
@@ -269,13 +262,11 @@ def _normal(slope: Tensor) -> Tensor:
 
 def _water_body(albedo: Tensor, depth: Tensor, silt: Tensor, foam: Tensor, light: Light, sunlit: Tensor) -> Tensor:
     """Compute the light that comes back out of the water: the bed through it, and the silt in it."""
-    turbid, clear, absorption = (
-        albedo.new_tensor(c)[:, None] for c in (_TURBID_WATER, _CLEAR_WATER, _ABSORPTION_PER_M)
-    )
+    turbid, clear, absorption = (torch.tensor(c)[:, None] for c in (_TURBID_WATER, _CLEAR_WATER, _ABSORPTION_PER_M))
     body = torch.lerp(clear, turbid, silt)
     through = torch.exp(-absorption * depth * (0.8 + 2.5 * silt))
     upwelling = (albedo * through + body * (1 - through)) * (1 - foam) + _FOAM * foam
-    level = depth.new_tensor([0.0, 0.0, 1.0])[:, None]
+    level = torch.tensor([0.0, 0.0, 1.0])[:, None]
     # Shadows are soft on water: silt scatters light into them.
     return upwelling * light.diffuse(level, 0.3 + 0.7 * sunlit, torch.ones_like(depth))
 
@@ -288,35 +279,29 @@ def make_ground(
     shade: Float[Tensor, "H W"],
     random: np.random.Generator,
 ) -> Ground:
-    """Compute the ground's maps.
-
-    Args:
-        settings: of the flat.
-        terrain: its shape.
-        marsh: 1 where plants grow densely.
-        sun: unit vector towards it.
-        shade: share of the sun that plants let through.
-        random: draws the patterns.
-    """
-    noise = Noise.make(random, channels=4)
+    """Compute the ground's maps, given the density of plants and the share of the sun that they let through."""
+    noise = Noise(random, channels=4)
     nodes = terrain.extent.nodes()
-    shape = (terrain.extent.rows, terrain.extent.columns)
+    shape = terrain.ground.shape
     large = noise.fractal(nodes, 26.0, 4).reshape(4, *shape)
     small = noise.fractal(nodes + 900, 3.6, 4).reshape(4, *shape)
     surface = terrain.surface
+    height = surface.values[0]
     wet = _wetness(settings, terrain, large[3] + 0.5 * small[3])
     albedo = _albedo(settings, terrain, marsh, wet, large, small)
     sunlit = shade * _terrain_sun(surface, sun)
     # Troughs see less of the sky: the height against its surroundings stands for how much.
-    hollow = (surface.values[0] - blurred(surface.values[0], 6)) / 0.18
+    hollow = (height - blurred(height, 6)) / 0.18
     openness = (0.95 + 0.2 * hollow).clamp(0.55, 1.15) * (1 - 0.35 * marsh)
     silt, foam = (x.reshape(shape) for x in _drift(noise, nodes, large[1].reshape(-1)))
     # Rough water foams.
     foam = foam * float(np.clip((settings.wave_slope - 0.035) / 0.03, 0, 1)) * smoothstep(0.1, 0.4, terrain.water_depth)
     ripple = terrain.ripple * (1 - marsh)
-    maps = [*surface.gradient(), *albedo, wet, terrain.water_depth, silt, foam, ripple, sunlit, openness]
-    raster, heading = Raster(terrain.extent, torch.stack(maps)), float(random.uniform(0, math.pi))
-    return Ground(raster, heading, settings.shells, settings.wave_slope, Noise.make(random, channels=4))
+    north, east = torch.gradient(height, spacing=terrain.extent.cell_m)
+    maps = [east, north, *albedo, wet, terrain.water_depth, silt, foam, ripple, sunlit, openness]
+    heading = float(random.uniform(0, math.pi))
+    detail = Noise(random, channels=4)
+    return Ground(Raster(terrain.extent, torch.stack(maps)), heading, settings.shells, settings.wave_slope, detail)
 
 
 def _wetness(settings: Settings, terrain: Terrain, pattern: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
@@ -364,18 +349,16 @@ def _drift(noise: Noise, nodes: Tensor, large: Tensor) -> tuple[Tensor, Tensor]:
 
 def _terrain_sun(surface: Raster, sun: Float[Tensor, "3"]) -> Float[Tensor, "H W"]:
     """Compute the share of the sun's disc above the terrain's horizon at every node, with a soft edge."""
-    level = float(torch.hypot(sun[0], sun[1]))
-    height, extent = surface.values[0], surface.extent
-    highest = float(height.amax()) - height.reshape(-1)
-    nodes = extent.nodes()
-    horizon = torch.full_like(highest, -1.0)
+    level, up = float(torch.hypot(sun[0], sun[1])), float(sun[2])
+    height, nodes, cell_m = surface.values.reshape(-1), surface.extent.nodes(), surface.extent.cell_m
     if level < 1e-3:
-        return torch.ones_like(height)
-    reach = (float(highest.amax()) * level / float(sun[2])) + extent.cell_m
-    distance = 1.5 * extent.cell_m
+        return torch.ones_like(surface.values[0])
+    horizon = torch.full_like(height, -1.0)
+    reach = float((height.amax() - height).amax()) * level / up + cell_m
+    distance = 1.5 * cell_m
     while distance < reach:
         ahead = nodes + (sun[:2] * (distance / level))[:, None]
-        horizon = torch.maximum(horizon, (surface.sample(ahead)[0] - height.reshape(-1)) / distance)
+        horizon = torch.maximum(horizon, (surface.sample(ahead)[0] - height) / distance)
         distance *= 1.3
-    tangent = float(sun[2]) / level
-    return (1 - smoothstep(0.9 * tangent, 1.1 * tangent + 0.05, horizon)).reshape(height.shape)
+    tangent = up / level
+    return (1 - smoothstep(0.9 * tangent, 1.1 * tangent + 0.05, horizon)).reshape(surface.values.shape[1:])

@@ -15,7 +15,7 @@ from torch import Tensor
 from tidefield.data.scene import SparsePoints
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.parallel import in_parallel
-from tidefield.synthetic.flat import TidalFlat, make_flat, moved
+from tidefield.synthetic.flat import TidalFlat, make_flat
 from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.settings import settings_for
 
@@ -91,9 +91,8 @@ def make_survey(
     width: int = 240,
     flight: Flight | None = None,
     supersample: int = 2,
-    device: torch.device | str = "cpu",
 ) -> Survey:
-    """Fly a survey over a new flat. The same arguments give the same pixels on the same device.
+    """Fly a survey over a new flat. The same arguments give the same pixels.
 
     Args:
         category: tidal_trees, river_mouths, ground_textures, vegetation or deep_water.
@@ -102,7 +101,6 @@ def make_survey(
         width: of a photograph, pixels; neither the flat nor the flight depends on it.
         flight: None for the defaults, which suit a demonstration.
         supersample: rays per pixel along each side.
-        device: renders the survey and holds the result.
 
     Raises:
         SceneError: the category is unknown.
@@ -113,23 +111,23 @@ def make_survey(
     if flight.wetness is not None:
         settings = replace(settings, wetness=flight.wetness)
     cameras = _fly(flight, views, width, random)
-    elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
     extent = _ground_extent(cameras, flight)
-    azimuth = float(random.uniform(0, 360))
-    [flat] = in_parallel([partial(make_flat, settings, extent, float(elevation), azimuth, random)], "cpu")
-    flat = moved(flat, device)
-    cameras = cameras.to(device)
-    tasks = [partial(_photograph, flat, cameras[i], supersample, i * flight.water_motion) for i in range(views)]
-    photographs, depth = (torch.stack(parts) for parts in zip(*in_parallel(tasks, device), strict=True))
+    elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
+    azimuth = random.uniform(0, 360)
+    # As a task of its own: then the flat does not depend on the number of cores.
+    [flat] = in_parallel([partial(make_flat, settings, extent, elevation, azimuth, random)], "cpu")
+    # In single precision, on which the photographs of a seed depend.
+    seconds = torch.tensor([i * flight.water_motion for i in range(views)]).tolist()
+
+    def photograph(i: int) -> tuple[Tensor, Tensor]:
+        colour, depth = flat.photograph(cameras[i], supersample, seconds[i])
+        return (colour * 255).round().to(torch.uint8), depth
+
+    made = in_parallel([partial(photograph, i) for i in range(views)], "cpu")
+    photographs, depth = (torch.stack(parts) for parts in zip(*made, strict=True))
     cameras = replace(cameras, near_far=_near_far(depth))
     points = _sparse_points(flat, cameras, photographs, depth, random)
     return Survey(category, seed, flat, cameras, photographs, depth, points)
-
-
-def _photograph(flat: TidalFlat, camera: Cameras, supersample: int, seconds: float) -> tuple[Tensor, Tensor]:
-    """Render one photograph [H W 3] in 8 bits and its depth [H W]."""
-    colour, depth = flat.render(camera, supersample, torch.tensor([seconds]))
-    return (colour[0] * 255).round().to(torch.uint8), depth[0]
 
 
 def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
@@ -148,54 +146,43 @@ def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) ->
             position = position + random.normal(0, 0.012, 3) * flight.altitude_m
             tilt = random.uniform(25, 45) if random.random() < flight.oblique_share else 0.0
             turn = random.normal(0, flight.jitter_deg, 3) + np.array([tilt, 0.0, 0.0])
-            poses.append(np.column_stack([_nadir(heading) @ _rotation(np.radians(turn)), position]))
-    pose = torch.from_numpy(np.stack(poses)).float()
-    focal = torch.full((views, 2), flight.focal_ratio * width)
-    principal, size = torch.tensor([[width / 2, height / 2]]), torch.tensor([[width, height]])
-    near_far = torch.tensor([[0.5, 2.0]]) * flight.altitude_m
+            poses.append(np.column_stack([_attitude(heading, np.radians(turn)), position]))
+    # Exposure, and a third of its spread for the colour balance.
+    log_gain = random.normal(0, 1, (views, 1)) + random.normal(0, 1 / 3, (views, 3))
     return Cameras(
-        T_world_camera=pose,
-        focal_px=focal,
-        principal_px=principal.repeat(views, 1),
-        size_px=size.repeat(views, 1),
-        near_far=near_far.repeat(views, 1),
-        gain=_gains(flight, views, random),
+        T_world_camera=torch.from_numpy(np.stack(poses)).float(),
+        focal_px=torch.full((views, 2), flight.focal_ratio * width),
+        principal_px=torch.tensor([width / 2, height / 2]).repeat(views, 1),
+        size_px=torch.tensor([width, height]).repeat(views, 1),
+        near_far=(torch.tensor([0.5, 2.0]) * flight.altitude_m).repeat(views, 1),
+        gain=torch.from_numpy(np.exp(flight.exposure_spread * log_gain)).float(),
     )
 
 
-def _gains(flight: Flight, views: int, random: np.random.Generator) -> Float[Tensor, "V 3"]:
-    """Draw the gains of exposure and colour balance."""
-    exposure = random.normal(0, 1, (views, 1)) + random.normal(0, 1 / 3, (views, 3))
-    return torch.from_numpy(np.exp(flight.exposure_spread * exposure)).float()
+def _attitude(heading: float, turn: np.ndarray) -> np.ndarray:
+    """Rotate camera to world: a view straight down, its top towards a heading clockwise from north, then turned.
 
-
-def _nadir(heading: float) -> np.ndarray:
-    """Rotate camera to world for a view straight down, its top towards a heading clockwise from north."""
+    The turns are about the camera's x, y and z axes in this order; about x tilts the view towards the image's top.
+    """
     sin, cos = math.sin(heading), math.cos(heading)
-    return np.array([[cos, -sin, 0.0], [-sin, -cos, 0.0], [0.0, 0.0, -1.0]])
-
-
-def _rotation(angles: np.ndarray) -> np.ndarray:
-    """Rotate about the camera's x, y and z axes in turn; about x tilts the view towards the image's top."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
+    (cx, cy, cz), (sx, sy, sz) = np.cos(turn), np.sin(turn)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    return np.array([[cos, -sin, 0], [-sin, -cos, 0], [0, 0, -1]]) @ (about_z @ about_y @ about_x)
 
 
 def _ground_extent(cameras: Cameras, flight: Flight) -> Extent:
     """Bound the ground in the photographs, out to four flight heights, with a margin for shadows and crowns."""
-    width, height = cameras.width, cameras.height
-    corners = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    direction = cameras.directions_world(corners.expand(len(cameras), -1, -1))
+    corners = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]]) * cameras.size_px[:, None].float()
+    direction = cameras.directions_world(corners)
     below = cameras.position_world[:, None, 2:] + 3.0
     run = direction[..., :2] / (-direction[..., 2:]).clamp(min=1e-3)
     length = run.norm(dim=-1, keepdim=True)
     run = run * (length.clamp(max=4.0) / length)
     ground = (cameras.position_world[:, None, :2] + run * below).reshape(-1, 2)
-    (west, south), (east, north) = (ground.amin(0) - 4).tolist(), (ground.amax(0) + 4).tolist()
-    return Extent.around(west, south, east, north, min(flight.altitude_m * _CELL_PER_ALTITUDE, _LARGEST_CELL_M))
+    cell_m = min(flight.altitude_m * _CELL_PER_ALTITUDE, _LARGEST_CELL_M)
+    return Extent.around((ground.amin(0) - 4).tolist(), (ground.amax(0) + 4).tolist(), cell_m)
 
 
 def _near_far(depth: Float[Tensor, "V H W"]) -> Float[Tensor, "V 2"]:
@@ -217,39 +204,40 @@ def _sparse_points(
 
     There are no outliers.
     """
-    device = depth.device
     true = torch.cat([_corners(cameras[i], photographs[i], depth[i], random) for i in range(len(cameras))])
-    true = true[flat.water_depth(true.T) < _MAX_WATER_M]
+    # The water's depth counts where a point is on the water, not on a plant above it.
+    above = true[:, 2] - flat.surface.sample(true[:, :2].T)[0]
+    true = true[(above >= 0.02) | (flat.ground.sample(true[:, :2].T).water_depth_m < _MAX_WATER_M)]
     visible = _visible(cameras, depth, true)
-    visible &= torch.from_numpy(random.random(visible.shape) < _MATCHED).to(device)
+    visible &= torch.from_numpy(random.random(visible.shape) < _MATCHED)
     camera, point = torch.nonzero(visible, as_tuple=True)
-    noise = torch.from_numpy(random.normal(0, _NOISE_PX, (*visible.shape, 2))).to(device)
+    noise = torch.from_numpy(random.normal(0, _NOISE_PX, (*visible.shape, 2)))
     uv = cameras.project(true)[0].double()[camera, point] + noise[camera, point]
     xyz, certain = _triangulate(cameras, true.double(), point, camera, uv)
     inside = ((uv > 0) & (uv < cameras.size_px[camera])).all(1)
     often = torch.bincount(point[inside], minlength=len(true)) >= 2
     kept = certain & often
     point, camera, uv = (x[inside & kept[point]] for x in (point, camera, uv))
-    _, _, residual = _linearise(cameras, xyz, point, camera, uv)
-    count = torch.bincount(point, minlength=len(true))
-    total = torch.zeros(len(true), dtype=torch.float64, device=device).index_add_(0, point, residual.norm(dim=1))
+    residual = _normal_equations(cameras, xyz, point, camera, uv)[3]
+    total = torch.zeros(len(true), dtype=torch.float64).index_add_(0, point, residual.norm(dim=1))
+    error = total / torch.bincount(point, minlength=len(true))
     number = kept.cumsum(0) - 1
-    return SparsePoints(xyz[kept].float(), (total / count)[kept].float(), number[point], camera, uv.float())
+    return SparsePoints(xyz[kept].float(), error[kept].float(), number[point], camera, uv.float())
 
 
 def _corners(
     camera: Cameras, photograph: UInt8[Tensor, "H W 3"], depth: Float[Tensor, "H W"], random: np.random.Generator
 ) -> Float[Tensor, "P 3"]:
     """Draw pixels by their corner strength and return their world points."""
-    grey = cv2.cvtColor(photograph.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(photograph.numpy(), cv2.COLOR_RGB2GRAY)
     strength = np.sqrt(cv2.cornerMinEigenVal(grey, 3).clip(min=1e-8)).reshape(-1)
-    strength = np.where(np.isfinite(depth.cpu().numpy().reshape(-1)), strength, 0)
+    strength = np.where(np.isfinite(depth.numpy().reshape(-1)), strength, 0)
     wanted = int(np.clip(grey.size / 400, 60, 200))
     # The largest of u^(1/w) are a weighted sample without replacement (Efraimidis and Spirakis 2006).
     key = np.log(random.random(grey.size)) / np.maximum(strength, 1e-12)
-    pixel = torch.from_numpy(np.sort(np.argpartition(-key, wanted)[:wanted])).to(depth.device)
+    pixel = torch.from_numpy(np.sort(np.argpartition(-key, wanted)[:wanted]))
     z = depth.reshape(-1)[pixel]
-    uv = pixel_grid(camera.width, camera.height, depth.device)[pixel]
+    uv = pixel_grid(camera.width, camera.height)[pixel]
     at = camera.position_world + camera.directions_world(uv[None])[0] * z[:, None]
     return at[torch.isfinite(z)]
 
@@ -271,15 +259,15 @@ def _triangulate(
     point: Int[Tensor, " O"],
     camera: Int[Tensor, " O"],
     uv: Float[Tensor, "O 2"],
-) -> tuple[Tensor, Tensor]:
-    """Triangulate points [P 3] by Gauss-Newton, and test which of them [P] are well determined."""
+) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
+    """Triangulate points by Gauss-Newton, and test which of them are well determined."""
     xyz = start
+    # Points with fewer than two rays are dropped later; this keeps their matrices regular.
+    tiny = 1e-9 * torch.eye(3, dtype=xyz.dtype)
     for _ in range(3):
-        normal, right, _ = _normal_equations(cameras, xyz, point, camera, uv)
-        # Points with fewer than two rays are dropped later; this keeps their matrices regular.
-        tiny = 1e-9 * torch.eye(3, dtype=xyz.dtype, device=xyz.device)
+        normal, right, _, _ = _normal_equations(cameras, xyz, point, camera, uv)
         xyz = xyz + torch.linalg.solve(normal + tiny, right).clamp(-10, 10)
-    normal, _, z = _normal_equations(cameras, xyz, point, camera, uv)
+    normal, _, z, _ = _normal_equations(cameras, xyz, point, camera, uv)
     sigma = _NOISE_PX / torch.sqrt(torch.linalg.eigvalsh(normal)[:, 0].clamp(min=1e-12))
     footprint = torch.zeros_like(sigma).scatter_reduce_(0, point, z / cameras.focal_px[camera, 0], "amax")
     return xyz, sigma < _MAX_SIGMA_PX * footprint
@@ -287,25 +275,17 @@ def _triangulate(
 
 def _normal_equations(
     cameras: Cameras, xyz: Tensor, point: Tensor, camera: Tensor, uv: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute left [P 3 3] and right [P 3] sides per point, and the z-depth [O] per observation."""
-    jacobian, z, residual = _linearise(cameras, xyz, point, camera, uv)
-    transposed = jacobian.transpose(1, 2)
-    normal = torch.zeros(len(xyz), 3, 3, dtype=xyz.dtype, device=xyz.device)
-    normal.index_add_(0, point, transposed @ jacobian)
-    right = torch.zeros_like(xyz).index_add_(0, point, (transposed @ residual[..., None])[..., 0])
-    return normal, right, z
-
-
-def _linearise(
-    cameras: Cameras, xyz: Tensor, point: Tensor, camera: Tensor, uv: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute Jacobians [O 2 3] of observations by their points, z-depths [O] and residuals [O 2]."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute left [P 3 3] and right [P 3] sides per point; z-depths [O] and residuals [O 2] of the observations."""
     pose = cameras.T_world_camera.double()[camera]
     focal, principal = cameras.focal_px.double()[camera], cameras.principal_px.double()[camera]
     local = ((xyz[point] - pose[:, :, 3])[:, None] @ pose[:, :, :3])[:, 0]
     z = local[:, 2]
     ratio = local[:, :2] / z[:, None]
+    residual = uv - (ratio * focal + principal)
     axes = pose[:, :, :3].transpose(1, 2)
     jacobian = (focal / z[:, None])[..., None] * (axes[:, :2] - ratio[..., None] * axes[:, 2:])
-    return jacobian, z, uv - (ratio * focal + principal)
+    transposed = jacobian.transpose(1, 2)
+    normal = torch.zeros(len(xyz), 3, 3, dtype=xyz.dtype).index_add_(0, point, transposed @ jacobian)
+    right = torch.zeros_like(xyz).index_add_(0, point, (transposed @ residual[..., None])[..., 0])
+    return normal, right, z, residual

@@ -49,7 +49,7 @@ class Terrain:
 
 def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator) -> Terrain:
     """Build humps and hollows, creeks, sand waves and pools."""
-    noise = Noise.make(random, channels=4)
+    noise = Noise(random, channels=4)
     nodes = extent.nodes()
     broad = noise.fractal(nodes, 38.0, 4)
     fine = noise.fractal(nodes + 500, 7.0, 4)
@@ -61,8 +61,7 @@ def make_terrain(settings: Settings, extent: Extent, random: np.random.Generator
     rill = _rills(nodes, noise, fine[2:4]) * smoothstep(-0.1, 0.45, broad[3])
     # Banks are roughened by sampling a smooth network at displaced points.
     displaced = nodes + 0.9 * fine[2:4] + 0.22 * noise.fractal(nodes, 1.9, 2)[0:2]
-    (west, south), (east, north) = displaced.amin(1).tolist(), displaced.amax(1).tolist()
-    wider = Extent.around(west, south, east, north, 2 * extent.cell_m)
+    wider = Extent.around(displaced.amin(1).tolist(), displaced.amax(1).tolist(), 2 * extent.cell_m)
     carved, near = _carve(_creeks(settings, extent, random), wider).sample(displaced)
     ripple = smoothstep(-0.25, 0.35, broad[1]) * (1 - smoothstep(0.3, 0.9, near)) + 0.35 * smoothstep(0.2, 0.6, fine[1])
     ripple = ripple.clamp(max=1) * (1 - 0.85 * smoothstep(0.25, 0.6, -fine[1]))
@@ -100,18 +99,13 @@ def _sand_waves(nodes: Tensor, noise: Noise, heading: float) -> Tensor:
     return 0.5 * torch.sin(forked + 0.35 * torch.sin(forked)) * (0.7 + 0.3 * warp[2])
 
 
-@dataclass(frozen=True)
-class _Reaches:
-    """Straight pieces of channel, one column each, in metres; half width and depth are those at mid-reach."""
+def _creeks(settings: Settings, extent: Extent, random: np.random.Generator) -> Float[Tensor, "6 N"]:
+    """Grow a network of meandering creeks from the seaward (south) edge, branching headward.
 
-    start: Float[Tensor, "2 N"]
-    end: Float[Tensor, "2 N"]
-    half_width: Float[Tensor, " N"]
-    depth: Float[Tensor, " N"]
-
-
-def _creeks(settings: Settings, extent: Extent, random: np.random.Generator) -> _Reaches:
-    """Grow a network of meandering creeks from the seaward (south) edge, branching headward."""
+    Returns:
+        Straight pieces of channel, one column each: start and end, east and north, then half width and depth at
+        mid-reach, all in metres.
+    """
     rows: list[np.ndarray] = []
 
     def grow(mouth: np.ndarray, heading: float, length_m: float, size: float, orders: int) -> None:
@@ -149,34 +143,30 @@ def _creeks(settings: Settings, extent: Extent, random: np.random.Generator) -> 
         heading, size = math.pi / 2 + random.uniform(-0.35, 0.35), random.uniform(0.8, 1.2)
         length_m = height * random.uniform(0.95, 1.15)
         grow(np.array([x, extent.south_m - 5.0]), heading, length_m, size, settings.branch_orders)
-    table = torch.from_numpy(np.concatenate(rows).astype(np.float32)).T
-    return _Reaches(table[0:2], table[2:4], table[4], table[5])
+    return torch.from_numpy(np.concatenate(rows).astype(np.float32)).T
 
 
-def _carve(reaches: _Reaches, extent: Extent) -> Raster:
+def _carve(reaches: Float[Tensor, "6 N"], extent: Extent) -> Raster:
     """Compute the creeks' depth below the flat in metres, and `Terrain.near_channel`."""
+    start, end, half_widths, depths = reaches[0:2], reaches[2:4], reaches[4], reaches[5]
     # The sloping bank is wide enough for mud to stand.
-    banks = 0.5 * reaches.half_width + 1.6 * reaches.depth
+    banks = 0.5 * half_widths + 1.6 * depths
+    margin = half_widths + 2 * banks
+    boxes = extent.boxes(torch.minimum(start, end) - margin, torch.maximum(start, end) + margin)
+    axis = end - start
+    table = torch.cat([start, axis / (axis**2).sum(0), axis, torch.stack([half_widths, banks, depths])])
     nodes = extent.nodes()
-    carved, near = torch.zeros(nodes.shape[1]), torch.zeros(nodes.shape[1])
-    margin = reaches.half_width + 2 * banks
-    low = torch.minimum(reaches.start, reaches.end) - margin
-    high = torch.maximum(reaches.start, reaches.end) + margin
-    west_south = torch.tensor([[extent.west_m], [extent.south_m]])
-    limit = torch.tensor([[extent.columns - 1], [extent.rows - 1]])
-    first = torch.ceil((low - west_south) / extent.cell_m).clamp(min=0)
-    last = torch.minimum(torch.floor((high - west_south) / extent.cell_m), limit).maximum(first - 1)
-    axis = reaches.end - reaches.start
-    table = torch.cat([reaches.start, axis / (axis**2).sum(0), axis, reaches.half_width[None], banks[None]])
-    for i, node in box_pairs(torch.cat([first, last]).long(), extent.columns):
-        x0, y0, ax, ay, bx, by, half_width, bank = table[:, i]
+    maps = torch.zeros_like(nodes)
+    carved, near = maps
+    for i, node in box_pairs(boxes, extent.columns):
+        x0, y0, ax, ay, bx, by, half_width, bank, depth = table[:, i]
         x, y = nodes[0, node] - x0, nodes[1, node] - y0
         along = (x * ax + y * ay).clamp(0, 1)
         distance = torch.hypot(x - along * bx, y - along * by)
-        depth = reaches.depth[i] * smoothstep(half_width + 0.8 * bank, 0.3 * half_width, distance)
-        carved.scatter_reduce_(0, node, depth, "amax")
+        hollow = depth * smoothstep(half_width + 0.8 * bank, 0.3 * half_width, distance)
+        carved.scatter_reduce_(0, node, hollow, "amax")
         near.scatter_reduce_(0, node, smoothstep(half_width + 2 * bank, 0.5 * half_width, distance), "amax")
-    return Raster.of(extent, carved, near)
+    return Raster(extent, maps.reshape(2, extent.rows, extent.columns))
 
 
 def _add_pools(
@@ -213,11 +203,6 @@ def _add_pools(
 
 def _nodes_around(extent: Extent, centre: tuple[float, float], reach_m: float) -> Int[Tensor, " K"]:
     """Number the nodes in a square around a point."""
-
-    def span(at: float, start_m: float, count: int) -> Tensor:
-        first = max(0, math.ceil((at - reach_m - start_m) / extent.cell_m))
-        last = min(count - 1, math.floor((at + reach_m - start_m) / extent.cell_m))
-        return torch.arange(first, max(first, last) + 1).clamp(max=count - 1)
-
-    column, row = span(centre[0], extent.west_m, extent.columns), span(centre[1], extent.south_m, extent.rows)
-    return (row[:, None] * extent.columns + column).reshape(-1)
+    middle = torch.tensor(centre, dtype=torch.float64)[:, None]
+    [(_, node)] = box_pairs(extent.boxes(middle - reach_m, middle + reach_m), extent.columns)
+    return node

@@ -34,11 +34,12 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise SceneError(f"{folder} is not empty: a synthetic scene needs an empty folder; name another or empty it")
-    names = _photograph_names(survey, suffix)
+    # The order of the flight is sorted order.
+    names = [f"{survey.category}_{i + 1:04d}{suffix}" for i in range(len(survey.cameras))]
     try:
         for part in ("images", "sparse/0", "truth/depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        for name, photograph, depth in zip(names, survey.photographs.cpu(), survey.depth.cpu(), strict=True):
+        for name, photograph, depth in zip(names, survey.photographs, survey.depth, strict=True):
             _write_picture(folder / "images" / name, photograph)
             np.save(folder / "truth" / "depth" / f"{Path(name).stem}.npy", depth.numpy())
         _reconstruction(survey, names).write_binary(folder / "sparse" / "0")
@@ -47,43 +48,31 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
         raise SceneError(f"cannot write to {folder}: {error}; free some space or name another folder") from error
 
 
-def _photograph_names(survey: Survey, suffix: str = ".png") -> tuple[str, ...]:
-    """Name the photographs; flight order is sorted order."""
-    return tuple(f"{survey.category}_{i + 1:04d}{suffix}" for i in range(len(survey.cameras)))
-
-
-def _reconstruction(survey: Survey, names: tuple[str, ...]) -> pycolmap.Reconstruction:
+def _reconstruction(survey: Survey, names: list[str]) -> pycolmap.Reconstruction:
     """Build the COLMAP model: true poses, one PINHOLE camera, the sparse points and their tracks."""
-    cameras, points = survey.cameras.to("cpu"), survey.points
+    cameras, points, photographs = survey.cameras, survey.points, survey.photographs.numpy()
     model = pycolmap.Reconstruction()
-    (fx, fy), (cx, cy) = cameras.focal_px[0].tolist(), cameras.principal_px[0].tolist()
-    lens = pycolmap.Camera(
-        model="PINHOLE", width=cameras.width, height=cameras.height, params=[fx, fy, cx, cy], camera_id=1
-    )
+    params = [*cameras.focal_px[0].tolist(), *cameras.principal_px[0].tolist()]
+    lens = pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(lens)
-    point, camera, uv = (x.cpu().numpy() for x in (points.point_index, points.camera_index, points.uv_px))
+    point, camera, uv = points.point_index.numpy(), points.camera_index.numpy(), points.uv_px.numpy()
     slot = np.zeros(len(point), dtype=int)
     for i, name in enumerate(names):
         rows = np.nonzero(camera == i)[0]
         slot[rows] = np.arange(len(rows))
         image = pycolmap.Image(name=name, keypoints=uv[rows].astype(np.float64), camera_id=1, image_id=i + 1)
-        model.add_image_with_trivial_frame(image, _camera_from_world(cameras.T_world_camera[i]))
-    photographs = survey.photographs.cpu().numpy()
+        pose = cameras.T_world_camera[i].double().numpy()
+        rotation = pose[:, :3].T
+        T_camera_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        model.add_image_with_trivial_frame(image, T_camera_world)
     order = np.argsort(point, kind="stable")
     tracks = np.split(order, np.nonzero(np.diff(point[order]))[0] + 1) if len(order) else []
-    xyz, error = points.xyz_world.cpu().numpy().astype(np.float64), points.error_px.cpu().numpy()
-    for track in tracks:
+    for track, xyz, error in zip(tracks, points.xyz_world.double().numpy(), points.error_px.tolist(), strict=True):
         elements = [pycolmap.TrackElement(int(camera[k]) + 1, int(slot[k])) for k in track]
         column, row = uv[track[0]].astype(int)
-        colour = photographs[camera[track[0]], row, column]
-        point_id = model.add_point3D(xyz[point[track[0]]], pycolmap.Track(elements), colour)
-        model.point3D(point_id).error = float(error[point[track[0]]])
+        point_id = model.add_point3D(xyz, pycolmap.Track(elements), photographs[camera[track[0]], row, column])
+        model.point3D(point_id).error = error
     return model
-
-
-def _camera_from_world(pose: Tensor) -> pycolmap.Rigid3d:
-    rotation = pose[:, :3].double().numpy().T
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3].double().numpy())
 
 
 def _write_picture(path: Path, colour: UInt8[Tensor, "H W 3"]) -> None:
@@ -92,25 +81,25 @@ def _write_picture(path: Path, colour: UInt8[Tensor, "H W 3"]) -> None:
         raise SceneError(f"cannot write {path}: free some space or name another folder")
 
 
-def _write_map(survey: Survey, names: tuple[str, ...], folder: Path) -> None:
+def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
     """Write orthophoto, surface and truth.json of the surveyed ground, at about the photographs' resolution."""
-    cameras, extent = survey.cameras, survey.flat.extent
+    cameras, whole = survey.cameras, survey.flat.surface.extent
     cell = float((cameras.position_world[:, 2] / cameras.focal_px[:, 0]).median())
-    ground = survey.flat.orthophoto(Extent.around(extent.west_m, extent.south_m, extent.east_m, extent.north_m, cell))
-    _write_picture(folder / "orthophoto.png", (ground.colour * 255).round().to(torch.uint8).cpu())
-    np.save(folder / "surface.npy", ground.height_m.cpu().numpy())
-    rows, columns = ground.height_m.shape
+    extent = Extent.around([whole.west_m, whole.south_m], [whole.east_m, whole.north_m], cell)
+    colour, height_m = survey.flat.map(extent)
+    _write_picture(folder / "orthophoto.png", (colour * 255).round().to(torch.uint8))
+    np.save(folder / "surface.npy", height_m.numpy())
     truth = {
         "category": survey.category,
         "seed": survey.seed,
         "map": {
-            "rows": rows,
-            "columns": columns,
-            "first_pixel_centre_east_north_m": [ground.west_m, ground.north_m],
-            "pixel_step_east_north_m": [ground.cell_m, -ground.cell_m],
+            "rows": extent.rows,
+            "columns": extent.columns,
+            "first_pixel_centre_east_north_m": [extent.west_m, extent.north_m],
+            "pixel_step_east_north_m": [cell, -cell],
             "colour": "sRGB, straight down, without mirrored light",
             "height": "metres above mean mud level, plants and water included",
         },
-        "gain": dict(zip(names, cameras.gain.cpu().tolist(), strict=True)),
+        "gain": dict(zip(names, cameras.gain.tolist(), strict=True)),
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
