@@ -13,12 +13,12 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Real
 from markupsafe import Markup
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Circle
@@ -113,18 +113,30 @@ def draw_map(findings: Findings, statistics: Statistics) -> Markup:
 
 
 @style.context(STYLE)
-def draw_bars(title: str, axis: str, counted: str, counts: list[int], edges: list[float], digits: int | None) -> Markup:
-    """Draw a histogram.
+def draw_histogram(
+    title: str, axis: str, counted: str, values: Real[np.ndarray, " K"], digits: int | None
+) -> Markup | None:
+    """Draw the histogram of the finite values; None if there are fewer than two.
 
     Args:
         title: heading for screen readers.
         axis: what is measured, with its unit.
         counted: what a bar counts.
-        counts: heights of the bars.
-        edges: of the bars.
-        digits: decimals of the edges in tooltips; None for whole numbers with a bar each, at their middles.
+        values: what is measured.
+        digits: decimals in tooltips; None for whole numbers from 2, with a bar each.
     """
-    labels = [f"{(a + b) / 2:g}" if digits is None else f"{a:.{digits}f} to {b:.{digits}f}" for a, b in pairwise(edges)]
+    known = values[np.isfinite(values)]
+    if len(known) < 2:
+        return None
+    if digits is None:
+        edges = np.arange(2, max(int(known.max()), 3) + 2) - 0.5
+        labels = [f"{value:g}" for value in edges[:-1] + 0.5]
+    else:
+        low, high = np.percentile(known, [0.5, 99.5])
+        low, high = (low, high) if high - low > 1e-9 else (low - 0.5 * 10**-digits, low + 0.5 * 10**-digits)
+        edges = np.linspace(low, high, min(24, max(6, round(math.sqrt(len(known))))) + 1)
+        labels = [f"{start:.{digits}f} to {end:.{digits}f}" for start, end in pairwise(edges)]
+    counts = np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].tolist()
     figure = _figure(340.0, 200.0)
     axes = figure.add_axes((0.155, 0.22, 0.825, 0.74))
     axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=BAR, edgecolor="white", linewidth=0.8)
@@ -145,19 +157,6 @@ def draw_bars(title: str, axis: str, counted: str, counts: list[int], edges: lis
     where = f"{'at' if digits is None else 'from'} {labels[most]}"
     description = f"{title}. {spaced(sum(counts))} {counted}; most, {spaced(counts[most])}, {where}."
     return _embedded(figure, "chart", title, description, tooltips)
-
-
-def draw_histogram(
-    title: str, axis: str, counted: str, values: Float64[np.ndarray, " K"], digits: int
-) -> Markup | None:
-    """Draw the histogram of the finite values; None if there are fewer than two. Args as of `draw_bars`."""
-    known = values[np.isfinite(values)]
-    if len(known) < 2:
-        return None
-    low, high = np.percentile(known, [0.5, 99.5])
-    low, high = (low, high) if high - low > 1e-9 else (low - 0.5 * 10**-digits, low + 0.5 * 10**-digits)
-    counts, edges = np.histogram(np.clip(known, low, high), min(24, max(6, round(math.sqrt(len(known))))), (low, high))
-    return draw_bars(title, axis, counted, counts.tolist(), edges.tolist(), digits)
 
 
 @style.context(STYLE)
@@ -260,13 +259,11 @@ def _extent(drawn: Float64[np.ndarray, "K 2"], others: list[XY]) -> tuple[XY, XY
 
 def _draw_coverage(axes: Axes, statistics: Statistics) -> None:
     coverage = statistics.coverage
-    kinds = np.searchsorted([least for least, _ in CLASSES], coverage.count, side="right")
     (west, south), (east, north) = coverage.corner, coverage.far_corner
     axes.imshow(
-        np.ma.masked_equal(kinds, 0),
+        np.ma.masked_equal(coverage.count, 0),
         ListedColormap(COLOURS),
-        vmin=0.5,
-        vmax=len(COLOURS) + 0.5,
+        BoundaryNorm([*(least for least, _ in CLASSES), np.iinfo(np.uint16).max], len(COLOURS)),
         origin="lower",
         extent=(west, east, south, north),
         aspect="auto",
@@ -422,8 +419,8 @@ def _draw_scale_bar(margin: Axes, extent: float, width: float, unit: str) -> Non
     """Draw a bar of four parts below the map, as long as a fifth to two fifths of it."""
     length = _round_step(extent / 5)
     part, y = length / extent * width / 4, 52.0
-    for i in range(4):
-        margin.barh(y, part, 5, LEFT + i * part, color=(INK, "white")[i % 2], edgecolor=INK, linewidth=0.9)
+    starts, colours = LEFT + part * np.arange(4), [INK, "white"] * 2
+    margin.barh(np.full(4, y), part, 5, starts, color=colours, edgecolor=INK, linewidth=0.9)
     kilometres = unit == "m" and length >= 1000
     for share in (0, 0.5, 1):
         value = f"{share * length / (1000 if kilometres else 1):g}"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
+import shapely
 from jaxtyping import Float64
 from scipy import ndimage
 from shapely import Polygon
@@ -95,10 +96,8 @@ def footprints(block: Block, ground: Ground) -> tuple[Polygon, ...]:
 
 def _border_directions(camera: pycolmap.Camera) -> Float64[np.ndarray, "K 3"]:
     """Unit directions, in the camera's frame, along the border of its image."""
-    along = np.linspace(0, 1, BORDER_POINTS, endpoint=False)
-    zero, one = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
-    sides = [(along, zero), (one, along), (1 - along, one), (zero, 1 - along)]
-    uv = np.concatenate([np.c_[u, v] for u, v in sides]) * (camera.width, camera.height)
+    border = shapely.segmentize(shapely.box(0, 0, 1, 1), 1 / BORDER_POINTS)
+    uv = shapely.get_coordinates(border)[:-1] * (camera.width, camera.height)
     xy = np.asarray(camera.cam_from_img(uv))
     xy = xy[np.isfinite(xy).all(1)]  # a strong distortion need not be invertible at the corners
     directions = np.c_[xy, np.ones(len(xy))]

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from tidefield.survey.report.figures import COLOURS, draw_bars, draw_histogram, draw_map, draw_residuals, spaced
+from tidefield.survey.report.figures import COLOURS, draw_histogram, draw_map, draw_residuals, spaced
 from tidefield.survey.report.findings import Findings
 from tidefield.survey.report.numbers import Numbers, duration
 from tidefield.survey.report.statistics import Statistics
@@ -101,22 +101,19 @@ def _significant(value: float) -> str:
 
 def _charts(statistics: Statistics, located: bool) -> list[tuple[str, Markup]]:
     """Titles and charts; those without values are left out."""
-    lengths = np.bincount(np.minimum(statistics.track_length, LONGEST_TRACK), minlength=4)[2:]
-    edges = np.arange(2, 3 + len(lengths)) - 0.5
     scale, unit, digits = (100, "cm/px", 2) if located else (1, "units/px", 4)
-    beyond = f" ({LONGEST_TRACK}: or more)" if len(lengths) + 1 == LONGEST_TRACK else ""
-    observed = statistics.observed.astype(np.float64)
+    tracks = np.minimum(statistics.track_length, LONGEST_TRACK)
+    beyond = f" ({LONGEST_TRACK}: or more)" if tracks.max() == LONGEST_TRACK else ""
     share = "share of the photograph (%)"
     charts = [
         ("Reprojection errors", "error (px)", "observations", statistics.error_px, 2),
+        ("Track lengths", f"photographs that see a point{beyond}", "points", tracks, None),
         ("Ground sampling distances", f"of each photograph ({unit})", "photographs", scale * statistics.gsd, digits),
-        ("Points per photograph", "points", "photographs", observed, 0),
+        ("Points per photograph", "points", "photographs", statistics.observed, 0),
         ("Forward overlap", share, "photographs", 100 * statistics.forward_overlap, 0),
         ("Side overlap", share, "photographs", 100 * statistics.side_overlap, 0),
     ]
     found = [(chart[0], draw_histogram(*chart)) for chart in charts]
-    title, axis = "Track lengths", f"photographs that see a point{beyond}"
-    found.insert(1, (title, draw_bars(title, axis, "points", lengths.tolist(), edges.tolist(), None)))
     return [(title, chart) for title, chart in found if chart]
 
 
