@@ -15,11 +15,10 @@ from rich.console import Console
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError, SurveyError
-from tidefield.survey.findings import findings
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, PrepareOptions, prepare
-from tidefield.survey.report import write_report
+from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.features import FeatureOptions
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
@@ -85,13 +84,13 @@ def test_transforms_list_the_same_photographs(made: tuple[Path, Prepared]):
 
 def test_the_report_shows_the_results(made: tuple[Path, Prepared]):
     scene, prepared = made
-    report = write_report(findings(prepared, scene, {"colour": "auto"}), scene)
-    table = json.loads(report.table.read_text(encoding="utf-8"))
+    page = write_report(collect_findings(prepared, scene, {"colour": "auto"}), scene)
+    table = json.loads((scene / "report.json").read_text(encoding="utf-8"))
     assert table["reconstruction_statistics"]["reconstructed_shots_count"] == 12
     assert table["tidefield"]["resolution"]["height_above_ground"]["mean"] == pytest.approx(ABOVE, rel=0.03)
     assert table["tidefield"]["colour"]["applied"]
-    assert report.map is not None
-    assert "flight 003.jpg" in report.page.read_text(encoding="utf-8")
+    assert (scene / "survey.geojson").exists()
+    assert "flight 003.jpg" in page.read_text(encoding="utf-8")
 
 
 def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends_on_it(
@@ -135,7 +134,7 @@ def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(fl
     other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
     prepared = run(folder, tmp_path / "scene")
     assert prepared.models[0] == sorted(flight.names)
-    reasons = {item.name: item.reason for item in findings(prepared, tmp_path / "scene", {}).left_out}
+    reasons = {item.name: item.reason for item in collect_findings(prepared, tmp_path / "scene", {}).left_out}
     assert set(reasons) == set(other.names)
     if len(prepared.models) > 1:
         assert set(prepared.models[1]) <= set(other.names)

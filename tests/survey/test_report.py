@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import shapely
 from flat_surveys import (
     AHEAD,
     ASIDE,
@@ -26,8 +27,9 @@ from flat_surveys import (
 
 from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import RunError
-from tidefield.survey.report import Change, ColourCorrection, ColourExample, UnusedPhotograph, write_report
-from tidefield.survey.report.ground import signed_area
+from tidefield.survey.colour import ExposureCorrection
+from tidefield.survey.report import UnusedPhotograph, write_report
+from tidefield.survey.report.findings import MOST_THUMBNAILS
 from tidefield.survey.report.numbers import duration, plain
 from tidefield.survey.survey import Control, Survey
 
@@ -103,12 +105,11 @@ def full():
         left_out=(
             UnusedPhotograph(NASTY, "quality", "blurred <i>", {"sharpness": 0.1}, picture),
             UnusedPhotograph(lost[1].name, "poses", "too few matches", {"matches": math.nan}, None),
-            UnusedPhotograph(lost[2].name, "reading", "cut short"),
+            UnusedPhotograph(lost[2].name, "quality", "cut short"),
         ),
         models=(18, 4),
-        colour=ColourCorrection(
-            True, "Corrected.", (Change("Difference", 21.0, 6.0, "%"),), (ColourExample(NASTY, picture, picture),)
-        ),
+        colour=ExposureCorrection(np.ones((18, 3)), np.zeros((18, 3)), 0.21, 0.07, 0.06, True, False),
+        examples=((NASTY, picture, picture),),
         seconds={"features": 75.0, "mapping": 3700.0},
         options={"control": NASTY},
         versions={"tidefield": "1"},
@@ -116,14 +117,30 @@ def full():
     )
 
 
+def report(found, folder):
+    """Write a report; return the text of its page, and its numbers."""
+    page = write_report(found, folder)
+    return page.read_text(encoding="utf-8"), json.loads((folder / "report.json").read_text(encoding="utf-8"))
+
+
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    return write_report(full(), tmp_path_factory.mktemp("report"))
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def written(folder):
+    return report(full(), folder)
 
 
 @pytest.fixture(scope="module")
 def html(written):
-    return written.page.read_text(encoding="utf-8")
+    return written[0]
+
+
+@pytest.fixture(scope="module")
+def table(written):
+    return written[1]
 
 
 def test_the_page_is_well_formed_and_every_id_is_its_own(html):
@@ -175,16 +192,14 @@ def test_control_points_are_drawn_at_their_given_positions(tmp_path):
     given = FRAME.to_crs(np.array([[0.0, 0, 0], [2 * AHEAD, ASIDE, 0]]))
     control = Control(FRAME.crs, dict(zip(check.names, map(tuple, given.tolist()), strict=True)), ())
     found = findings(position, georeference=located(check=check))
-    page = Reader(
-        write_report(replace(found, survey=replace(found.survey, control=control)), tmp_path).page.read_text("utf-8")
-    )
+    page = Reader(report(replace(found, survey=replace(found.survey, control=control)), tmp_path)[0])
     cameras, points = page.markers["DJI_0000.JPG"], page.markers["check 0"]
     np.testing.assert_allclose(cameras, points, atol=0.05)
     np.testing.assert_allclose(page.markers["DJI_0003.JPG"], page.markers["check 1"], atol=0.05)
 
 
-def test_the_same_findings_give_the_same_page(written, html, tmp_path):
-    assert write_report(full(), tmp_path).page.read_text(encoding="utf-8") == html
+def test_the_same_findings_give_the_same_page(html, tmp_path):
+    assert report(full(), tmp_path)[0] == html
 
 
 @pytest.mark.parametrize("name", ["$x$ $", "点.JPG", "a\x01b"])
@@ -192,7 +207,7 @@ def test_any_name_of_a_point_can_be_drawn(tmp_path, name):
     check = Residuals((name,), np.array([[0.01, 0.02, 0.03]]))
     found = findings(georeference=located(check=check))
     found = replace(found, survey=replace(found.survey, control=surveyed(check)))
-    page = Reader(write_report(found, tmp_path).page.read_text(encoding="utf-8"))
+    page = Reader(report(found, tmp_path)[0])
     assert name.replace("\x01", "\ufffd") in page.text
 
 
@@ -209,14 +224,12 @@ def test_pictures_have_words_and_tables_have_captions_and_heads(html):
     assert page.count("table") == page.count("caption")
 
 
-def test_every_number_of_the_page_is_in_the_json(written, html):
+def test_every_number_of_the_page_is_in_the_json(table, html):
     def numbers_in(value):
         if isinstance(value, dict):
             value = list(value.values())
         return [n for item in value for n in numbers_in(item)] if isinstance(value, list) else [value]
 
-    table = json.loads(written.table.read_text(encoding="utf-8"))
-    assert table == json.loads(json.dumps(written.numbers))
     known = {float(n) for n in numbers_in(table) if isinstance(n, int | float)}
     shown = Reader(html).values
     assert len(shown) > 40
@@ -234,8 +247,7 @@ def test_the_page_states_the_known_values_of_the_survey(html):
     assert "2, of 18 and 4 photographs" in text
 
 
-def test_the_json_has_the_names_and_meanings_of_opensfm(written):
-    table = written.numbers
+def test_the_json_has_the_names_and_meanings_of_opensfm(table):
     shots = table["reconstruction_statistics"]
     assert shots["reconstructed_shots_count"] == 18
     assert shots["initial_shots_count"] == 21
@@ -264,7 +276,7 @@ def test_errors_count_only_what_was_used(tmp_path):
     errors = np.array([[3.0, 4, 0], [-3, -4, 2], [100, 100, 100]])
     wrong = (LeftOut("GPS", "gps 2", "it is 170 m away"),)
     found = findings(georeference=located(gps=residuals("gps", error_m=errors), left_out=wrong))
-    table = write_report(found, tmp_path).numbers
+    table = report(found, tmp_path)[1]
     gps = table["gps_errors"]
     assert gps["mean"] == {"x": 0, "y": 0, "z": 1}
     assert gps["error"] == pytest.approx({"x": 3, "y": 4, "z": math.sqrt(2)})
@@ -280,14 +292,14 @@ def test_a_point_without_an_estimate_is_listed_but_not_drawn(tmp_path):
     check = residuals("check", error_m=errors)
     found = findings(georeference=located(check=check))
     found = replace(found, survey=replace(found.survey, control=surveyed(check)))
-    html = write_report(found, tmp_path).page.read_text(encoding="utf-8")
+    html = report(found, tmp_path)[0]
     shapes = [value for _, attrs in Reader(html).seen for value in attrs.values() if value]
     assert not any("nan" in value.lower() for value in shapes)
     assert "check 1" in "".join(Reader(html).text)
 
 
-def test_the_map_for_a_gis_follows_rfc_7946_and_is_at_the_place_of_the_world(written):
-    collection = json.loads(written.map.read_text(encoding="utf-8"))
+def test_the_map_for_a_gis_follows_rfc_7946_and_is_at_the_place_of_the_world(written, folder):
+    collection = json.loads((folder / "survey.geojson").read_text(encoding="utf-8"))
     assert collection["type"] == "FeatureCollection"
     kinds: dict[str, list] = {}
     for feature in collection["features"]:
@@ -309,24 +321,22 @@ def test_the_map_for_a_gis_follows_rfc_7946_and_is_at_the_place_of_the_world(wri
     assert len(outer) == 1
     for ring in (*rings, outer[0][0]):
         assert ring[0] == ring[-1]
-        assert signed_area(np.array(ring)) > 0
+        assert shapely.LinearRing(ring).is_ccw
     world = FRAME.from_geographic(np.c_[np.array(rings[0]), np.zeros(len(rings[0]))])
-    assert signed_area(world[:-1, :2]) == pytest.approx(80 * 60, rel=1e-3)
+    assert shapely.Polygon(world[:, :2]).area == pytest.approx(80 * 60, rel=1e-3)
     area = kinds["area covered"][0]["properties"]["area_m2"]
     assert area == pytest.approx((5 * AHEAD + 80) * (2 * ASIDE + 60), rel=0.01)
 
 
 def test_without_a_georeference_there_is_no_map_and_an_earlier_one_is_deleted(tmp_path):
-    first = write_report(findings(), tmp_path)
-    assert first.map is not None
-    second = write_report(findings(georeference=located(None)), tmp_path)
-    assert second.map is None
+    write_report(findings(), tmp_path)
+    assert (tmp_path / "survey.geojson").exists()
+    text, table = report(findings(georeference=located(None)), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
-    text = second.page.read_text(encoding="utf-8")
     Reader(text)
     assert "in its own unit" in text
     assert "cm/px" not in text
-    assert second.numbers["odm_processing_statistics"]["average_gsd"] is None
+    assert table["odm_processing_statistics"]["average_gsd"] is None
 
 
 def test_the_report_warns_of_low_overlap_and_of_a_changed_focal_length(tmp_path):
@@ -335,7 +345,7 @@ def test_the_report_warns_of_low_overlap_and_of_a_changed_focal_length(tmp_path)
     read = found.survey.photographs
     lens = replace(read[0].lens, focal_px=500.0)
     survey = replace(found.survey, photographs=tuple(replace(p, lens=lens) for p in read))
-    remarks = " ".join(write_report(replace(found, survey=survey), tmp_path).numbers["tidefield"]["remarks"])
+    remarks = " ".join(report(replace(found, survey=survey), tmp_path)[1]["tidefield"]["remarks"])
     assert "seen by three photographs or more" in remarks
     assert "forward overlap, 40%" in remarks
     assert "side overlap, 25%" in remarks
@@ -347,7 +357,7 @@ def test_the_report_of_a_good_survey_with_check_points_has_no_warnings(tmp_path)
     control, check = residuals("control"), residuals("check")
     checked = findings(flight(5, 12), georeference=located(control=control, check=check))
     checked = replace(checked, survey=replace(checked.survey, control=surveyed(control, check)))
-    assert write_report(checked, tmp_path).numbers["tidefield"]["remarks"] == []
+    assert report(checked, tmp_path)[1]["tidefield"]["remarks"] == []
 
 
 def test_a_photograph_100_km_away_does_not_shrink_the_map(tmp_path):
@@ -355,11 +365,9 @@ def test_a_photograph_100_km_away_does_not_shrink_the_map(tmp_path):
     stray = photograph(200, np.array([100_000.0, 0, 60]))
     found = findings(position)
     survey = replace(found.survey, photographs=(*found.survey.photographs, stray))
-    near = write_report(found, tmp_path / "near").page.read_text(encoding="utf-8")
+    near = report(found, tmp_path / "near")[0]
     left_out = (UnusedPhotograph(stray.name, "quality", "its GPS lies 100 km away"),)
-    far = write_report(replace(found, survey=survey, left_out=left_out), tmp_path / "far").page.read_text(
-        encoding="utf-8"
-    )
+    far = report(replace(found, survey=survey, left_out=left_out), tmp_path / "far")[0]
     assert re.search(r'class="map" viewBox="[^"]*"', near)[0] == re.search(r'class="map" viewBox="[^"]*"', far)[0]
 
 
@@ -372,14 +380,17 @@ def test_a_folder_that_cannot_be_written_to_is_an_error_of_the_run(tmp_path):
 def test_two_thousand_photographs_make_a_page_that_can_be_sent(tmp_path):
     position = flight(40, 50)
     picture = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
-    lost = tuple(UnusedPhotograph(f"lost {i}.JPG", "quality", "blurred", {}, picture) for i in range(500))
+    lost = tuple(
+        UnusedPhotograph(f"lost {i}.JPG", "quality", "blurred", {}, picture if i < MOST_THUMBNAILS else None)
+        for i in range(500)
+    )
     model = reconstruction(position, flat_ground(position, a_photograph=8))
     found = findings(position, left_out=lost, reconstruction=model)
     start = time.process_time()
-    report = write_report(found, tmp_path)
+    page = write_report(found, tmp_path)
     assert time.process_time() - start < 20  # a few seconds without the checks of types
-    assert report.page.stat().st_size < 5e6
-    assert Reader(report.page.read_text(encoding="utf-8")).count("figure") < 60
+    assert page.stat().st_size < 5e6
+    assert Reader(page.read_text(encoding="utf-8")).count("figure") < 60
 
 
 def test_numbers_become_plain_python_and_durations_are_formatted():

@@ -24,11 +24,10 @@ from flat_surveys import (
 
 from tidefield.errors import SurveyError
 from tidefield.survey.report.block import read_block
-from tidefield.survey.report.coverage import cover
 from tidefield.survey.report.figures import affine, coordinates, crossings
-from tidefield.survey.report.ground import fit_ground, footprints, signed_area
+from tidefield.survey.report.ground import fit_ground, footprints
 from tidefield.survey.report.numbers import numbers
-from tidefield.survey.report.statistics import measure
+from tidefield.survey.report.statistics import cover, measure, unite
 from tidefield.survey.survey import Survey
 
 FOOTPRINT = (WIDTH * GSD, HEIGHT * GSD)  # 80 by 60
@@ -54,22 +53,23 @@ def test_resolution_height_and_errors_are_those_of_the_construction(flat):
 def test_footprints_are_the_frames_on_the_ground_and_run_counter_clockwise(flat):
     for outline, place in zip(flat.footprints, flat.block.position, strict=True):
         corners = shapely.get_coordinates(outline)
-        assert signed_area(corners) == pytest.approx(np.prod(FOOTPRINT), rel=1e-5)
+        assert outline.exterior.is_ccw
+        assert outline.area == pytest.approx(np.prod(FOOTPRINT), rel=1e-5)
         np.testing.assert_allclose(corners.max(0) - place[:2], np.array(FOOTPRINT) / 2, atol=1e-3)
         np.testing.assert_allclose(corners.min(0) - place[:2], -np.array(FOOTPRINT) / 2, atol=1e-3)
 
 
 def test_neighbours_share_what_their_distance_leaves_of_a_footprint(flat):
-    np.testing.assert_allclose(flat.overlap.forward, 1 - AHEAD / FOOTPRINT[0], atol=1e-3)
-    np.testing.assert_allclose(flat.overlap.side, 1 - ASIDE / FOOTPRINT[1], atol=1e-3)
+    np.testing.assert_allclose(flat.forward_overlap, 1 - AHEAD / FOOTPRINT[0], atol=1e-3)
+    np.testing.assert_allclose(flat.side_overlap, 1 - ASIDE / FOOTPRINT[1], atol=1e-3)
 
 
 def test_a_missing_photograph_shows_as_a_gap_only_where_no_other_neighbour_fills_it():
     position = np.delete(flight(1, 6), 4, axis=0)
-    found = measure(findings(position)).overlap
-    np.testing.assert_allclose(found.forward[:4], 1 - AHEAD / FOOTPRINT[0], atol=1e-3)
-    np.testing.assert_allclose(found.forward[4], 1 - 2 * AHEAD / FOOTPRINT[0], atol=1e-3)
-    assert np.isnan(found.side).all()
+    found = measure(findings(position))
+    np.testing.assert_allclose(found.forward_overlap[:4], 1 - AHEAD / FOOTPRINT[0], atol=1e-3)
+    np.testing.assert_allclose(found.forward_overlap[4], 1 - 2 * AHEAD / FOOTPRINT[0], atol=1e-3)
+    assert np.isnan(found.side_overlap).all()
 
 
 def test_coverage_has_the_area_of_the_union_and_of_the_intersections(flat):
@@ -83,29 +83,22 @@ def test_coverage_has_the_area_of_the_union_and_of_the_intersections(flat):
 
 
 def test_cells_are_counted_when_their_centre_lies_in_the_polygon():
-    generator = np.random.default_rng(3)
-    angles = np.sort(generator.uniform(0, 2 * np.pi, 11))
-    star = np.c_[np.cos(angles), np.sin(angles)] * generator.uniform(20, 100, 11)[:, None]
-    coverage = cover((shapely.Polygon(star), box((-50, -50), (70, 10))))
+    triangle = shapely.Polygon([(0, 0), (100, 0), (0, 70)])
+    coverage = cover((triangle, box((20, 10), (90, 20)), shapely.Polygon()))
     rows, columns = coverage.count.shape
-    x = coverage.corner[0] + (np.arange(columns) + 0.5) * coverage.cell
-    y = coverage.corner[1] + (np.arange(rows) + 0.5) * coverage.cell
-    x, y = np.meshgrid(x, y)
-    inside = np.zeros(x.shape, int)
-    for (x0, y0), (x1, y1) in zip(star, np.roll(star, -1, axis=0), strict=True):
-        crosses = (y >= min(y0, y1)) & (y < max(y0, y1))
-        inside ^= crosses & (x0 + (y - y0) * (x1 - x0) / (y1 - y0) <= x)
-    inside += (x > -50) & (x < 70) & (y > -50) & (y < 10)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) * coverage.cell, (np.arange(rows) + 0.5) * coverage.cell)
+    inside = (x / 100 + y / 70 < 1).astype(int) + ((x > 20) & (x < 90) & (y > 10) & (y < 20))
     assert (coverage.count != inside).mean() < 1e-4
 
 
 def test_the_outline_keeps_holes_and_separate_parts():
     ring = (box((0, 0), (100, 30)), box((0, 70), (100, 100)), box((0, 0), (30, 100)), box((70, 0), (100, 100)))
-    outline = cover((*ring, box((150, 0), (200, 50)))).outline()
-    rings = [[part.exterior, *part.interiors] for part in outline.geoms]
-    areas = sorted([[signed_area(np.array(ring.coords)) for ring in rings_of] for rings_of in rings], key=len)
-    assert areas[0] == pytest.approx([2500], rel=0.02)
-    assert areas[1] == pytest.approx([10000, -1600], rel=0.02)
+    crossed = shapely.Polygon([(150, 0), (200, 50), (200, 0), (150, 50)])  # two triangles, by its crossing sides
+    small, large = sorted(unite((*ring, crossed, shapely.Polygon())).geoms, key=lambda part: part.area)[-2:]
+    assert small.area == pytest.approx(625)
+    assert large.area == pytest.approx(10000 - 1600)
+    assert [shapely.Polygon(inner).area for inner in large.interiors] == pytest.approx([1600])
+    assert large.exterior.is_ccw
 
 
 def test_footprints_end_on_a_slope_where_the_rays_meet_it():
@@ -146,7 +139,9 @@ def test_a_photograph_that_sees_no_ground_has_no_footprint():
     model = reconstruction(flight(), flat_ground(flight()))
     sky = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), -np.array([20.0, 20, ABOVE]))
     model.add_image_with_trivial_frame(pycolmap.Image("sky.JPG", np.zeros((0, 2)), 1, 500), sky)
-    found = measure(findings(reconstruction=model))
+    found = findings(reconstruction=model)
+    everyone = (*found.survey.photographs, replace(photograph(500, None), name="sky.JPG"))
+    found = measure(replace(found, survey=replace(found.survey, photographs=everyone)))
     lost = found.block.names.index("sky.JPG")
     assert found.footprints[lost].is_empty
     assert np.isnan(found.gsd[lost])
@@ -161,7 +156,7 @@ def test_a_model_in_any_frame_and_unit_has_the_same_shares_and_angles(flat):
     found = measure(findings(reconstruction=turned, georeference=located(None)))
     np.testing.assert_allclose(found.gsd, 0.1 * GSD, rtol=1e-6)
     np.testing.assert_allclose(found.height, 0.1 * ABOVE, rtol=1e-4)
-    np.testing.assert_allclose(found.overlap.forward, flat.overlap.forward, atol=2e-3)
+    np.testing.assert_allclose(found.forward_overlap, flat.forward_overlap, atol=2e-3)
     assert found.coverage.area(1) == pytest.approx(0.01 * flat.coverage.area(1), rel=0.01)
 
 

@@ -54,11 +54,10 @@ def prepare(options: Prepare, console: Console) -> None:
     """Run `tidefield prepare`."""
     import pycolmap
 
-    from tidefield.survey.findings import findings
     from tidefield.survey.io.photographs import read_survey
     from tidefield.survey.prepare import PrepareOptions
     from tidefield.survey.prepare import prepare as prepare_scene
-    from tidefield.survey.report import write_report
+    from tidefield.survey.report import collect_findings, write_report
     from tidefield.survey.sfm.features import FeatureOptions, choose_device
 
     if options.control is not None and options.no_control:
@@ -78,9 +77,9 @@ def prepare(options: Prepare, console: Console) -> None:
     )
     prepared = prepare_scene(survey, options.scene, how, choose_device(options.device), console)
     given = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
-    report = write_report(findings(prepared, options.scene, given), options.scene)
+    page = write_report(collect_findings(prepared, options.scene, given), options.scene)
     missing = len(survey.photographs) - len(prepared.models[0])
-    reasons = f"; why {missing} are missing, and more, is in {report.page}" if missing else f"; see {report.page}"
+    reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
     console.print(
         f"{options.scene}: {len(prepared.models[0])} of {len(survey.photographs)} photographs{reasons}",
         highlight=False,

@@ -68,20 +68,19 @@ def read_block(reconstruction: pycolmap.Reconstruction, level: bool) -> Block:
             f"the model has {len(images)} photographs and {reconstruction.num_points3D()} points: expected at least "
             "one of both; estimate the poses again"
         )
-    lenses = sorted({image.camera_id for image in images})
+    lenses, lens = np.unique([image.camera_id for image in images], return_inverse=True)
     point_index = {key: i for i, key in enumerate(reconstruction.points3D)}
     seen = [image.get_observation_points2D() for image in images]
-    poses = [image.cam_from_world() for image in images]
-    rotation = np.stack([pose.rotation.matrix().T for pose in poses])
-    position = -np.einsum("nij,nj->ni", rotation, np.stack([pose.translation for pose in poses]))
+    rotation = np.stack([image.cam_from_world().rotation.matrix().T for image in images])
+    position = np.stack([image.projection_center() for image in images])
     points = np.array([point.xyz for point in reconstruction.points3D.values()])
     if level:
         turn, middle = _levelling(points, position)
         points, position, rotation = (points - middle) @ turn.T, (position - middle) @ turn.T, turn @ rotation
     return Block(
         names=tuple(image.name for image in images),
-        cameras=tuple(reconstruction.cameras[key] for key in lenses),
-        lens=np.array([lenses.index(image.camera_id) for image in images]),
+        cameras=tuple(reconstruction.cameras[key] for key in lenses.tolist()),
+        lens=lens,
         position=position,
         R_world_camera=rotation,
         detected=np.array([len(image.points2D) for image in images]),

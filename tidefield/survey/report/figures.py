@@ -9,20 +9,26 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
+import matplotlib
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Real
 from markupsafe import Markup
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.markers import MarkerStyle
+from matplotlib.patches import Circle
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.transforms import Affine2D
 
-from tidefield.geometry.geodesy import parse_crs
+from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.survey.report.findings import Comparison, Findings
 from tidefield.survey.report.numbers import CLASSES, crs_title
 from tidefield.survey.report.statistics import Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # A separate hue for ground in a single photograph, then pale to dark: distinct for colour-blind readers too.
 COLOURS = ("#f2d5c4", "#f7f0cd", "#cfe6c4", "#97cfbd", "#52a7b5", "#2c7199", "#1d3d68")
@@ -38,165 +44,17 @@ NARROWEST = 0.45  # of the longer side: a single strip still has a map with room
 ARROWS = 14
 LONG_PAUSE = 5.0  # times the usual time between photographs: the flight's line is broken there
 
-Points = dict[str, Float64[np.ndarray, " 2"]]
-"""x and y in the world, by name."""
+XY = Float64[np.ndarray, " 2"]
+"""x and y in the world."""
 Affine = Float64[np.ndarray, "2 3"]
 Tooltips = dict[str, list[str]]
 """By id of an artist (`set_gid`): a text for each of its markers, or one for the whole."""
 
-
-def spaced(value: float | int, digits: int = 0) -> str:
-    """Format a number with narrow spaces between its thousands and a true minus."""
-    return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "\u2212")
-
-
-def draw_map(findings: Findings, statistics: Statistics) -> Markup:
-    """Draw coverage, footprints, flight, cameras and surveyed points, north up, in the products' coordinates."""
-    coverage, position = statistics.coverage, statistics.block.position[:, :2]
-    corners = np.stack([coverage.corner, coverage.far_corner])
-    lost, surveyed = _lost_cameras(findings, corners), findings.control_points()
-    low, high = _extent(np.concatenate([corners, position]), [*lost.values(), *(p[:2] for p in surveyed.values())])
-    size = (high - low) * min(WIDEST / (high - low)[0], HIGHEST / (high - low)[1])
-    width, height = LEFT + size[0] + RIGHT, TOP + size[1] + BOTTOM
-
-    def draw(figure: Figure) -> Tooltips:
-        axes = figure.add_axes((LEFT / width, BOTTOM / height, size[0] / width, size[1] / height))
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor="#fafbfb")
-        _draw_coverage(axes, statistics)
-        _draw_grid(axes, findings, low, high)
-        tooltips = _draw_survey(axes, findings, statistics, lost)
-        margin = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height), facecolor="none")
-        margin.set_axis_off()
-        _draw_scale_bar(margin, float(high[0] - low[0]), size[0], "m" if findings.frame else "units")
-        if findings.frame:
-            _draw_north(margin, width - RIGHT - 26, height - TOP - 36)
-        axes.legend(
-            bbox_to_anchor=(LEFT / width, 44 / height),
-            bbox_transform=figure.transFigure,
-            loc="upper left",
-            ncols=3 if size[0] > 560 else 2,
-            frameon=False,
-            borderaxespad=0.2,
-            borderpad=0.2,
-        )
-        return tooltips
-
-    description = (
-        f"Survey location map: {len(position)} cameras, the line of the flight and the footprints of the photographs, "
-        "over the number of photographs that see each piece of ground."
-    )
-    return _render("map", (width, height), description, draw)
-
-
-def draw_bars(title: str, axis: str, counted: str, counts: list[int], edges: list[float], digits: int | None) -> Markup:
-    """Draw a histogram.
-
-    Args:
-        title: heading for screen readers.
-        axis: what is measured, with its unit.
-        counted: what a bar counts.
-        counts: heights of the bars.
-        edges: of the bars.
-        digits: decimals of the edges in tooltips; None for whole numbers with a bar each, at their middles.
-    """
-
-    def label(start: float, end: float) -> str:
-        return f"{(start + end) / 2:g}" if digits is None else f"{start:.{digits}f} to {end:.{digits}f}"
-
-    def draw(figure: Figure) -> Tooltips:
-        axes = figure.add_axes((0.155, 0.22, 0.825, 0.74))
-        axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=BAR, edgecolor="white", linewidth=0.8)
-        _style(axes, integers=digits is None)
-        axes.grid(axis="y", color=RULE)
-        axes.set(xlim=(edges[0], edges[-1]), xlabel=axis, ylabel=counted)
-        axes.spines[["left", "top", "right"]].set_visible(False)
-        tooltips: Tooltips = {}
-        for i, (bar, count, (start, end)) in enumerate(zip(axes.patches, counts, pairwise(edges), strict=True)):
-            bar.set_gid(f"bar {i}")
-            tooltips[f"bar {i}"] = [f"{label(start, end)}: {spaced(count)}"]
-        return tooltips
-
-    most = int(np.argmax(counts))
-    where = f"{'at' if digits is None else 'from'} {label(edges[most], edges[most + 1])}"
-    description = f"{title}. {spaced(sum(counts))} {counted}; most, {spaced(counts[most])}, {where}."
-    return _render(title, (340.0, 200.0), description, draw)
-
-
-def draw_histogram(
-    title: str, axis: str, counted: str, values: Float64[np.ndarray, " K"], digits: int
-) -> Markup | None:
-    """Draw the histogram of the finite values; None if there are fewer than two. Args as of `draw_bars`."""
-    known = values[np.isfinite(values)]
-    if len(known) < 2:
-        return None
-    low, high = np.percentile(known, [0.5, 99.5])
-    low, high = (low, high) if high - low > 1e-9 else (low - 0.5 * 10**-digits, low + 0.5 * 10**-digits)
-    counts, edges = np.histogram(np.clip(known, low, high), min(24, max(6, round(math.sqrt(len(known))))), (low, high))
-    return draw_bars(title, axis, counted, counts.tolist(), edges.tolist(), digits)
-
-
-def draw_residuals(comparison: Comparison) -> Markup | None:
-    """Draw residuals in plan, and their heights in a strip next to it; None if none are known."""
-    finite = np.isfinite(comparison.residuals.error_m).all(axis=1)
-    if not (finite & comparison.used).any():
-        return None
-    error_m, used = comparison.residuals.error_m[finite], comparison.used[finite]
-    names = np.array(comparison.residuals.names, dtype=object)[finite]
-    largest = max(float(np.abs(error_m[used]).max()), 1e-6)
-    step = _round_step(largest / 3)
-    reach = step * math.ceil(largest / step - 1e-9)
-    inside = error_m.clip(-1.03 * reach, 1.03 * reach)  # one that was not used may lie far outside
-
-    def draw(figure: Figure) -> Tooltips:
-        from matplotlib.patches import Circle
-
-        plan, strip = figure.add_axes((0.17, 0.18, 0.60, 0.78)), figure.add_axes((0.79, 0.18, 0.06, 0.78))
-        limits, ticks = (-1.08 * reach, 1.08 * reach), (-reach, 0, reach)
-        labels = [f"{value:g}".replace("-", "\u2212") for value in ticks]
-        for axes in (plan, strip):
-            axes.axhline(0, color=RULE)
-            axes.set(xlim=limits, ylim=limits)
-            axes.set_xticks(ticks, labels)
-            axes.set_yticks(ticks, labels)
-            axes.tick_params(length=0, labelcolor=SOFT)
-            axes.spines[:].set_color(RULE)
-        plan.axvline(0, color=RULE)
-        for i in range(1, round(reach / step) + 1):
-            plan.add_patch(Circle((0, 0), i * step, fill=False, color=RULE, linewidth=0.9))
-            strip.axhspan(-i * step, i * step, fill=False, color=RULE)
-        plan.set(xlabel=f"East (m); a ring every {step:g} m", ylabel="North (m)")
-        plan.yaxis.labelpad = -6
-        strip.yaxis.set_label_position("right")
-        strip.yaxis.tick_right()
-        strip.set(xticks=[], xlim=(-1, 1), ylabel="Up (m)")
-        for keep, gid, style in (
-            (used, "used", {"marker": "o", "color": DOT, "alpha": 0.7, "markersize": 4.6, "markeredgewidth": 0}),
-            (~used, "unused", {"marker": "x", "color": LOST, "markersize": 5.5, "markeredgewidth": 1.4}),
-        ):
-            for axes, x, y in ((plan, inside[:, 0], inside[:, 1]), (strip, np.zeros(len(inside)), inside[:, 2])):
-                axes.plot(x[keep], y[keep], linestyle="", gid=gid, **style)
-        return {"used": [*names[used]], "unused": [f"{name}: not used" for name in names[~used]]}
-
-    longest = float(np.hypot(*error_m[used, :2].T).max())
-    description = f"{comparison.title}. Residuals in plan, the largest {longest:.3f} m long, and their heights."
-    return _render(comparison.title, (320.0, 246.0), description, draw)
-
-
-def _render(name: str, size: tuple[float, float], description: str, draw: Callable[[Figure], Tooltips]) -> Markup:
-    """Render a figure to an SVG element that shares a page with others; its text stays text.
-
-    Args:
-        name: what the ids in it are made from; unique in the page.
-        size: width and height in units of the SVG.
-        description: for screen readers.
-        draw: draws into the figure, and returns its tooltips.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    settings: dict[Any, Any] = {
+# From matplotlib's defaults, whatever the user's matplotlibrc says.
+STYLE: list[Any] = [
+    "default",
+    {
         "svg.fonttype": "none",
-        "svg.hashsalt": name,
         "font.size": 10.5,
         "text.color": INK,
         "text.parse_math": False,  # names may hold dollar signs
@@ -208,26 +66,166 @@ def _render(name: str, size: tuple[float, float], description: str, draw: Callab
         "ytick.labelsize": 10,
         "legend.fontsize": 10.5,
         "lines.linewidth": 0.9,
-    }
+    },
+]
+
+
+def spaced(value: float | int, digits: int = 0) -> str:
+    """Format a number with narrow spaces between its thousands and a true minus."""
+    return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "\u2212")
+
+
+@style.context(STYLE)
+def draw_map(findings: Findings, statistics: Statistics) -> Markup:
+    """Draw coverage, footprints, flight, cameras and surveyed points, north up, in the products' coordinates."""
+    coverage, position = statistics.coverage, statistics.block.position[:, :2]
+    corners = np.stack([coverage.corner, coverage.far_corner])
+    lost = _lost_cameras(findings, corners)
+    surveyed = {name: place[:2] for name, place in findings.control_points().items()}
+    low, high = _extent(np.concatenate([corners, position]), [*lost.values(), *surveyed.values()])
+    size = (high - low) * min(WIDEST / (high - low)[0], HIGHEST / (high - low)[1])
+    width, height = LEFT + size[0] + RIGHT, TOP + size[1] + BOTTOM
+    figure = _figure(width, height)
+    axes = figure.add_axes((LEFT / width, BOTTOM / height, size[0] / width, size[1] / height))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor="#fafbfb")
+    _draw_coverage(axes, statistics)
+    _draw_grid(axes, findings.frame, low, high)
+    tooltips = _draw_survey(axes, findings, statistics, lost, surveyed)
+    margin = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height), facecolor="none")
+    margin.set_axis_off()
+    _draw_scale_bar(margin, float(high[0] - low[0]), size[0], "m" if findings.frame else "units")
+    if findings.frame:
+        _draw_north(margin, width - RIGHT - 26, height - TOP - 36)
+    axes.legend(
+        bbox_to_anchor=(LEFT / width, 44 / height),
+        bbox_transform=figure.transFigure,
+        loc="upper left",
+        ncols=3 if size[0] > 560 else 2,
+        frameon=False,
+        borderaxespad=0.2,
+        borderpad=0.2,
+    )
+    description = (
+        f"Survey location map: {len(position)} cameras, the line of the flight and the footprints of the photographs, "
+        "over the number of photographs that see each piece of ground."
+    )
+    return _embedded(figure, "map", "map", description, tooltips)
+
+
+@style.context(STYLE)
+def draw_histogram(
+    title: str, axis: str, counted: str, values: Real[np.ndarray, " K"], digits: int | None
+) -> Markup | None:
+    """Draw the histogram of the finite values; None if there are fewer than two.
+
+    Args:
+        title: heading for screen readers.
+        axis: what is measured, with its unit.
+        counted: what a bar counts.
+        values: what is measured.
+        digits: decimals in tooltips; None for whole numbers from 2, with a bar each.
+    """
+    known = values[np.isfinite(values)]
+    if len(known) < 2:
+        return None
+    if digits is None:
+        edges = np.arange(2, max(int(known.max()), 3) + 2) - 0.5
+        labels = [f"{value:g}" for value in edges[:-1] + 0.5]
+    else:
+        low, high = np.percentile(known, [0.5, 99.5])
+        low, high = (low, high) if high - low > 1e-9 else (low - 0.5 * 10**-digits, low + 0.5 * 10**-digits)
+        edges = np.linspace(low, high, min(24, max(6, round(math.sqrt(len(known))))) + 1)
+        labels = [f"{start:.{digits}f} to {end:.{digits}f}" for start, end in pairwise(edges)]
+    counts = np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].tolist()
+    figure = _figure(340.0, 200.0)
+    axes = figure.add_axes((0.155, 0.22, 0.825, 0.74))
+    axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=BAR, edgecolor="white", linewidth=0.8)
+    steps = [1, 2, 5, 10]
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=steps, integer=digits is None))
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=steps, integer=True))
+    axes.ticklabel_format(axis="x", useOffset=False)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace(",", "\u202f")))
+    axes.tick_params(length=0, labelcolor=SOFT)
+    axes.grid(axis="y", color=RULE)
+    axes.set(xlim=(edges[0], edges[-1]), xlabel=axis, ylabel=counted)
+    axes.spines[["left", "top", "right"]].set_visible(False)
+    tooltips: Tooltips = {}
+    for bar, count, label in zip(axes.patches, counts, labels, strict=True):
+        bar.set_gid(f"bar {len(tooltips)}")
+        tooltips[f"bar {len(tooltips)}"] = [f"{label}: {spaced(count)}"]
+    most = int(np.argmax(counts))
+    where = f"{'at' if digits is None else 'from'} {labels[most]}"
+    description = f"{title}. {spaced(sum(counts))} {counted}; most, {spaced(counts[most])}, {where}."
+    return _embedded(figure, "chart", title, description, tooltips)
+
+
+@style.context(STYLE)
+def draw_residuals(comparison: Comparison) -> Markup | None:
+    """Draw residuals in plan, and their heights in a strip next to it; None if none are known."""
+    finite = comparison.residuals.known
+    if not (finite & comparison.used).any():
+        return None
+    error_m, used = comparison.residuals.error_m[finite], comparison.used[finite]
+    names = np.array(comparison.residuals.names, dtype=object)[finite]
+    largest = max(float(np.abs(error_m[used]).max()), 1e-6)
+    step = _round_step(largest / 3)
+    reach = step * math.ceil(largest / step - 1e-9)
+    inside = error_m.clip(-1.03 * reach, 1.03 * reach)  # one that was not used may lie far outside
+    figure = _figure(320.0, 246.0)
+    plan, strip = figure.add_axes((0.17, 0.18, 0.60, 0.78)), figure.add_axes((0.79, 0.18, 0.06, 0.78))
+    limits, ticks = (-1.08 * reach, 1.08 * reach), (-reach, 0, reach)
+    labels = [f"{value:g}".replace("-", "\u2212") for value in ticks]
+    for axes in (plan, strip):
+        axes.axhline(0, color=RULE)
+        axes.set(xlim=limits, ylim=limits)
+        axes.set_xticks(ticks, labels)
+        axes.set_yticks(ticks, labels)
+        axes.tick_params(length=0, labelcolor=SOFT)
+        axes.spines[:].set_color(RULE)
+    plan.axvline(0, color=RULE)
+    for i in range(1, round(reach / step) + 1):
+        plan.add_patch(Circle((0, 0), i * step, fill=False, color=RULE, linewidth=0.9))
+        strip.axhspan(-i * step, i * step, fill=False, color=RULE)
+    plan.set(xlabel=f"East (m); a ring every {step:g} m", ylabel="North (m)")
+    plan.yaxis.labelpad = -6
+    strip.yaxis.set_label_position("right")
+    strip.yaxis.tick_right()
+    strip.set(xticks=[], xlim=(-1, 1), ylabel="Up (m)")
+    for keep, gid, marker in (
+        (used, "used", {"marker": "o", "color": DOT, "alpha": 0.7, "markersize": 4.6, "markeredgewidth": 0}),
+        (~used, "unused", {"marker": "x", "color": LOST, "markersize": 5.5, "markeredgewidth": 1.4}),
+    ):
+        plan.plot(inside[keep, 0], inside[keep, 1], linestyle="", gid=gid, **marker)
+        strip.plot(np.zeros(keep.sum()), inside[keep, 2], linestyle="", gid=gid, **marker)
+    longest = float(np.hypot(*error_m[used, :2].T).max())
+    description = f"{comparison.title}. Residuals in plan, the largest {longest:.3f} m long, and their heights."
+    tooltips = {"used": [*names[used]], "unused": [f"{name}: not used" for name in names[~used]]}
+    return _embedded(figure, "chart", comparison.title, description, tooltips)
+
+
+def _figure(width: float, height: float) -> Figure:
+    """Make a figure of a size in units of the SVG."""
+    return Figure(figsize=(width / 72, height / 72), facecolor="none")
+
+
+def _embedded(figure: Figure, kind: str, name: str, description: str, tooltips: Tooltips) -> Markup:
+    """Render a figure to an SVG element that shares a page with others; its text stays text.
+
+    Args:
+        kind: class of the element.
+        name: what the ids in it are made from; unique in the page.
+        description: for screen readers.
+        tooltips: of the markers.
+    """
+    matplotlib.rcParams["svg.hashsalt"] = name
     buffer = io.StringIO()
-    with matplotlib.rc_context(), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # the browser has other fonts
-        matplotlib.rcdefaults()  # no matplotlibrc of the user's
-        matplotlib.rcParams.update(settings)
-        figure = Figure(figsize=(size[0] / 72, size[1] / 72), facecolor="none")
-        tooltips = draw(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return _embedded(buffer.getvalue(), "map" if name == "map" else "chart", description, tooltips)
-
-
-def _embedded(svg: str, kind: str, description: str, tooltips: Tooltips) -> Markup:
-    """Turn an SVG file into an HTML element: no namespaces, metadata, styles or ids of groups; with tooltips."""
-    root = ET.fromstring(svg)
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag.rpartition("}")[2] in ("metadata", "style"):
-                parent.remove(child)
-    for element in list(root.iter()):
+    root = ET.fromstring(buffer.getvalue())
+    for element in list(root.iter()):  # no metadata and styles, no namespaces, no spaces between elements
+        for child in [child for child in element if child.tag.endswith(("}metadata", "}style"))]:
+            element.remove(child)
         element.tag = element.tag.rpartition("}")[2]
         element.attrib = {key.rpartition("}")[2]: value for key, value in element.attrib.items()}
         element.tail = element.text = None if element.tag != "text" else element.text
@@ -246,21 +244,7 @@ def _embedded(svg: str, kind: str, description: str, tooltips: Tooltips) -> Mark
     return Markup(ET.tostring(root, encoding="unicode"))  # ElementTree has escaped every name
 
 
-def _style(axes: Axes, integers: bool) -> None:
-    """Set few, round ticks with spaced thousands."""
-    from matplotlib.ticker import FuncFormatter, MaxNLocator
-
-    steps = [1, 2, 5, 10]
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=steps, integer=integers))
-    axes.yaxis.set_major_locator(MaxNLocator(4, steps=steps, integer=True))
-    axes.ticklabel_format(axis="x", useOffset=False)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace(",", "\u202f")))
-    axes.tick_params(length=0, labelcolor=SOFT)
-
-
-def _extent(
-    drawn: Float64[np.ndarray, "K 2"], others: list[Float64[np.ndarray, " 2"]]
-) -> tuple[Float64[np.ndarray, " 2"], Float64[np.ndarray, " 2"]]:
+def _extent(drawn: Float64[np.ndarray, "K 2"], others: list[XY]) -> tuple[XY, XY]:
     """Return the map's corners: what must be drawn, and of the others those that are not far away."""
     low, high = drawn.min(0), drawn.max(0)
     points = np.array(others, dtype=np.float64).reshape(-1, 2)
@@ -274,16 +258,12 @@ def _extent(
 
 
 def _draw_coverage(axes: Axes, statistics: Statistics) -> None:
-    from matplotlib.colors import ListedColormap
-
     coverage = statistics.coverage
-    kinds = np.searchsorted([least for least, _ in CLASSES], coverage.count, side="right")
     (west, south), (east, north) = coverage.corner, coverage.far_corner
     axes.imshow(
-        np.ma.masked_equal(kinds, 0),
+        np.ma.masked_equal(coverage.count, 0),
         ListedColormap(COLOURS),
-        vmin=0.5,
-        vmax=len(COLOURS) + 0.5,
+        BoundaryNorm([*(least for least, _ in CLASSES), np.iinfo(np.uint16).max], len(COLOURS)),
         origin="lower",
         extent=(west, east, south, north),
         aspect="auto",
@@ -291,66 +271,61 @@ def _draw_coverage(axes: Axes, statistics: Statistics) -> None:
     )
     rings = [np.array([*outline.exterior.coords, (np.nan, np.nan)]) for outline in statistics.footprints if outline]
     if rings:
-        style = {"color": INK, "alpha": 0.32, "linewidth": 0.5, "zorder": 1}
-        axes.plot(*np.concatenate(rings).T, **style, label="footprint of a photograph")
+        line = {"color": INK, "alpha": 0.32, "linewidth": 0.5, "zorder": 1}
+        axes.plot(*np.concatenate(rings).T, **line, label="footprint of a photograph")
 
 
-def _draw_survey(axes: Axes, findings: Findings, statistics: Statistics, lost: Points) -> Tooltips:
+def _draw_survey(
+    axes: Axes, findings: Findings, statistics: Statistics, lost: dict[str, XY], surveyed: dict[str, XY]
+) -> Tooltips:
     """Draw flight, cameras, photographs that are not in the model and surveyed points."""
     order, position = statistics.order, statistics.block.position[:, :2]
     tooltips: Tooltips = {}
-    timed = all(p is not None and math.isfinite(p.time_s) for p in statistics.photographs)
-    _draw_flight(axes, statistics, f"flight, in order of {'time' if timed else 'name'}")
+    _draw_flight(axes, statistics)
     dot = float(np.clip(6.8 * math.sqrt(150 / len(position)), 2.2, 6.8))
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
 
-    def markers(gid: str, points: Points, label: str, suffix: str = "", named: bool = False, **style) -> None:
-        (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    def markers(gid: str, points: dict[str, XY], label: str, suffix: str = "", **marker) -> dict[str, XY]:
+        """Draw those points that lie in the frame, and return them."""
         shown = {name: (x, y) for name, (x, y) in points.items() if west <= x <= east and south <= y <= north}
-        if not shown:
-            return
-        axes.plot(*np.array([*shown.values()]).T, linestyle="", gid=gid, label=label, **style)
-        tooltips[gid] = [name + suffix for name in shown]
-        for name, place in shown.items() if named else ():
-            _annotate(axes, name, place)
+        if shown:
+            axes.plot(*np.array([*shown.values()]).T, linestyle="", gid=gid, label=label, **marker)
+            tooltips[gid] = [name + suffix for name in shown]
+        return {name: points[name] for name in shown}
 
-    white: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": INK}
     markers("lost", lost, "photograph not in the model, by its GPS", ": not in the model", marker="x", color=LOST)
+    white: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": INK}
     cameras = dict(zip(statistics.block.names, position, strict=True))
     markers("cameras", cameras, "camera", marker="o", markersize=dot, markeredgewidth=1.0, **white)
     for i, name in ((order[0], "first"), (order[-1], "last")):
         axes.plot(*position[i], "o", markersize=dot + 5, markerfacecolor="none", markeredgecolor=INK)
         _annotate(axes, name, position[i], above=True)
-    surveyed = {name: place[:2] for name, place in findings.control_points().items()}
     fitted = {name for c in findings.comparisons() if c.kind == "control" for name in c.residuals.names}
-    control = {name: place for name, place in surveyed.items() if name in fitted}
-    check = {name: place for name, place in surveyed.items() if name not in fitted}
     triangle: dict[str, Any] = {"marker": "^", "markersize": 9, "color": CONTROL, "markeredgecolor": "white"}
     diamond: dict[str, Any] = {"marker": "D", "markersize": 7, "color": CHECK, "markeredgecolor": INK}
-    markers("control", control, "control point", "", True, **triangle)
-    markers("check", check, "check point", "", True, **diamond)
+    for kind, is_fitted, marker in (("control", True, triangle), ("check", False, diamond)):
+        points = {name: place for name, place in surveyed.items() if (name in fitted) == is_fitted}
+        for name, place in markers(kind, points, f"{kind} point", **marker).items():
+            _annotate(axes, name, place)
     return tooltips
 
 
-def _annotate(
-    axes: Axes, text: str, place: tuple[float, float] | Float64[np.ndarray, " 2"], above: bool = False
-) -> None:
+def _annotate(axes: Axes, text: str, place: XY, above: bool = False) -> None:
     """Write a label to the right of a point, or above it; the page's style sheet gives it its halo."""
     printable = "".join(c if c.isprintable() else "\ufffd" for c in text)  # XML has no control characters
-    style: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"va": "center"}
-    style |= {"fontsize": 10, "fontweight": "bold", "gid": "label", "clip_on": True, "zorder": 1.9}
-    axes.annotate(printable, tuple(place), (0, 6) if above else (8, 0), textcoords="offset points", **style)
+    font: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"va": "center"}
+    font |= {"fontsize": 10, "fontweight": "bold", "gid": "label", "clip_on": True, "zorder": 1.9}
+    axes.annotate(printable, tuple(place), (0, 6) if above else (8, 0), textcoords="offset points", **font)
 
 
-def _draw_flight(axes: Axes, statistics: Statistics, label: str) -> None:
+def _draw_flight(axes: Axes, statistics: Statistics) -> None:
     """Draw lines through the cameras in the order of the flight, broken at long pauses, and arrows along them."""
-    from matplotlib.markers import MarkerStyle
-    from matplotlib.transforms import Affine2D
-
     order, position = statistics.order, statistics.block.position[:, :2]
-    times = np.array([math.nan if p is None else p.time_s for p in statistics.photographs])[order]
-    pause = np.diff(times)
-    long = np.flatnonzero(pause > LONG_PAUSE * np.median(pause)) if np.isfinite(pause).all() and len(pause) else []
-    parts = [position[part] for part in np.split(order, np.array(long, dtype=int) + 1)]
+    pause = np.diff(np.array([photograph.time_s for photograph in statistics.photographs])[order])
+    timed = bool(np.isfinite(pause).all())
+    label = f"flight, in order of {'time' if timed else 'name'}"
+    breaks = np.flatnonzero(pause > LONG_PAUSE * np.median(pause)) + 1 if timed and len(pause) else []
+    parts = [position[part] for part in np.split(order, breaks)]
     for part in parts:
         axes.plot(*part.T, color="white", alpha=0.75, linewidth=3, zorder=1.8)
         axes.plot(*part.T, color=INK, linewidth=1.1, zorder=1.8, label=label if part is parts[0] else "_")
@@ -361,45 +336,36 @@ def _draw_flight(axes: Axes, statistics: Statistics, label: str) -> None:
         axes.plot(*(start + end) / 2, marker=arrow, markersize=9, color=INK, markeredgecolor="white", zorder=1.8)
 
 
-def _draw_grid(axes: Axes, findings: Findings, low: Float64[np.ndarray, " 2"], high: Float64[np.ndarray, " 2"]) -> None:
+def _draw_grid(axes: Axes, frame: LocalFrame | None, low: XY, high: XY) -> None:
     """Draw lines of equal easting and northing, and ticks of longitude (above) and latitude (on the right).
 
     Over so little of the Earth, both are affine in x and y to less than a line's width.
     """
-    frame = findings.frame
     grid = affine(low, high, frame.to_crs) if frame else np.eye(2, 3)
     geographic = affine(low, high, frame.to_geographic) if frame else None
-    units_per_length = axes.bbox.width / float(high[0] - low[0])
+    label_half = LABEL_HALF * float(high[0] - low[0]) / axes.bbox.width
 
-    def labelled(places: Float64[np.ndarray, " K"], labels: list[str], axis: int) -> tuple[np.ndarray, list[str]]:
-        """Ticks inside the frame; those near a corner lose their labels."""
+    def label(where: Axis, axis: int, places: Float64[np.ndarray, " K"], labels: list[str]) -> None:
+        """Set ticks inside the frame; those near a corner have no label."""
         gap = np.minimum(places - low[axis], high[axis] - places)
-        texts = [label if room > LABEL_HALF / units_per_length else "" for label, room in zip(labels, gap, strict=True)]
-        return places[gap >= 0], [text for text, room in zip(texts, gap, strict=True) if room >= 0]
+        texts = [text if room > label_half else "" for text, room in zip(labels, gap, strict=True) if room >= 0]
+        where.set_ticks(places[gap >= 0], labels=texts, **({"rotation": 90, "va": "center"} if axis else {}))
 
-    names: tuple[Literal["x", "y"], ...] = ("x", "y")
-    for axis, name in enumerate(names):
+    for axis, where in enumerate((axes.xaxis, axes.yaxis)):
         values, digits = coordinates(grid, low, high, axis, 6)
         near, far = (crossings(grid, axis, values, float(edge[1 - axis])) for edge in (low, high))
         for start, end in zip(near, far, strict=True):
             line = [(start, end), (low[1 - axis], high[1 - axis])]
             axes.plot(*(line if axis == 0 else line[::-1]), color=INK, alpha=0.28, linewidth=0.6, zorder=1)
-        places, texts = labelled(near, [spaced(value, digits) for value in values], axis)
-        axes.tick_params(axis=name, length=4, color=INK, pad=2, labelcolor=INK)
-        (axes.set_xticks if axis == 0 else axes.set_yticks)(places, texts)
+        where.set_tick_params(length=4, color=INK, pad=2, labelcolor=INK)
+        label(where, axis, near, [spaced(value, digits) for value in values])
         if geographic is None:
             continue
         values, digits = coordinates(geographic, low, high, axis, 4)
         texts = [f"{abs(value):.{digits}f}° {('EW', 'NS')[axis][bool(value < 0)]}" for value in values]
-        places, texts = labelled(crossings(geographic, axis, values, float(high[1 - axis])), texts, axis)
-        other = axes.secondary_xaxis("top") if axis == 0 else axes.secondary_yaxis("right")
-        (other.set_xticks if axis == 0 else other.set_yticks)(places, texts)
-        other.tick_params(length=4, color=INK, pad=2, labelcolor=INK)
-        if axis == 1:
-            other.tick_params(labelrotation=90)
-            _centre(other)
-    axes.tick_params(axis="y", labelrotation=90)
-    _centre(axes)
+        other = axes.secondary_yaxis("right").yaxis if axis else axes.secondary_xaxis("top").xaxis
+        other.set_tick_params(length=4, color=INK, pad=2, labelcolor=INK)
+        label(other, axis, crossings(geographic, axis, values, float(high[1 - axis])), texts)
     if frame is None:
         axes.set(xlabel="x (model units)", ylabel="y (model units)")
     else:
@@ -407,15 +373,7 @@ def _draw_grid(axes: Axes, findings: Findings, low: Float64[np.ndarray, " 2"], h
         axes.set(xlabel=f"Easting ({unit}), {crs_title(frame)}", ylabel=f"Northing ({unit})")
 
 
-def _centre(axes) -> None:
-    """Centre turned labels of a y axis on their ticks."""
-    for text in axes.get_yticklabels():
-        text.set_verticalalignment("center")
-
-
-def affine(
-    low: Float64[np.ndarray, " 2"], high: Float64[np.ndarray, " 2"], transform: Callable[[np.ndarray], np.ndarray]
-) -> Affine:
+def affine(low: XY, high: XY, transform: Callable[[np.ndarray], np.ndarray]) -> Affine:
     """Fit the matrix that takes (x, y, 1) between two corners of the world to `transform`'s first two coordinates."""
     x, y = np.meshgrid(*np.linspace(low, high, 3).T)
     design = np.stack([x.ravel(), y.ravel(), np.ones(9)], 1)
@@ -423,9 +381,7 @@ def affine(
     return np.linalg.lstsq(design, there, rcond=None)[0].T
 
 
-def coordinates(
-    matrix: Affine, low: Float64[np.ndarray, " 2"], high: Float64[np.ndarray, " 2"], axis: int, number: int
-) -> tuple[Float64[np.ndarray, " K"], int]:
+def coordinates(matrix: Affine, low: XY, high: XY, axis: int, number: int) -> tuple[Float64[np.ndarray, " K"], int]:
     """Choose about `number` round values of a coordinate between two corners of the world, and their decimals."""
     corners = np.array([(x, y, 1) for x in (low[0], high[0]) for y in (low[1], high[1])]) @ matrix[axis]
     step = _round_step(float(np.ptp(corners)) / (number + 0.5))
@@ -444,7 +400,7 @@ def _round_step(least: float) -> float:
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= least * (1 - 1e-9))
 
 
-def _lost_cameras(findings: Findings, corners: Float64[np.ndarray, "2 2"]) -> Points:
+def _lost_cameras(findings: Findings, corners: Float64[np.ndarray, "2 2"]) -> dict[str, XY]:
     """Where photographs that are not in the model were taken, as far as known."""
     if findings.frame is None:
         return {}
@@ -463,8 +419,8 @@ def _draw_scale_bar(margin: Axes, extent: float, width: float, unit: str) -> Non
     """Draw a bar of four parts below the map, as long as a fifth to two fifths of it."""
     length = _round_step(extent / 5)
     part, y = length / extent * width / 4, 52.0
-    for i in range(4):
-        margin.barh(y, part, 5, LEFT + i * part, color=(INK, "white")[i % 2], edgecolor=INK, linewidth=0.9)
+    starts, colours = LEFT + part * np.arange(4), [INK, "white"] * 2
+    margin.barh(np.full(4, y), part, 5, starts, color=colours, edgecolor=INK, linewidth=0.9)
     kilometres = unit == "m" and length >= 1000
     for share in (0, 0.5, 1):
         value = f"{share * length / (1000 if kilometres else 1):g}"
@@ -475,7 +431,6 @@ def _draw_scale_bar(margin: Axes, extent: float, width: float, unit: str) -> Non
 def _draw_north(margin: Axes, x: float, y: float) -> None:
     margin.plot(x, y, "o", markersize=50, color="white", alpha=0.85, markeredgewidth=0, zorder=0)
     for side, colour in ((-1, INK), (1, "white")):
-        margin.fill(
-            x + np.array([0, side * 6.5, 0]), y + np.array([13, -13, -8]), facecolor=colour, edgecolor=INK, lw=1
-        )
+        xs, ys = x + np.array([0, side * 6.5, 0]), y + np.array([13, -13, -8])
+        margin.fill(xs, ys, facecolor=colour, edgecolor=INK, lw=1)
     margin.text(x, y + 15, "N", ha="center", va="bottom", fontsize=11, fontweight="bold", gid="label")

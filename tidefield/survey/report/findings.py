@@ -1,18 +1,35 @@
-"""Hold what the pipeline found: the input of the report, plain values that the stages fill in."""
+"""Collect what the pipeline found: the input of the report."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from datetime import datetime
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, UInt8
 
+from tidefield import __version__
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.survey.colour import ExposureCorrection
+from tidefield.survey.io.image_decoding import thumbnail
+from tidefield.survey.prepare import Prepared
+from tidefield.survey.sfm.features import decode_name
+from tidefield.survey.sfm.mapping import lens_notes
 from tidefield.survey.survey import Survey
+
+MOST_THUMBNAILS = 24  # of each stage
+THUMBNAIL_PX = 160
+EXAMPLES = 3  # photographs that are shown before and after the colour correction
+EXAMPLE_PX = 200
+
+Picture = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -21,53 +38,17 @@ class UnusedPhotograph:
 
     Attributes:
         name: `Photograph.name`.
-        stage: where it was left out: not readable, rejected for its quality, or not registered.
+        stage: where it was left out: rejected for its quality, or not registered.
         reason: in words, with the measure and its limit where there is one.
         measures: by name, for report.json.
         thumbnail: a small upright copy, or None.
     """
 
     name: str
-    stage: Literal["reading", "quality", "poses"]
+    stage: Literal["quality", "poses"]
     reason: str
     measures: dict[str, float] = field(default_factory=dict)
-    thumbnail: UInt8[np.ndarray, "h w 3"] | None = None
-
-
-@dataclass(frozen=True)
-class Change:
-    """A measure before and after the colour correction."""
-
-    what: str
-    before: float
-    after: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class ColourExample:
-    """One photograph before and after the colour correction, small."""
-
-    name: str
-    before: UInt8[np.ndarray, "h w 3"]
-    after: UInt8[np.ndarray, "h w 3"]
-
-
-@dataclass(frozen=True)
-class ColourCorrection:
-    """What the colour correction did.
-
-    Attributes:
-        applied: whether the scene's photographs were corrected.
-        verdict: a sentence with the reason.
-        changes: measures before and after.
-        examples: photographs before and after, the most changed first.
-    """
-
-    applied: bool
-    verdict: str
-    changes: tuple[Change, ...]
-    examples: tuple[ColourExample, ...] = ()
+    thumbnail: Picture | None = None
 
 
 @dataclass(frozen=True)
@@ -96,13 +77,14 @@ class Findings:
     Attributes:
         title: name of the survey.
         date: when the scene was made.
-        survey: what was read; may hold photographs that are not in the model.
+        survey: what was read; holds photographs that are not in the model, too.
         reconstruction: the model, image names as `Photograph.name`; in the world (z up, metres) where it has a frame,
             else in any frame and unit.
         georeference: position of the world on the Earth, and its accuracy.
         left_out: photographs that are not in the model.
         models: number of photographs of each model that was found; the reconstruction is the first.
-        colour: what the colour correction did, or None if it was not tried.
+        colour: the colour correction, or None if it was not tried, or could not be measured.
+        examples: name and small pictures before and after the correction, the most changed first.
         seconds: wall time by stage, in order.
         options: of the command, as text.
         versions: of the programs.
@@ -116,7 +98,8 @@ class Findings:
     georeference: Georeference
     left_out: tuple[UnusedPhotograph, ...] = ()
     models: tuple[int, ...] = ()
-    colour: ColourCorrection | None = None
+    colour: ExposureCorrection | None = None
+    examples: tuple[tuple[str, Picture, Picture], ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
@@ -142,7 +125,7 @@ class Findings:
         rejected = {item.name: f"{item.name}: {item.reason}" for item in located.left_out if item.kind == "GPS"}
         trusted = np.array([name not in rejected for name in located.gps.names], dtype=bool)
         found = [Comparison("gps", "GPS of the cameras", located.gps, trusted, tuple(rejected.values()))]
-        if located.source == "ground control" and self.survey.control is not None and located.frame is not None:
+        if located.source == "ground control":
             marks = tuple(f"{item.name}: {item.reason}" for item in located.left_out if item.kind != "GPS")
             check = "Control points, each left out in turn"
             found += [
@@ -156,7 +139,99 @@ class Findings:
         names = [name for c in self.comparisons() if c.kind != "gps" for name in c.residuals.names]
         if not names:
             return {}
-        assert self.survey.control is not None, "comparisons() lists points of a control file only"
-        assert self.frame is not None, "comparisons() lists located points only"
+        assert self.survey.control is not None, "the model was fitted to a control file"
+        assert self.frame is not None, "ground control gives a frame"
         given = np.array([self.survey.control.points[name] for name in names], dtype=np.float64)
         return dict(zip(names, self.frame.from_system(self.survey.control.crs, given), strict=True))
+
+
+def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]) -> Findings:
+    """Collect everything that the report of a prepared scene describes."""
+    correction = prepared.correction
+    if correction is not None and math.isnan(correction.before):
+        correction = None
+    return Findings(
+        title=prepared.survey.folder.resolve().name,
+        date=datetime.now(UTC),
+        survey=prepared.survey,
+        reconstruction=pycolmap.Reconstruction(scene / "sparse" / "0"),
+        georeference=prepared.georeference,
+        left_out=(*_rejected(prepared), *_unregistered(prepared, scene)),
+        models=tuple(len(names) for names in prepared.models),
+        colour=correction,
+        examples=_examples(prepared, scene, correction) if correction and correction.helps else (),
+        seconds=prepared.seconds,
+        options=dict(options),
+        versions={
+            "tidefield": __version__,
+            "pycolmap": pycolmap.__version__,
+            "Python": platform.python_version(),
+        },
+        remarks=(*prepared.georeference.notes, *lens_notes(prepared.lens), *prepared.survey.remarks),
+    )
+
+
+def _rejected(prepared: Prepared) -> list[UnusedPhotograph]:
+    by_name = {photograph.name: photograph for photograph in prepared.survey.photographs}
+    found = []
+    for verdict in prepared.verdicts:
+        if not verdict.left_out or verdict.name in prepared.used:
+            continue
+        measures = {} if verdict.measures is None else vars(verdict.measures)
+        finite = {name: value for name, value in measures.items() if math.isfinite(value)}
+        shown = verdict.measures is not None and len(found) < MOST_THUMBNAILS
+        picture = thumbnail(by_name[verdict.name], THUMBNAIL_PX) if shown else None
+        found.append(UnusedPhotograph(verdict.name, "quality", str(verdict.left_out), finite, picture))
+    return found
+
+
+def _unregistered(prepared: Prepared, scene: Path) -> list[UnusedPhotograph]:
+    """List photographs that are not in the model, with the likely reason: how well they match any other."""
+    unregistered = prepared.used - set(prepared.models[0])
+    if not unregistered:
+        return []
+    elsewhere = {name: model for model in prepared.models[1:] for name in model}
+    matches: dict[str, list[int]] = {}  # verified ones, with each photograph that it matches
+    with pycolmap.Database.open(scene / "prepare" / "database.db") as db:
+        names = {image.image_id: decode_name(image.name) for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(number) for number, name in names.items()}
+        for pair, inliers in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
+            if inliers:
+                for number in pycolmap.pair_id_to_image_pair(pair):
+                    matches.setdefault(names[number], []).append(int(inliers))
+    found = []
+    for photograph in prepared.survey.photographs:
+        name = photograph.name
+        if name in unregistered:
+            reason = _why(features[name], matches.get(name, []), elsewhere.get(name))
+            picture = thumbnail(photograph, THUMBNAIL_PX) if len(found) < MOST_THUMBNAILS else None
+            found.append(UnusedPhotograph(name, "poses", reason, {}, picture))
+    return found
+
+
+def _why(features: int, matches: list[int], model: list[str] | None) -> str:
+    """Say why a photograph was not registered; `model` lists the photographs of another model that has it."""
+    if model:
+        where = f"{model[0]} to {model[-1]}"
+        return f"matches only {len(model) - 1} others, of a place that nothing connects with the rest ({where})"
+    if features < 500:
+        return f"only {features} features were found: the ground has too little texture, or the photograph is blurred"
+    if not matches:
+        return f"none of its {features} features match another photograph: expected overlap with at least two others"
+    return (
+        f"matches {len(matches)} other{'s' * (len(matches) > 1)}, by {max(matches)} features at most: too few, or "
+        "too close to one line, to estimate its pose; fly with more overlap here"
+    )
+
+
+def _examples(
+    prepared: Prepared, scene: Path, correction: ExposureCorrection
+) -> tuple[tuple[str, Picture, Picture], ...]:
+    by_name = {photograph.name: photograph for photograph in prepared.survey.photographs}
+    names = sorted(prepared.models[0])
+    shown = []
+    for k in np.argsort(-np.abs(np.log(correction.gain)).mean(1))[:EXAMPLES]:
+        before = by_name[names[k]]
+        after = replace(before, path=scene / "images" / names[k], orientation=1)
+        shown.append((names[k], thumbnail(before, EXAMPLE_PX), thumbnail(after, EXAMPLE_PX)))
+    return tuple(shown)

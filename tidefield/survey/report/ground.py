@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import pycolmap
+import shapely
 from jaxtyping import Float64
-from scipy.ndimage import distance_transform_edt, map_coordinates, median_filter
+from scipy import ndimage
 from shapely import Polygon
+from shapely.geometry.polygon import orient
 
 from tidefield.survey.report.block import Block
 
@@ -44,14 +45,10 @@ class Ground:
         """Heights of points above the plane alone."""
         return points[..., 2] - points[..., :2] @ self.plane[:2] - self.plane[2]
 
-    def relief(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
-        """Heights of the ground above its plane (bilinear)."""
-        index = np.moveaxis((xy - self.corner)[..., ::-1] / self.cell, -1, 0)
-        return map_coordinates(self.residual, index, order=1, mode="nearest")
-
     def above(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
-        """Heights of points above the ground."""
-        return self.above_plane(points) - self.relief(points[..., :2])
+        """Heights of points above the ground (bilinear)."""
+        index = np.moveaxis((points[..., :2] - self.corner)[..., ::-1] / self.cell, -1, 0)
+        return self.above_plane(points) - ndimage.map_coordinates(self.residual, index, order=1, mode="nearest")
 
 
 def fit_ground(points: Float64[np.ndarray, "P 3"]) -> Ground:
@@ -65,51 +62,42 @@ def fit_ground(points: Float64[np.ndarray, "P 3"]) -> Ground:
     columns, rows = (np.floor(size / cell).astype(int) + 1).tolist()
     index = np.floor((points[:, :2] - low) / cell).astype(int)
     flat = index[:, 1] * columns + index[:, 0]
-    middle = _medians(flat, points)
-    design = np.c_[middle[:, :2], np.ones(len(middle))]
-    plane = np.linalg.lstsq(design, middle[:, 2], rcond=None)[0]
+    cells = np.unique(flat)
+    x, y = (ndimage.mean(points[:, axis], flat, cells) for axis in (0, 1))
+    z = ndimage.median(points[:, 2], flat, cells)
+    design = np.stack([x, y, np.ones(len(cells))], axis=1)
+    plane = np.linalg.lstsq(design, z, rcond=None)[0]
     residual = np.full(rows * columns, np.nan)
-    residual[np.unique(flat)] = middle[:, 2] - design @ plane
+    residual[cells] = z - design @ plane
     residual = residual.reshape(rows, columns)
-    nearest = np.asarray(distance_transform_edt(np.isnan(residual), return_distances=False, return_indices=True))
-    smooth = median_filter(residual[tuple(nearest)], 3, mode="nearest")
+    nearest = np.asarray(
+        ndimage.distance_transform_edt(np.isnan(residual), return_distances=False, return_indices=True)
+    )
+    smooth = ndimage.median_filter(residual[tuple(nearest)], 3, mode="nearest")
     return Ground(plane, low + cell / 2, cell, smooth)
-
-
-def _medians(group: np.ndarray, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "G 3"]:
-    """Per group, in order: mean x and y, median z."""
-    order = np.lexsort((points[:, 2], group))
-    _, first, count = np.unique(group[order], return_index=True, return_counts=True)
-    mean = np.add.reduceat(points[order, :2], first) / count[:, None]
-    z = points[order, 2]
-    return np.c_[mean, (z[first + (count - 1) // 2] + z[first + count // 2]) / 2]
 
 
 def footprints(block: Block, ground: Ground) -> tuple[Polygon, ...]:
     """Outline what every photograph covers of the ground: x and y, counter-clockwise; empty if it sees no ground."""
-    reach = _reach(block, ground)
-    borders = [_border_directions(camera) for camera in block.cameras]
-    return tuple(
-        _simplified(_intersect(ground, block.position[i], borders[lens] @ block.R_world_camera[i].T, reach[i])[:, :2])
-        for i, lens in enumerate(block.lens)
-    )
-
-
-def _reach(block: Block, ground: Ground) -> Float64[np.ndarray, " N"]:
-    """Largest distance of a footprint from each camera."""
     distance = np.linalg.norm(block.points[block.point] - block.position[block.photograph], axis=1)
     far = 2 * np.maximum(ground.above(block.position), 0)
     for i, mine in block.observations():
         far[i] = np.percentile(distance[mine], 98)
-    return FURTHEST * far
+    borders = [_border_directions(camera) for camera in block.cameras]
+    found = []
+    for i, lens in enumerate(block.lens):
+        directions = borders[lens] @ block.R_world_camera[i].T
+        xy = _intersect(ground, block.position[i], directions, FURTHEST * far[i])[:, :2]
+        outline = Polygon(xy).simplify(TOLERANCE * float(np.ptp(xy, 0).max())) if len(xy) > 2 else Polygon()
+        assert isinstance(outline, Polygon), "`simplify` keeps the topology"
+        found.append(orient(outline) if outline.area > 0 else Polygon())
+    return tuple(found)
 
 
 def _border_directions(camera: pycolmap.Camera) -> Float64[np.ndarray, "K 3"]:
     """Unit directions, in the camera's frame, along the border of its image."""
-    along = np.linspace(0, 1, BORDER_POINTS, endpoint=False)
-    zero, one = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
-    sides = [(along, zero), (one, along), (1 - along, one), (zero, 1 - along)]
-    uv = np.concatenate([np.c_[u, v] for u, v in sides]) * (camera.width, camera.height)
+    border = shapely.segmentize(shapely.box(0, 0, 1, 1), 1 / BORDER_POINTS)
+    uv = shapely.get_coordinates(border)[:-1] * (camera.width, camera.height)
     xy = np.asarray(camera.cam_from_img(uv))
     xy = xy[np.isfinite(xy).all(1)]  # a strong distortion need not be invertible at the corners
     directions = np.c_[xy, np.ones(len(xy))]
@@ -138,22 +126,3 @@ def _intersect(
     share = np.where(under[rows, k], share, 1)
     hit = t[rows, k - 1] + share * (t[rows, k] - t[rows, k - 1])
     return origin + hit[:, None] * directions
-
-
-def _simplified(xy: Float64[np.ndarray, "K 2"]) -> Polygon:
-    """The same outline with fewer corners, counter-clockwise; empty if it encloses nothing."""
-    if len(xy) < 3:
-        return Polygon()
-    middle = xy.mean(0)  # float32 holds a footprint, not a coordinate
-    outline = cv2.approxPolyDP((xy - middle).astype(np.float32)[:, None], TOLERANCE * float(np.ptp(xy, 0).max()), True)
-    outline = outline[:, 0].astype(np.float64) + middle
-    area = signed_area(outline)
-    if len(outline) < 3 or area == 0:
-        return Polygon()
-    return Polygon(outline if area > 0 else outline[::-1])
-
-
-def signed_area(polygon: Float64[np.ndarray, "K 2"]) -> float:
-    """Compute the area of a polygon: positive if its corners run counter-clockwise."""
-    x, y = (polygon - polygon[:1]).T  # near zero, because far from it the products' difference loses its digits
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2

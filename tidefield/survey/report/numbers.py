@@ -1,4 +1,4 @@
-"""Collect the numbers of report.json and of the page, named as in OpenSfM's and ODM's stats.json where they are there.
+"""Collect the contents of report.json and of survey.geojson; names are those of OpenSfM's and ODM's stats.json.
 
 https://github.com/mapillary/OpenSfM (opensfm/stats.py) and https://github.com/OpenDroneMap/ODM (stages/odm_report.py)
 define these names. Numbers without one are under "tidefield". Lengths are metres (model units without a georeference),
@@ -13,44 +13,202 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+import shapely
+from jaxtyping import Float64
+from shapely.geometry import mapping
+from shapely.geometry.base import BaseGeometry
 
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
-from tidefield.survey.report.findings import Comparison, Findings, UnusedPhotograph
-from tidefield.survey.report.remarks import remarks
-from tidefield.survey.report.statistics import Statistics
-from tidefield.survey.survey import Photograph
+from tidefield.survey.colour import ExposureCorrection
+from tidefield.survey.report.findings import Comparison, Findings
+from tidefield.survey.report.statistics import Statistics, unite
 
 Numbers = dict[str, Any]
 
 CLASSES = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 11), (12, 19), (20, None))  # photographs that see a piece of ground
+DECIMALS = 8  # of a degree: a millimetre
 _OPENSFM_TIME = "%d/%m/%Y at %H:%M:%S"
 _OPENSFM_NAMES = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y", "k": "k1"}
 _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 _OPENSFM_ERRORS = {"gps": "gps_errors", "control": "gcp_errors", "check": "check_errors"}
 
+# Limits of the warnings.
+THIN_SHARE = 0.7  # of the area, seen by three photographs
+LOW_FORWARD, LOW_SIDE = 0.6, 0.4  # the least of what flight planning asks for
+LARGE_ERROR_PX = 1.0
+FOCAL_CHANGE = 0.05
+TILT_DEG = 30.0
+
 
 def numbers(findings: Findings, statistics: Statistics) -> Numbers:
     """Collect all numbers of a report, ready for JSON: plain Python values, None for what is unknown."""
+    block, frame = statistics.block, findings.frame
     comparisons = findings.comparisons()
+    kinds = {comparison.kind for comparison in comparisons}
+    cameras, camera_errors = _lenses(statistics)
+    times = [p.time_s for p in findings.survey.photographs if math.isfinite(p.time_s)]
+    captured = [datetime.fromtimestamp(at, UTC) for at in (min(times), max(times))] if times else []  # camera's clock
+    start, end = [at.strftime(_OPENSFM_TIME) for at in captured] or ["unknown", "unknown"]
+    reduction = np.array([block.camera(i).width / p.width for i, p in enumerate(statistics.photographs)])
+    seconds = sum(findings.seconds.values(), 0.0)
+    lengths, counts = np.unique(statistics.track_length, return_counts=True)
+    error = statistics.error_px[np.isfinite(statistics.error_px)]
+    histogram, edges = np.histogram(error, 30, (0, max(np.percentile(error, 99.5), 1e-6) if len(error) else 1))
     table: Numbers = {
-        "processing_statistics": _processing(findings, statistics),
+        "processing_statistics": {
+            "steps_times": findings.seconds | {"Total Time": seconds},
+            "date": findings.date.strftime(_OPENSFM_TIME),
+            "start_date": start,
+            "end_date": end,
+            "area": np.ptp(block.position[:, :2], axis=0).prod(),  # OpenSfM's: of the cameras' bounding box
+        },
         "features_statistics": {
-            "detected_features": _spread(statistics.block.detected),
+            "detected_features": _spread(block.detected),
             "reconstructed_features": _spread(statistics.observed),
         },
-        "reconstruction_statistics": _reconstruction(findings, statistics),
-        "camera_errors": {camera["name"]: camera["opensfm"] for camera in lenses(statistics)},
-        "odm_processing_statistics": {
-            "total_time": sum(findings.seconds.values(), 0.0),
-            "total_time_human": duration(sum(findings.seconds.values(), 0.0)),
-            # ODM's unit; without a scale there is none.
-            "average_gsd": 100 * _mean(statistics.gsd) if findings.frame else None,
+        "reconstruction_statistics": {
+            "components": max(len(findings.models), 1),
+            "has_gps": "gps" in kinds,
+            "has_gcp": "control" in kinds,
+            "initial_shots_count": len(findings.survey.photographs),
+            "reconstructed_shots_count": len(block),
+            "reconstructed_points_count": len(block.points),
+            "observations_count": len(block.point),
+            "average_track_length": _mean(statistics.track_length),
+            "average_track_length_over_two": _mean(statistics.track_length[statistics.track_length > 2]),
+            "histogram_track_length": dict(zip(lengths.tolist(), counts.tolist(), strict=True)),
+            "reprojection_error_pixels": _mean(error),
+            "reprojection_histogram_pixels": [histogram, edges],
         },
-        "tidefield": _ours(findings, statistics),
+        "camera_errors": camera_errors,
+        "odm_processing_statistics": {
+            "total_time": seconds,
+            "total_time_human": duration(seconds),
+            # ODM's unit; without a scale there is none.
+            "average_gsd": 100 * _mean(statistics.gsd) if frame else None,
+        },
+        "tidefield": {
+            "title": findings.title,
+            "date": findings.date.isoformat(timespec="seconds"),
+            "captured": [at.replace(tzinfo=None).isoformat() for at in captured] or None,
+            "unit": "m" if frame else "model unit",
+            "georeference": frame.to_json()
+            | {
+                "crs_title": crs_title(frame),
+                "placed_by": findings.placed_by,
+                "origin_longitude_latitude_height": frame.to_geographic(np.zeros((1, 3)))[0],
+                "origin_easting_northing_height": frame.to_crs(np.zeros((1, 3)))[0],
+            }
+            if frame
+            else None,
+            "models": findings.models or (len(block),),
+            "resolution": {
+                "gsd": _spread(statistics.gsd),
+                "gsd_of_originals": _spread(statistics.gsd * reduction),
+                "height_above_ground": _spread(statistics.height),
+                "relative_altitude": _spread(np.array([p.relative_altitude_m for p in statistics.photographs])),
+            },
+            "coverage": _coverage(statistics),
+            "overlap": {"forward": _spread(statistics.forward_overlap), "side": _spread(statistics.side_overlap)},
+            "reprojection": {
+                "mean_px": _mean(error),
+                "rms_px": math.sqrt(_mean(error**2)),
+                "per_photograph": _spread(statistics.mean_px),
+            },
+            "cameras": cameras,
+            "residuals": [_residuals(comparison) for comparison in comparisons],
+            "colour": _colour(findings.colour) if findings.colour else None,
+            "left_out": [
+                {"name": lost.name, "stage": lost.stage, "reason": lost.reason, "measures": lost.measures}
+                for lost in findings.left_out
+            ],
+            "photographs": [
+                {
+                    "name": name,
+                    "position": block.position[i],
+                    "height_above_ground": statistics.height[i],
+                    "gsd": statistics.gsd[i],
+                    "points": statistics.observed[i],
+                    "reprojection_mean_px": statistics.mean_px[i],
+                    "reprojection_rms_px": statistics.rms_px[i],
+                    "forward_overlap": statistics.forward_overlap[i],
+                    "side_overlap": statistics.side_overlap[i],
+                }
+                for i, name in enumerate(block.names)
+            ],
+            "options": findings.options,
+            "versions": findings.versions,
+            "remarks": _remarks(findings, statistics, cameras),
+        },
     }
     for kind, name in _OPENSFM_ERRORS.items():
-        table[name] = next((_opensfm_errors(r) for r in comparisons if r.kind == kind), {})
+        table[name] = next((_opensfm_errors(c) for c in comparisons if c.kind == kind), {})
     return plain(table)
+
+
+def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
+    """Collect cameras, their footprints, surveyed points and the outline of the area covered as features (RFC 7946).
+
+    Positions are longitude and latitude (WGS 84). They have no third coordinate, as RFC 7946 wants ellipsoidal heights
+    there; heights are properties instead.
+    """
+    frame, block = findings.frame, statistics.block
+    assert frame is not None, "a model without a georeference has no map"
+    geographic = frame.to_geographic(block.position)
+    rank = np.argsort(statistics.order)
+    features: list[dict[str, Any]] = []
+
+    def add(geometry: BaseGeometry, **properties: object) -> None:
+        features.append({"type": "Feature", "geometry": mapping(geometry), "properties": plain(properties)})
+
+    def on_earth(outline: BaseGeometry) -> BaseGeometry:
+        """The same outline in longitude and latitude; its orientation is kept."""
+        return shapely.transform(
+            outline, lambda xy: frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
+        )
+
+    def point(longitude_latitude_height: Float64[np.ndarray, " 3"]) -> shapely.Point:
+        return shapely.Point(longitude_latitude_height[:2].round(DECIMALS))
+
+    area_m2 = round(statistics.coverage.area(1), 2)
+    add(on_earth(unite(statistics.footprints)), kind="area covered", area_m2=area_m2)
+    for name, outline, gsd in zip(block.names, statistics.footprints, statistics.gsd, strict=True):
+        if not outline.is_empty:
+            add(on_earth(outline), kind="footprint", photograph=name, gsd_m=gsd)
+    for i, name in enumerate(block.names):
+        add(
+            point(geographic[i]),
+            kind="camera",
+            photograph=name,
+            flight_order=rank[i] + 1,
+            height_m=geographic[i, 2],
+            height_above_ground_m=statistics.height[i],
+            gsd_m=statistics.gsd[i],
+            points=statistics.observed[i],
+            reprojection_error_px=statistics.mean_px[i],
+        )
+    surveyed = findings.control_points()
+    for comparison in (c for c in findings.comparisons() if c.kind != "gps"):
+        residuals = comparison.residuals
+        for name, used, error_m in zip(residuals.names, comparison.used, residuals.error_m, strict=True):
+            given = frame.to_geographic(surveyed[name][None])[0]
+            add(
+                point(given),
+                kind=f"{comparison.kind} point",
+                name=name,
+                compared=comparison.title,
+                used=used,
+                height_m=given[2],
+                residual_east_m=error_m[0],
+                residual_north_m=error_m[1],
+                residual_up_m=error_m[2],
+            )
+    return {
+        "type": "FeatureCollection",
+        "title": findings.title,
+        "vertical_datum": frame.vertical_datum,
+        "features": features,
+    }
 
 
 def duration(seconds: float) -> str:
@@ -72,44 +230,36 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _processing(findings: Findings, statistics: Statistics) -> Numbers:
-    start, end = _capture(findings)
-    size = np.ptp(statistics.block.position[:, :2], axis=0)
+def crs_title(frame: LocalFrame) -> str:
+    """Name and code of the coordinate reference system of the results."""
+    name = parse_crs(frame.crs).name
+    return f"{name} (EPSG:{frame.epsg})" if frame.epsg else name
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else math.nan
+
+
+def _spread(values: np.ndarray) -> Numbers:
+    """Least, greatest, mean and median of the known values."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {"min": None, "max": None, "mean": None, "median": None}
+    return {"min": known.min(), "max": known.max(), "mean": known.mean(), "median": np.median(known)}
+
+
+def _coverage(statistics: Statistics) -> Numbers:
+    coverage = statistics.coverage
+    total = coverage.area(1)
+    seen = coverage.count[coverage.count > 0]
     return {
-        "steps_times": findings.seconds | {"Total Time": sum(findings.seconds.values(), 0.0)},
-        "date": findings.date.strftime(_OPENSFM_TIME),
-        "start_date": start.strftime(_OPENSFM_TIME) if start else "unknown",
-        "end_date": end.strftime(_OPENSFM_TIME) if end else "unknown",
-        "area": size.prod(),  # OpenSfM's: of the cameras' bounding box
-    }
-
-
-def _capture(findings: Findings) -> tuple[datetime | None, datetime | None]:
-    times = [p.time_s for p in findings.survey.photographs if math.isfinite(p.time_s)]
-    if not times:
-        return None, None
-    return datetime.fromtimestamp(min(times), UTC), datetime.fromtimestamp(max(times), UTC)  # the camera's own clock
-
-
-def _reconstruction(findings: Findings, statistics: Statistics) -> Numbers:
-    kinds = {comparison.kind for comparison in findings.comparisons()}
-    lengths, counts = np.unique(statistics.track_length, return_counts=True)
-    error = statistics.error_px[np.isfinite(statistics.error_px)]
-    histogram, edges = np.histogram(error, 30, (0, max(np.percentile(error, 99.5), 1e-6) if len(error) else 1))
-    longer = statistics.track_length[statistics.track_length > 2]
-    return {
-        "components": max(len(findings.models), 1),
-        "has_gps": "gps" in kinds,
-        "has_gcp": "control" in kinds,
-        "initial_shots_count": len(findings.survey.photographs),
-        "reconstructed_shots_count": len(statistics.block),
-        "reconstructed_points_count": len(statistics.block.points),
-        "observations_count": len(statistics.block.point),
-        "average_track_length": _mean(statistics.track_length),
-        "average_track_length_over_two": _mean(longer),
-        "histogram_track_length": dict(zip(lengths.tolist(), counts.tolist(), strict=True)),
-        "reprojection_error_pixels": _mean(error),
-        "reprojection_histogram_pixels": [histogram, edges],
+        "area": total,
+        "share_seen_by_2": coverage.area(2) / total if total else None,
+        "share_seen_by_3": coverage.area(3) / total if total else None,
+        "median_photographs": np.median(seen) if len(seen) else None,
+        "cell": coverage.cell,
+        "classes": [{"least": least, "most": most, "area": coverage.area(least, most)} for least, most in CLASSES],
     }
 
 
@@ -135,87 +285,6 @@ def _opensfm_errors(comparison: Comparison) -> Numbers:
     }
 
 
-def _ours(findings: Findings, statistics: Statistics) -> Numbers:
-    error = statistics.error_px[np.isfinite(statistics.error_px)]
-    start, end = _capture(findings)
-    frame, colour = findings.frame, findings.colour
-    return {
-        "title": findings.title,
-        "date": findings.date.isoformat(timespec="seconds"),
-        "captured": [start.replace(tzinfo=None).isoformat() if start else None, end.replace(tzinfo=None).isoformat()]
-        if start and end
-        else None,
-        "unit": "m" if frame else "model unit",
-        "georeference": _georeference(findings, frame) if frame else None,
-        "models": findings.models or (len(statistics.block),),
-        "resolution": {
-            "gsd": _spread(statistics.gsd),
-            "gsd_of_originals": _spread(statistics.gsd * _reduction(statistics)),
-            "height_above_ground": _spread(statistics.height),
-            "relative_altitude": _spread(
-                np.array([np.nan if p is None else p.relative_altitude_m for p in statistics.photographs])
-            ),
-        },
-        "coverage": _coverage(statistics),
-        "overlap": {"forward": _spread(statistics.overlap.forward), "side": _spread(statistics.overlap.side)},
-        "reprojection": {
-            "mean_px": _mean(error),
-            "rms_px": math.sqrt(_mean(error**2)),
-            "per_photograph": _spread(statistics.mean_px),
-        },
-        "cameras": [{key: value for key, value in camera.items() if key != "opensfm"} for camera in lenses(statistics)],
-        "residuals": [_residuals(comparison) for comparison in findings.comparisons()],
-        "colour": None
-        if colour is None
-        else {
-            "applied": colour.applied,
-            "verdict": colour.verdict,
-            "changes": [vars(change) for change in colour.changes],
-        },
-        "left_out": [_left_out(lost) for lost in findings.left_out],
-        "photographs": [_photograph(statistics, i) for i in range(len(statistics.block))],
-        "options": findings.options,
-        "versions": findings.versions,
-        "remarks": remarks(findings, statistics),
-    }
-
-
-def crs_title(frame: LocalFrame) -> str:
-    """Name and code of the coordinate reference system of the results."""
-    name = parse_crs(frame.crs).name
-    return f"{name} (EPSG:{frame.epsg})" if frame.epsg else name
-
-
-def _georeference(findings: Findings, frame: LocalFrame) -> Numbers:
-    origin = np.zeros((1, 3))
-    return frame.to_json() | {
-        "crs_title": crs_title(frame),
-        "placed_by": findings.placed_by,
-        "origin_longitude_latitude_height": frame.to_geographic(origin)[0],
-        "origin_easting_northing_height": frame.to_crs(origin)[0],
-    }
-
-
-def _reduction(statistics: Statistics) -> np.ndarray:
-    """Width in the model over the original photograph's, per photograph."""
-    widths = [statistics.block.camera(i).width for i in range(len(statistics.block))]
-    return np.array([np.nan if p is None else w / p.width for p, w in zip(statistics.photographs, widths, strict=True)])
-
-
-def _coverage(statistics: Statistics) -> Numbers:
-    coverage = statistics.coverage
-    total = coverage.area(1)
-    seen = coverage.count[coverage.count > 0]
-    return {
-        "area": total,
-        "share_seen_by_2": coverage.area(2) / total if total else None,
-        "share_seen_by_3": coverage.area(3) / total if total else None,
-        "median_photographs": np.median(seen) if len(seen) else None,
-        "cell": coverage.cell,
-        "classes": [{"least": least, "most": most, "area": coverage.area(least, most)} for least, most in CLASSES],
-    }
-
-
 def _residuals(comparison: Comparison) -> Numbers:
     rows = zip(comparison.residuals.names, comparison.residuals.error_m, comparison.used, strict=True)
     return {
@@ -227,47 +296,39 @@ def _residuals(comparison: Comparison) -> Numbers:
     }
 
 
-def _left_out(lost: UnusedPhotograph) -> Numbers:
-    return {"name": lost.name, "stage": lost.stage, "reason": lost.reason, "measures": lost.measures}
-
-
-def _photograph(statistics: Statistics, i: int) -> Numbers:
-    return {
-        "name": statistics.block.names[i],
-        "position": statistics.block.position[i],
-        "height_above_ground": statistics.height[i],
-        "gsd": statistics.gsd[i],
-        "points": statistics.observed[i],
-        "reprojection_mean_px": statistics.mean_px[i],
-        "reprojection_rms_px": statistics.rms_px[i],
-        "forward_overlap": statistics.overlap.forward[i],
-        "side_overlap": statistics.overlap.side[i],
+def _colour(correction: ExposureCorrection) -> Numbers:
+    vignetting = " and the vignetting of the lens was removed" if correction.sees_falloff else ""
+    verdict = (
+        f"Exposure and white balance were corrected{vignetting}; the brightest photograph had "
+        f"{correction.gain.max() / correction.gain.min():.1f} times the gain of the darkest."
+        if correction.helps
+        else "The photographs agree as they are: their colours were not changed."
+    )
+    change = {
+        "what": "difference between photographs at points that took no part in the estimate",
+        "before": 100 * correction.before,
+        "after": 100 * min(correction.gains_alone, correction.after),
+        "unit": "% of a pixel's value",
     }
+    return {"applied": correction.helps, "verdict": verdict, "changes": [change]}
 
 
-def _mean(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else math.nan
-
-
-def _spread(values: np.ndarray) -> Numbers:
-    """Least, greatest, mean and median of the known values."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return {"min": None, "max": None, "mean": None, "median": None}
-    return {"min": known.min(), "max": known.max(), "mean": known.mean(), "median": np.median(known)}
-
-
-def lenses(statistics: Statistics) -> list[dict[str, Any]]:
-    """Describe every lens: estimate and prior, in pixels with COLMAP's names and (`opensfm`) in OpenSfM's units."""
-    found: list[dict[str, Any]] = []
+def _lenses(statistics: Statistics) -> tuple[list[Numbers], dict[str, Numbers]]:
+    """Describe every lens: estimate and prior, in pixels with COLMAP's names, and by name in OpenSfM's units."""
+    found: list[Numbers] = []
+    opensfm: dict[str, Numbers] = {}
     for index, camera in enumerate(statistics.block.cameras):
-        mine = np.flatnonzero(statistics.block.lens == index)
-        photograph = next((p for p in (statistics.photographs[i] for i in mine) if p is not None), None)
-        label = (photograph.camera if photograph else "") or "camera"
-        if any(other["name"] == label for other in found):
+        mine = [statistics.photographs[i] for i in np.flatnonzero(statistics.block.lens == index)]
+        label = mine[0].camera or "camera"
+        if label in opensfm:
             label = f"{label} ({index + 1})"
-        names = [name.strip() for name in camera.params_info.split(",")]
+        parameters = dict(zip((name.strip() for name in camera.params_info.split(",")), camera.params, strict=True))
+        photograph = next((p for p in mine if p.lens is not None), mine[0])
+        prior, initial = photograph.lens, {}
+        if prior is not None:
+            focal = prior.focal_px / max(photograph.width, photograph.height)
+            initial = {"focal_x": focal, "focal_y": focal}
+            initial |= dict(zip(("k1", "k2", "p1", "p2", "k3"), prior.distortion or (), strict=False))
         found.append(
             {
                 "name": label,
@@ -275,44 +336,24 @@ def lenses(statistics: Statistics) -> list[dict[str, Any]]:
                 "width": camera.width,
                 "height": camera.height,
                 "model": camera.model_name,
-                "parameters": dict(zip(names, camera.params, strict=True)),
+                "parameters": parameters,
                 "focal_px": camera.mean_focal_length(),
-                **_prior(photograph, camera),
+                # The model's images may be smaller than the originals.
+                "prior_focal_px": prior.focal_px * (camera.width / photograph.width) if prior else None,
+                "prior_source": prior.source if prior else None,
                 "corner_distortion_px": _corner_distortion(camera),
-                "opensfm": {
-                    "initial_values": _initial(photograph, camera),
-                    "optimized_values": _normalised(camera, names),
-                },
             }
         )
-    return found
-
-
-def _prior(photograph: Photograph | None, camera: pycolmap.Camera) -> dict[str, Any]:
-    if photograph is None or photograph.lens is None:
-        return {"prior_focal_px": None, "prior_source": None}
-    scale = camera.width / photograph.width  # the model's images may be smaller than the originals
-    return {"prior_focal_px": photograph.lens.focal_px * scale, "prior_source": photograph.lens.source}
-
-
-def _initial(photograph: Photograph | None, camera: pycolmap.Camera) -> dict[str, float]:
-    if photograph is None or photograph.lens is None:
-        return {}
-    focal = photograph.lens.focal_px / max(photograph.width, photograph.height)
-    known = {"focal_x": focal, "focal_y": focal}
-    if photograph.lens.distortion:
-        known |= dict(zip(("k1", "k2", "p1", "p2", "k3"), photograph.lens.distortion, strict=True))
-    return known
-
-
-def _normalised(camera: pycolmap.Camera, names: list[str]) -> dict[str, float]:
-    """Focal lengths, and offsets of the principal point from the middle, by the image's longer side."""
-    side = max(camera.width, camera.height)
-    middle = {"cx": camera.width / 2, "cy": camera.height / 2}
-    values = {}
-    for name, value in zip(names, camera.params, strict=True):
-        values[_OPENSFM_NAMES.get(name, name)] = (value - middle.get(name, 0)) / side if name in _IN_PIXELS else value
-    return values
+        # Focal lengths, and offsets of the principal point from the middle, by the image's longer side.
+        middle, side = {"cx": camera.width / 2, "cy": camera.height / 2}, max(camera.width, camera.height)
+        opensfm[label] = {
+            "initial_values": initial,
+            "optimized_values": {
+                _OPENSFM_NAMES.get(name, name): (value - middle.get(name, 0)) / side if name in _IN_PIXELS else value
+                for name, value in parameters.items()
+            },
+        }
+    return found, opensfm
 
 
 def _corner_distortion(camera: pycolmap.Camera) -> float:
@@ -321,3 +362,48 @@ def _corner_distortion(camera: pycolmap.Camera) -> float:
     straight = np.asarray(camera.cam_from_img(corners)) * (camera.focal_length_x, camera.focal_length_y)
     straight += (camera.principal_point_x, camera.principal_point_y)
     return float(np.linalg.norm(straight - corners, axis=1).max())
+
+
+def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers]) -> list[str]:
+    """List warnings as whole sentences: those of the pipeline first."""
+    found = list(findings.remarks)
+    kinds = {comparison.kind for comparison in findings.comparisons()}
+    if findings.frame is None:
+        found.append(
+            "The model has no georeference and no scale: lengths are in its own unit, and its ground plane is assumed "
+            "to be level."
+        )
+    elif not kinds & {"control", "check"}:
+        found.append(
+            "No surveyed points were used: the model is as well placed as the receiver's positions are, and their "
+            "common error does not show in any residual."
+        )
+    elif "check" not in kinds:
+        found.append(
+            "No check points were held out: the residuals of control points are those of a fit, and flatter it."
+        )
+    share = statistics.coverage.area(3) / max(statistics.coverage.area(1), 1e-12)
+    if share < THIN_SHARE:
+        found.append(
+            f"Only {share:.0%} of the area is seen by three photographs or more; where fewer see it, heights are weak "
+            "or unknown."
+        )
+    oblique = statistics.block.R_world_camera[:, 2, 2] > -np.cos(np.radians(TILT_DEG))
+    for name, values, least in (
+        ("forward", statistics.forward_overlap, LOW_FORWARD),
+        ("side", statistics.side_overlap, LOW_SIDE),
+    ):
+        known = values[np.isfinite(values) & ~oblique]
+        if len(known) and np.median(known) < least:
+            found.append(f"The {name} overlap, {np.median(known):.0%} (median), is under the usual {least:.0%}.")
+    error = _mean(statistics.error_px)
+    if error > LARGE_ERROR_PX:
+        found.append(f"The reprojection error, {error:.2f} px, is high: it should stay under a pixel.")
+    for camera in cameras:
+        change = camera["focal_px"] / camera["prior_focal_px"] - 1 if camera["prior_focal_px"] else 0
+        if abs(change) > FOCAL_CHANGE:
+            found.append(
+                f"The focal length came out {change:+.0%} from what {camera['prior_source']} says: flat ground seen "
+                "straight down cannot tell focal length from height, so check the flight height."
+            )
+    return found

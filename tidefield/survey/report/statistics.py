@@ -5,14 +5,44 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int
+import shapely
+from jaxtyping import Bool, Float64, Int, UInt16
 from shapely import Polygon
+from shapely.geometry.polygon import orient
 
 from tidefield.survey.report.block import Block, read_block
-from tidefield.survey.report.coverage import Coverage, Overlap, cover, overlap
 from tidefield.survey.report.findings import Findings
 from tidefield.survey.report.ground import fit_ground, footprints
 from tidefield.survey.survey import Photograph
+
+LONG_SIDE = 600  # cells
+SAME_PLACE = 0.02  # of the height: photographs nearer than this were taken from one place
+PARALLEL_DEG = 30.0
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """A raster over the survey.
+
+    Attributes:
+        count: photographs whose footprint holds the cell's centre; rows from south to north.
+        corner: x and y of the raster's south-western corner.
+        cell: side of a cell.
+    """
+
+    count: UInt16[np.ndarray, "h w"]
+    corner: Float64[np.ndarray, " 2"]
+    cell: float
+
+    @property
+    def far_corner(self) -> Float64[np.ndarray, " 2"]:
+        """x and y of the north-eastern corner."""
+        return self.corner + np.array(self.count.shape[::-1]) * self.cell
+
+    def area(self, least: int, most: int | None = None) -> float:
+        """Area that at least `least` and at most `most` photographs see."""
+        seen = self.count >= least
+        return float((seen if most is None else seen & (self.count <= most)).sum()) * self.cell**2
 
 
 @dataclass(frozen=True)
@@ -21,13 +51,15 @@ class Statistics:
 
     Attributes:
         block: the model as arrays.
-        photographs: what was read of each registered photograph; None if it is not in the survey.
+        photographs: what was read of each registered photograph.
         order: registered photographs in the order of the flight: by time, or by name where times are missing.
         gsd: ground sampling distance of every photograph: median over its points of z-depth / focal length.
         height: of every camera above the ground beneath.
         footprints: what each covers of the ground, counter-clockwise x and y; empty if it sees none.
         coverage: how many photographs see each piece of ground.
-        overlap: what each shares with its neighbours.
+        forward_overlap: share of each footprint that the nearest photograph ahead or behind along the flight sees too,
+            the larger of the two; NaN where there is none.
+        side_overlap: the same of the nearest to the side, on a parallel line.
         error_px: reprojection error of every observation.
         mean_px, rms_px: per photograph.
         observed: points that every photograph observes.
@@ -35,13 +67,14 @@ class Statistics:
     """
 
     block: Block
-    photographs: tuple[Photograph | None, ...]
+    photographs: tuple[Photograph, ...]
     order: Int[np.ndarray, " N"]
     gsd: Float64[np.ndarray, " N"]
     height: Float64[np.ndarray, " N"]
     footprints: tuple[Polygon, ...]
     coverage: Coverage
-    overlap: Overlap
+    forward_overlap: Float64[np.ndarray, " N"]
+    side_overlap: Float64[np.ndarray, " N"]
     error_px: Float64[np.ndarray, " O"]
     mean_px: Float64[np.ndarray, " N"]
     rms_px: Float64[np.ndarray, " N"]
@@ -57,13 +90,15 @@ def measure(findings: Findings) -> Statistics:
     """
     block = read_block(findings.reconstruction, level=findings.frame is None)
     known = {photograph.name: photograph for photograph in findings.survey.photographs}
-    photographs = tuple(known.get(name) for name in block.names)
-    order = _flight_order(photographs)
+    photographs = tuple(known[name] for name in block.names)
+    times = np.array([photograph.time_s for photograph in photographs])
+    order = np.arange(len(times)) if np.isnan(times).any() else np.argsort(times, kind="stable")
     track_length = np.bincount(block.point, minlength=len(block.points))
     trusted = block.points[track_length > 2]
     ground = fit_ground(trusted if len(trusted) >= len(block.points) / 4 else block.points)
     height = ground.above(block.position)
     outlines = footprints(block, ground)
+    forward, side = overlap(outlines, block.position, order, float(np.median(height)))
     gsd, error_px, mean_px, rms_px = _resolution_and_errors(block)
     return Statistics(
         block=block,
@@ -73,18 +108,14 @@ def measure(findings: Findings) -> Statistics:
         height=height,
         footprints=outlines,
         coverage=cover(outlines),
-        overlap=overlap(outlines, block.position, order, float(np.median(height))),
+        forward_overlap=forward,
+        side_overlap=side,
         error_px=error_px,
         mean_px=mean_px,
         rms_px=rms_px,
         observed=np.bincount(block.photograph, minlength=len(block)),
         track_length=track_length,
     )
-
-
-def _flight_order(photographs: tuple[Photograph | None, ...]) -> Int[np.ndarray, " N"]:
-    times = np.array([np.nan if photograph is None else photograph.time_s for photograph in photographs])
-    return np.arange(len(times)) if np.isnan(times).any() else np.argsort(times, kind="stable")
 
 
 def _resolution_and_errors(block: Block) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -101,3 +132,81 @@ def _resolution_and_errors(block: Block) -> tuple[np.ndarray, np.ndarray, np.nda
         if len(here):
             mean[i], rms[i] = np.mean(here), np.sqrt(np.mean(here**2))
     return gsd, error, mean, rms
+
+
+def cover(footprints: tuple[Polygon, ...]) -> Coverage:
+    """Count the footprints over every cell of a raster that holds them all."""
+    bounds = shapely.total_bounds(footprints).reshape(2, 2)
+    low, high = bounds if np.isfinite(bounds).all() else np.array([[0.0, 0.0], [1.0, 1.0]])  # nothing is seen
+    cell = float((high - low).max()) / LONG_SIDE
+    columns, rows = np.ceil((high - low) / cell - 1e-9).astype(int).clip(1)
+    # A hair beyond the centres, so that one on the common border of two footprints counts in one of them.
+    x, y = (low[0] + (np.arange(columns) + 0.5 + 1e-6) * cell, low[1] + (np.arange(rows) + 0.5 + 1e-6) * cell)
+    count = np.zeros((rows, columns), np.uint16)
+    # cv2.fillPoly also fills cells that the border only touches: a footprint of 120 by 90 cells would grow by 1 to 2%.
+    for outline in footprints:
+        west, south, east, north = outline.bounds
+        window = slice(*np.searchsorted(y, (south, north))), slice(*np.searchsorted(x, (west, east)))
+        count[window] += shapely.contains_xy(outline, *np.meshgrid(x[window[1]], y[window[0]]))
+    return Coverage(count, low, cell)
+
+
+def unite(footprints: tuple[Polygon, ...]) -> shapely.MultiPolygon:
+    """Outline the area that any photograph sees; outer rings run counter-clockwise."""
+    # An outline that crosses itself cannot be united; made valid, it may hold lines, too.
+    parts = shapely.get_parts(shapely.make_valid(np.array(footprints, dtype=object)))
+    return shapely.MultiPolygon(
+        [orient(part) for part in shapely.get_parts(shapely.union_all(parts[shapely.area(parts) > 0]))]
+    )
+
+
+def overlap(
+    footprints: tuple[Polygon, ...], position: Float64[np.ndarray, "N 3"], order: Int[np.ndarray, " N"], height: float
+) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    """Measure forward and side overlap from geometry alone, so that a missing photograph shows as a gap.
+
+    Args:
+        footprints: of every photograph; their convex hulls are compared.
+        position: of the cameras.
+        order: photographs in the order of the flight, from which its heading follows.
+        height: of the flight above ground.
+
+    Returns:
+        `Statistics.forward_overlap` and `side_overlap`.
+    """
+    hulls = shapely.convex_hull(np.array(footprints, dtype=object))
+    heading = _headings(position[:, :2], order)
+    forward, side = np.full((2, len(position)), np.nan)
+
+    def shared(i: int, distance: Float64[np.ndarray, " N"], among: Bool[np.ndarray, " N"]) -> float:
+        """Share of footprint `i` that the nearest of some photographs sees; NaN if there are none."""
+        if not among.any():
+            return np.nan
+        nearest = hulls[np.where(among, distance, np.inf).argmin()]
+        return min(hulls[i].intersection(nearest).area / hulls[i].area, 1.0)
+
+    for i in np.flatnonzero(~shapely.is_empty(hulls)).tolist():
+        offset = position[:, :2] - position[i, :2]
+        along, across = offset @ heading[i], offset @ [-heading[i, 1], heading[i, 0]]
+        distance = np.hypot(along, across)
+        parallel = np.abs(heading @ heading[i]) > np.cos(np.radians(PARALLEL_DEG))
+        candidate = parallel & (distance > SAME_PLACE * height)
+        ahead = candidate & (np.abs(along) > np.abs(across))
+        front, back = (shared(i, distance, ahead & (sign * along > 0)) for sign in (1, -1))
+        forward[i] = np.fmax(front, back)
+        side[i] = shared(i, distance, candidate & ~ahead)
+    return forward, side
+
+
+def _headings(xy: Float64[np.ndarray, "N 2"], order: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
+    """Unit vectors of the flight's heading: along the shorter leg, before or after the photograph."""
+    if len(xy) < 2:
+        return np.tile([[1.0, 0.0]], (len(xy), 1))
+    steps = np.diff(xy[order], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    arriving, leaving = np.r_[np.inf, length], np.r_[length, np.inf]
+    index = np.arange(len(xy))
+    chosen = steps[np.where(arriving < leaving, index - 1, np.minimum(index, len(steps) - 1))]
+    heading = np.empty_like(xy)
+    heading[order] = chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)  # hovering has none
+    return heading
