@@ -190,14 +190,6 @@ def test_positions_across_the_date_line():
     assert found.gps.horizontal_rms_m < 0.05
 
 
-def test_positions_at_zero_are_left_out():
-    flight = fly(noise_px=0.0)
-    survey = moved(flight.survey, {name_of(3): {"latitude_deg": 0.0, "longitude_deg": 0.0}})
-    _, found = located(flight, survey)
-    assert [(item.kind, item.name) for item in found.left_out] == [("GPS", name_of(3))]
-    assert found.gps.horizontal_rms_m < 0.01
-
-
 def differential(survey: Survey) -> Survey:
     return all_moved(survey, lambda position: {"horizontal_m": 0.015, "vertical_m": 0.025})
 

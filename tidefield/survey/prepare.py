@@ -191,10 +191,10 @@ def estimate_poses(survey: Survey, database: Path, folder: Path, console: Consol
         models = reconstruct(database, folder.with_name("models"), bar)
     has_prior = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Choosing a lens") as bar:
-        choice = choose_lens(models.best, survey.photographs, has_prior, bar)
+        choice = choose_lens(models[0], survey.photographs, has_prior, bar)
     folder.mkdir(exist_ok=True)
-    models.best.write_binary(folder)
-    return {"models": [registered_names(models.best), *map(list, models.others)], "lens": _to_json(choice)}
+    models[0].write_binary(folder)
+    return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 
 def georeference_model(good: Survey, model: Path, sparse: Path, console: Console) -> Facts:

@@ -8,7 +8,6 @@ equivalent to a higher flight, unless points lie at two heights or a bend shows 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -17,11 +16,11 @@ from jaxtyping import Bool, Float64
 from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import list_names
 from tidefield.survey.georeference.bundle_adjustment import (
-    adjustment_options,
     all_images,
     carry_over,
     generalise_lenses,
     reliable,
+    solve,
     thinned,
 )
 from tidefield.survey.georeference.gps_alignment import metres
@@ -51,22 +50,12 @@ _FOLDS_OF_LARGE = 4
 _LARGE = 300  # photographs
 
 
-@dataclass(frozen=True)
-class ControlResult:
-    """Results of an adjustment to ground control; see `Georeference`."""
-
-    control: Residuals
-    check: Residuals
-    left_out: tuple[LeftOut, ...]
-    notes: tuple[str, ...]
-
-
 def adjust_to_control(
     model: pycolmap.Reconstruction,
     marks: Marks,
     agree: Bool[np.ndarray, " M"],
     progress: Callable[[int, int], object],
-) -> ControlResult:
+) -> tuple[Residuals, Residuals, tuple[LeftOut, ...], tuple[str, ...]]:
     """Adjust a model that is aligned with its control points, in place.
 
     The lens is adjusted too if this reduces the errors of the points that are left out in turn. Marks are added when
@@ -74,14 +63,17 @@ def adjust_to_control(
 
     Args:
         agree: the marks to start with.
+
+    Returns:
+        The residuals of the control points, those of each after an adjustment without it, the rejected marks and
+        points, and notes.
     """
     if are_collinear(_coordinates(marks.where(agree))):
         note = (
             "Fewer than three control points can be used, or they lie on one line: the photographs were aligned with "
             "them without adjustment, and cannot be checked."
         )
-        seen = _control_residuals(model, marks.where(agree))
-        return ControlResult(seen, Residuals(), _rejected(model, marks, agree), (note,))
+        return _control_residuals(model, marks.where(agree)), Residuals(), _rejected(model, marks, agree), (note,)
     refused: set[str] = set()
     sound = reliable(model)
     while True:
@@ -96,14 +88,22 @@ def adjust_to_control(
     if (final != agree).any():
         agree, check = final, _cross_validate(sound, marks.where(final), free_lens, progress)
     adjusted = _adjusted(sound, marks.where(agree), free_lens)
-    result = ControlResult(
-        control=_control_residuals(adjusted, marks.where(agree)),
-        check=check,
-        left_out=_rejected(adjusted, marks, agree),
-        notes=(*_lens_notes(model, adjusted, free_lens), *_unchecked(marks.where(agree), check)),
-    )
+    notes = []
+    if free_lens:
+        changes = [
+            f"{camera.mean_focal_length():.1f} to {adjusted.camera(number).mean_focal_length():.1f} px"
+            for number, camera in sorted(model.cameras.items())
+        ]
+        notes.append(
+            f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): "
+            "this reduces the errors of points that are left out in turn."
+        )
+    unchecked = sorted(marks.where(agree).points.keys() - set(check.names))
+    if unchecked:
+        why = "one photograph shows it, or too few points would be left"
+        notes.append(f"Used, but not checked: {list_names(unchecked)}; {why}.")
     carry_over(adjusted, model)
-    return result
+    return _control_residuals(adjusted, marks.where(agree)), check, _rejected(adjusted, marks, agree), tuple(notes)
 
 
 def _adjusted(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool) -> pycolmap.Reconstruction:
@@ -116,21 +116,15 @@ def _adjusted(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool) -> 
     config = all_images(copy)
     generalise_lenses(copy, config, free_lens)
     for name, surveyed in marks.points.items():
-        config.add_constant_point(_add_control(copy, marks.where(marks.of(name)), surveyed))
-    options = adjustment_options()
-    options.refine_focal_length = True
-    pycolmap.create_default_bundle_adjuster(options, config, copy).solve()
+        track, own = pycolmap.Track(), marks.of(name)
+        for number, uv in zip(marks.image[own], marks.uv_px[own], strict=True):
+            points = copy.image(int(number)).points2D
+            for _ in range(_REPEATS):
+                points.append(pycolmap.Point2D(uv))
+                track.add_element(int(number), len(points) - 1)
+        config.add_constant_point(copy.add_point3D(surveyed, track))
+    solve(copy, config, refine_focal_length=True)
     return copy
-
-
-def _add_control(model: pycolmap.Reconstruction, marks: Marks, surveyed: Float64[np.ndarray, " 3"]) -> int:
-    track = pycolmap.Track()
-    for number, uv in zip(marks.image, marks.uv_px, strict=True):
-        points = model.image(int(number)).points2D
-        for _ in range(_REPEATS):
-            points.append(pycolmap.Point2D(uv))
-            track.add_element(int(number), len(points) - 1)
-    return model.add_point3D(surveyed, track)
 
 
 def _cross_validate(
@@ -182,16 +176,12 @@ def _consistent(
         adjusted = _adjusted(model, marks.where(agree), free_lens)
         share = reprojection_px(adjusted, marks, marks.surveyed_world) / marks.width_px
         found = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
-        found &= ~marks.of(*_outvoted(marks, found))
+        # Where most of a point's marks disagree, those that agree do so by chance.
+        found &= ~marks.of(*(n for n in marks.points if 2 * (found & marks.of(n)).sum() < marks.of(n).sum()))
         if (found == agree).all() or are_collinear(_coordinates(marks.where(found))):
             break
         agree = found
     return agree
-
-
-def _outvoted(marks: Marks, agree: Bool[np.ndarray, " M"]) -> list[str]:
-    """List points most of whose marks disagree: those that agree do so by chance."""
-    return [name for name in marks.points if 2 * np.count_nonzero(agree & marks.of(name)) < marks.of(name).sum()]
 
 
 def _choose_lens(
@@ -237,7 +227,13 @@ def _rejected(model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarr
             seen = triangulate_points(model, marks.where(own), 2 * _MARK_TOLERANCE)
             share = reprojection_px(model, marks.where(own), np.tile(seen.get(name, surveyed), (len(wrong), 1)))
             if name in seen and (share < 2 * _MARK_TOLERANCE * marks.width_px[own]).all():
-                found.append(LeftOut("control point", name, _misplaced(len(wrong), seen[name] - surveyed)))
+                east, north, up = error_m = seen[name] - surveyed
+                reason = (
+                    f"its {len(wrong)} marks agree with one another, but show it "
+                    f"{metres(float(np.linalg.norm(error_m)))} from where it was surveyed ({east:+.2f} m east, "
+                    f"{north:+.2f} m north, {up:+.2f} m up): check its coordinates and its name"
+                )
+                found.append(LeftOut("control point", name, reason))
                 continue
         found += [
             LeftOut(
@@ -250,30 +246,3 @@ def _rejected(model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarr
             for i in wrong
         ]
     return tuple(found)
-
-
-def _misplaced(count: int, error_m: Float64[np.ndarray, " 3"]) -> str:
-    east, north, up = error_m
-    return (
-        f"its {count} marks agree with one another, but show it {metres(float(np.linalg.norm(error_m)))} from where it "
-        f"was surveyed ({east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up): check its coordinates and its name"
-    )
-
-
-def _lens_notes(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction, free_lens: bool) -> tuple[str, ...]:
-    if not free_lens:
-        return ()
-    changes = [
-        f"{camera.mean_focal_length():.1f} to {adjusted.camera(number).mean_focal_length():.1f} px"
-        for number, camera in sorted(model.cameras.items())
-    ]
-    return (
-        f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): this "
-        "reduces the errors of points that are left out in turn.",
-    )
-
-
-def _unchecked(marks: Marks, check: Residuals) -> tuple[str, ...]:
-    rest = sorted(set(marks.point) - set(check.names))
-    why = "one photograph shows it, or too few points would be left"
-    return (f"Used, but not checked: {list_names(rest)}; {why}.",) if rest else ()

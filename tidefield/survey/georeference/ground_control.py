@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, compress
+from itertools import combinations
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float64, Int, Shaped
 from scipy.optimize import least_squares
 
 from tidefield.data.georeference import LeftOut
@@ -38,8 +38,8 @@ class Marks:
         surveyed_world: the control point's coordinates.
     """
 
-    point: tuple[str, ...]
-    photograph: tuple[str, ...]
+    point: Shaped[np.ndarray, " M"]
+    photograph: Shaped[np.ndarray, " M"]
     image: Int[np.ndarray, " M"]
     uv_px: Float64[np.ndarray, "M 2"]
     zoom: Float64[np.ndarray, " M"]
@@ -51,15 +51,7 @@ class Marks:
 
     def where(self, mask: Bool[np.ndarray, " M"]) -> Marks:
         """Select marks by a mask."""
-        return Marks(
-            tuple(compress(self.point, mask)),
-            tuple(compress(self.photograph, mask)),
-            self.image[mask],
-            self.uv_px[mask],
-            self.zoom[mask],
-            self.width_px[mask],
-            self.surveyed_world[mask],
-        )
+        return Marks(**{name: values[mask] for name, values in vars(self).items()})
 
     def of(self, *points: str) -> Bool[np.ndarray, " M"]:
         """Mask the marks of these points."""
@@ -68,7 +60,7 @@ class Marks:
     @property
     def points(self) -> dict[str, Float64[np.ndarray, " 3"]]:
         """Surveyed coordinates of the marked points, by name."""
-        return {name: self.surveyed_world[self.point.index(name)] for name in sorted(set(self.point))}
+        return {name: self.surveyed_world[self.point == name][0] for name in sorted(set(self.point.tolist()))}
 
 
 def locate_marks(
@@ -99,8 +91,8 @@ def locate_marks(
     width = np.array([model.camera(images[mark.photograph].camera_id).width for mark in found], dtype=np.float64)
     zoom = np.array([sizes[mark.photograph] for mark in found]) / width
     marks = Marks(
-        tuple(mark.point for mark in found),
-        tuple(mark.photograph for mark in found),
+        np.array([mark.point for mark in found]),
+        np.array([mark.photograph for mark in found]),
         np.array([images[mark.photograph].image_id for mark in found], dtype=np.int64),
         np.array([mark.uv_px for mark in found], dtype=np.float64).reshape(-1, 2) / zoom[:, None],
         zoom,
