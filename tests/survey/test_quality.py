@@ -16,7 +16,7 @@ from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.quality.assessment import (
     QualityDecision,
     assess_quality,
-    find_off_survey,
+    find_beyond_gap,
     select_photographs,
 )
 from tidefield.survey.quality.measures import sharpness
@@ -216,7 +216,7 @@ def test_a_survey_of_many_fields_is_one_survey(tmp_path):
             assert taken.position is not None
             east = replace(taken.position, longitude_deg=taken.position.longitude_deg + 0.01 * field)
             fields.append(replace(taken, name=f"{field:02d}/{taken.name}", position=east))
-    assert find_off_survey(fields) == {}
+    assert find_beyond_gap(fields) == {}
 
 
 def test_a_flat_set_is_one_clear_error(tmp_path):

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+VerticalDatum = Literal["mean sea level", "ellipsoid", "unknown"]
+
 
 @dataclass(frozen=True)
 class Position:
@@ -28,7 +30,7 @@ class Position:
     height_m: float
     horizontal_m: float
     vertical_m: float
-    datum: Literal["mean sea level", "ellipsoid", "unknown"]
+    datum: VerticalDatum
     source: str
 
 

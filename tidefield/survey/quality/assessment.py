@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64, Int, Int8
+from jaxtyping import Int8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -22,7 +22,7 @@ from tidefield.errors import SurveyError
 from tidefield.machine import cores
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.io.photographs import FEWEST
-from tidefield.survey.io.positions import metres_around
+from tidefield.survey.io.positions import positions_m
 from tidefield.survey.quality.duplicates import capture_order, find_duplicates, outline
 from tidefield.survey.quality.measures import SIDE_PX, Measures, measure
 from tidefield.survey.survey import Photograph, Survey
@@ -90,17 +90,18 @@ def assess_quality(survey: Survey, progress: Callable[[int, int], None] | None =
     for index, measures in enumerate(measured):
         if measures is not None:
             neighbours = [other for other in (measured[i] for i in near[index]) if other is not None]
-            reasons[index] = _flat(measures) or _exposed(measures, neighbours)
+            reasons[index] = _flat_or_badly_exposed(measures, neighbours)
     # Photographs that are left out already must not be what the others are compared with.
     sharp = [math.nan if reason or not m else m.sharpness for m, reason in zip(measured, reasons, strict=True)]
-    of_survey = _median_of_camera(photographs, sharp)
+    kinds = [(p.camera, min(p.width, p.height), max(p.width, p.height)) for p in photographs]
+    of_kind = {k: _median([s for kind, s in zip(kinds, sharp, strict=True) if kind == k]) for k in set(kinds)}
     for index, measures in enumerate(measured):
         if measures is not None and reasons[index] is None:
             of_neighbours = _median([sharp[i] for i in near[index]])
-            reasons[index] = _blurred(sharp[index], of_survey[index], of_neighbours) or _horizon(
+            reasons[index] = _blurred(sharp[index], of_kind[kinds[index]], of_neighbours) or _horizon(
                 photographs[index], measures
             )
-    for index, reason in find_off_survey(photographs).items():
+    for index, reason in {**find_beyond_gap(photographs), **_low(photographs)}.items():
         reasons[index] = reasons[index] or reason
     kept = [index for index, reason in enumerate(reasons) if reason is None]
     duplicates = find_duplicates([photographs[i] for i in kept], [outlines[i] for i in kept], [sharp[i] for i in kept])
@@ -140,11 +141,6 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
     return replace(survey, photographs=photographs, control=control)
 
 
-def find_off_survey(photographs: Sequence[Photograph]) -> dict[int, str]:
-    """Find the photographs that are far from the others or far below them; returns the reason by index."""
-    return {**_beyond_gap(photographs), **_low(photographs)}
-
-
 def _measure(
     photographs: Sequence[Photograph], progress: Callable[[int, int], None] | None
 ) -> tuple[list[Measures | None], list[Int8[np.ndarray, "_ _"]], list[str | None]]:
@@ -177,29 +173,13 @@ def _neighbours(photographs: Sequence[Photograph]) -> list[list[int]]:
     for rank, index in enumerate(by_time):
         first = max(0, min(rank - count // 2, len(by_time) - count - 1))
         near[index] = [other for other in by_time[first : first + count + 1] if other != index]
-    located, xy_m = _located(photographs)
+    xy_m = positions_m(photographs)
+    located = np.flatnonzero(np.isfinite(xy_m[:, 0])).tolist()
     if len(located) > count:
-        _, found = KDTree(xy_m).query(xy_m, count + 1)
+        _, found = KDTree(xy_m[located]).query(xy_m[located], count + 1)
         for row, index in zip(found.reshape(len(located), -1), located, strict=True):
             near[index] = [located[other] for other in row if located[other] != index][:count]
     return near
-
-
-def _located(photographs: Sequence[Photograph]) -> tuple[list[int], Float64[np.ndarray, "N 2"]]:
-    """Indices of the photographs with a position, and their east and north in metres."""
-    located = [(index, p.position) for index, p in enumerate(photographs) if p.position is not None]
-    xy_m = metres_around([position for _, position in located]) if located else np.zeros((0, 2))
-    return [index for index, _ in located], xy_m
-
-
-def _median_of_camera(photographs: Sequence[Photograph], values: Sequence[float]) -> list[float]:
-    """For each photograph the median over all of its camera and size."""
-    kinds = [(p.camera, min(p.width, p.height), max(p.width, p.height)) for p in photographs]
-    by_kind: dict[tuple[str, int, int], list[float]] = {}
-    for kind, value in zip(kinds, values, strict=True):
-        by_kind.setdefault(kind, []).append(value)
-    median = {kind: _median(several) for kind, several in by_kind.items()}
-    return [median[kind] for kind in kinds]
 
 
 def _median(values: Sequence[float]) -> float:
@@ -208,16 +188,12 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(finite)) if finite else math.nan
 
 
-def _flat(measures: Measures) -> str | None:
-    if measures.contrast >= FLAT_CONTRAST:
-        return None
-    return (
-        f"flat: 98% of the image lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
-        f"{FLAT_CONTRAST:.0f} or more."
-    )
-
-
-def _exposed(measures: Measures, neighbours: Sequence[Measures]) -> str | None:
+def _flat_or_badly_exposed(measures: Measures, neighbours: Sequence[Measures]) -> str | None:
+    if measures.contrast < FLAT_CONTRAST:
+        return (
+            f"flat: 98% of the image lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
+            f"{FLAT_CONTRAST:.0f} or more."
+        )
     if measures.white > WHITE:
         return f"over-exposed: {measures.white:.0%} of it is white; {WHITE:.0%} is the limit."
     if measures.highlights < DARK_HIGHLIGHTS:
@@ -258,7 +234,12 @@ def _blurred(sharpness: float, usual: float, of_neighbours: float) -> str | None
 
 def _horizon(photograph: Photograph, measures: Measures) -> str | None:
     """Use the gimbal pitch where the image confirms it (makers define it differently), else the image alone."""
-    above = _above_horizon(photograph)
+    above = math.nan  # share of the image above the horizon, if the camera does not roll
+    if photograph.gimbal_deg is not None:
+        lens, pitch_deg = photograph.lens, min(89.0, max(-89.0, photograph.gimbal_deg[1]))
+        focal_px = lens.focal_px if lens else _UNKNOWN_FOCAL * max(photograph.width, photograph.height)
+        above = 0.5 + focal_px * math.tan(math.radians(pitch_deg)) / photograph.height
+        above = min(1.0, max(0.0, above))
     if above > SKY_BELOW_HORIZON and measures.sky > SKY_AT_LEAST:
         return f"horizon: {above:.0%} of it is above the horizon; {SKY_BELOW_HORIZON:.0%} is the limit."
     if math.isnan(above) and measures.sky > SKY:
@@ -266,24 +247,22 @@ def _horizon(photograph: Photograph, measures: Measures) -> str | None:
     return None
 
 
-def _above_horizon(photograph: Photograph) -> float:
-    """Share of the image above the horizon, if the camera does not roll; NaN where its pitch is unknown."""
-    if photograph.gimbal_deg is None:
-        return math.nan
-    lens, side = photograph.lens, max(photograph.width, photograph.height)
-    focal_px = lens.focal_px if lens else _UNKNOWN_FOCAL * side
-    pitch = math.radians(min(89.0, max(-89.0, photograph.gimbal_deg[1])))
-    return min(1.0, max(0.0, 0.5 + focal_px * math.tan(pitch) / photograph.height))
-
-
-def _beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
-    located, xy_m = _located(photographs)
+def find_beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
+    """Find the few photographs beyond a gap in the survey; returns the reason by index."""
+    xy_m = positions_m(photographs)
+    located = np.flatnonzero(np.isfinite(xy_m[:, 0])).tolist()
+    xy_m = xy_m[located]
     if len(located) < 4:
         return {}
     nearest_m = float(np.median(KDTree(xy_m).query(xy_m, 2)[0][:, 1]))
     height_m = _flight_height_m(photographs)
     gap_m = max(_MIN_GAP_M, GAP_SPACINGS * nearest_m, GAP_HEIGHTS * height_m if height_m > 0 else 0.0)
-    cluster = _clusters(xy_m, gap_m)
+    # Single linkage with distances shorter than a gap. Positions are rounded to an eighth of the gap first, because
+    # thousands at one position would be millions of pairs.
+    cells, cell_of = np.unique(np.round(xy_m * (_CELLS_IN_GAP / gap_m)), axis=0, return_inverse=True)
+    pairs = KDTree(cells).query_pairs(_CELLS_IN_GAP, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    cluster = connected_components(graph, directed=False)[1][cell_of.reshape(-1)]
     sizes = np.bincount(cluster)
     largest = sizes.argmax()
     small = sizes <= max(1.0, min(MAX_FEW, FEW * len(located)))
@@ -296,18 +275,6 @@ def _beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
         "is the limit."
         for row in np.flatnonzero(small[cluster])
     }
-
-
-def _clusters(xy_m: Float64[np.ndarray, "N 2"], gap_m: float) -> Int[np.ndarray, " N"]:
-    """Number of the cluster of each position: single linkage with distances shorter than a gap.
-
-    Positions are rounded to an eighth of the gap first, because thousands at one position would be millions of pairs.
-    """
-    cells, cell_of = np.unique(np.round(xy_m * (_CELLS_IN_GAP / gap_m)), axis=0, return_inverse=True)
-    pairs = KDTree(cells).query_pairs(_CELLS_IN_GAP, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    _, cluster = connected_components(graph, directed=False)
-    return cluster[cell_of.reshape(-1)]
 
 
 def _low(photographs: Sequence[Photograph]) -> dict[int, str]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8
 
-from tidefield.survey.io.positions import metres_around
+from tidefield.survey.io.positions import positions_m
 from tidefield.survey.survey import Photograph
 
 MAX_SHIFT = 0.03
@@ -45,10 +45,7 @@ def find_duplicates(
     coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(-1, _COARSE[0] * _COARSE[1])
     order = sorted(range(len(photographs)), key=lambda i: (-(sharpness[i] if sharpness[i] > 0 else 0.0), i))
     rank = np.argsort(np.array(capture_order(photographs), dtype=np.int64))
-    xy_m = np.full((len(photographs), 2), math.nan)
-    located = [i for i, photograph in enumerate(photographs) if photograph.position is not None]
-    if located:
-        xy_m[located] = metres_around([p.position for p in photographs if p.position is not None])
+    xy_m = positions_m(photographs)
     kept: list[int] = []
     reasons = {}
     for index in order:
