@@ -1,13 +1,19 @@
 """Make a Scene on disk from a survey: one stage after the other, with files between them.
 
-SCENE/prepare contains the intermediate files, and the state of the stages in `stages.json`. The names of the stages,
-their options and the keys of their results are a file format: a change makes earlier scenes start again.
+SCENE/prepare contains the intermediate files, and the state of the stages in `stages.json`: the result of each, and a
+key, which is a digest of its options and of the key of the stage before it, so that a changed option repeats that stage
+and all that follow. The names of the stages, their options and the keys of their results are a file format: a change
+makes earlier scenes start again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +25,7 @@ from rich.console import Console
 from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
+from tidefield.files import write_json, writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import write_images, write_transforms
@@ -28,15 +35,90 @@ from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
-from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
 
+log = logging.getLogger(__name__)
+
+Facts = dict[str, Any]
+"""Result of a stage, as JSON."""
 COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
-
-
 STAGES = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
 """In their order."""
+
+
+class Stages:
+    """The stages of one working folder and their state.
+
+    Args:
+        folder: contains `stages.json` and the stages' files; created if it does not exist.
+        source: what the first stage depends on (any JSON).
+        redo: name of a stage to repeat, with all that follow, even if nothing has changed.
+
+    Attributes:
+        seconds: run time of each stage, including interrupted attempts.
+
+    Raises:
+        RunError: the folder cannot be written to, or `stages.json` is damaged.
+    """
+
+    def __init__(self, folder: Path, source: object, redo: str | None = None) -> None:
+        with writing_to(folder.parent):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._file = folder, folder / "stages.json"
+        self._records = self._read()
+        self._key, self._redo, self._is_redoing = _digest(source), redo, False
+        self.seconds: dict[str, float] = {}
+
+    def run(self, name: str, options: object, outputs: Sequence[Path], job: Callable[[bool], Facts]) -> Facts:
+        """Run a stage unless it is complete.
+
+        Args:
+            options: everything its result depends on, besides the previous stages (any JSON).
+            outputs: files or folders that must exist for the stage to count as complete.
+            job: runs the stage; called with whether an interrupted attempt with the same key can be continued.
+
+        Returns:
+            The job's result, of this run or of an earlier one.
+        """
+        self._key = _digest([self._key, name, options])
+        self._is_redoing = self._is_redoing or name == self._redo
+        record = self._records.get(name, {})
+        is_same = record.get("key") == self._key and not self._is_redoing
+        if is_same and record.get("done") and all(path.exists() for path in outputs):
+            self.seconds[name] = record["seconds"]
+            log.info(f"{name}: complete already")
+            return record["facts"]
+        earlier = record.get("seconds", 0.0) if is_same else 0.0
+        record = self._records[name] = {"key": self._key, "done": False, "seconds": earlier}
+        write_json(self._file, self._records)
+        start = time.monotonic()
+        try:
+            with writing_to(self._folder.parent):
+                facts = job(is_same)
+            record |= {"done": True, "facts": facts}
+        finally:
+            self.seconds[name] = record["seconds"] = earlier + time.monotonic() - start
+            write_json(self._file, self._records)
+        return facts
+
+    def _read(self) -> dict[str, Facts]:
+        if not self._file.exists():
+            return {}
+        try:
+            records = json.loads(self._file.read_text(encoding="utf-8"))
+            if not isinstance(records, dict) or not all(isinstance(r, dict) for r in records.values()):
+                raise ValueError("no table of stages")
+        except ValueError as error:
+            raise RunError(
+                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._folder} to "
+                "start again"
+            ) from error
+        return records
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -97,7 +179,11 @@ def prepare(
         raise RunError(f"there is no stage {options.redo!r}: expected one of {', '.join(STAGES)}; name one of these")
     stages = Stages(work, _fingerprint(survey), options.redo)
 
-    quality = stages.run("quality", {}, [], lambda _: judge_quality(survey, console))
+    def judge_quality(_: bool) -> Facts:
+        with ProgressBar(console, "Judging photographs") as bar:
+            return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
+
+    quality = stages.run("quality", {}, [], judge_quality)
     verdicts = tuple(_verdict_from_json(verdict) for verdict in quality["verdicts"])
     good = select_photographs(survey, verdicts, options.keep_all)
     names = [photograph.name for photograph in good.photographs]
@@ -139,12 +225,6 @@ def prepare(
         _correction_from_json(written["evening"]),
         stages.seconds,
     )
-
-
-def judge_quality(survey: Survey, console: Console) -> Facts:
-    """Judge the quality of every photograph."""
-    with ProgressBar(console, "Judging photographs") as bar:
-        return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
 
 
 def extract_features(

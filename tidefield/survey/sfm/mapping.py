@@ -27,7 +27,7 @@ from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions
 from tidefield.survey.sfm.features import Progress, decode_name
-from tidefield.survey.stages import interruptible
+from tidefield.survey.sfm.matching import interruptible
 from tidefield.survey.survey import Photograph
 
 MIN_PHOTOGRAPHS = 3
