@@ -14,7 +14,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -66,7 +66,17 @@ class Stages:
         with writing_to(folder.parent):
             folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._file = folder, folder / "stages.json"
-        self._records = self._read()
+        self._records: dict[str, Facts] = {}
+        if self._file.exists():
+            try:
+                self._records = json.loads(self._file.read_text(encoding="utf-8"))
+                if not isinstance(self._records, dict) or not all(isinstance(r, dict) for r in self._records.values()):
+                    raise ValueError("no table of stages")
+            except ValueError as error:
+                raise RunError(
+                    f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {folder} to start "
+                    "again"
+                ) from error
         self._key, self._redo, self._is_redoing = _digest(source), redo, False
         self.seconds: dict[str, float] = {}
 
@@ -102,40 +112,9 @@ class Stages:
             write_json(self._file, self._records)
         return facts
 
-    def _read(self) -> dict[str, Facts]:
-        if not self._file.exists():
-            return {}
-        try:
-            records = json.loads(self._file.read_text(encoding="utf-8"))
-            if not isinstance(records, dict) or not all(isinstance(r, dict) for r in records.values()):
-                raise ValueError("no table of stages")
-        except ValueError as error:
-            raise RunError(
-                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._folder} to "
-                "start again"
-            ) from error
-        return records
-
 
 def _digest(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
-
-@dataclass(frozen=True)
-class PrepareOptions:
-    """Options of `prepare`.
-
-    Attributes:
-        keep_all: use photographs of low quality too.
-        colour: correct exposures and lens falloff: where it helps, always, or never.
-        features: options of feature extraction.
-        redo: a stage to repeat, with all that follow.
-    """
-
-    keep_all: bool = False
-    colour: Literal["auto", "on", "off"] = "auto"
-    features: FeatureOptions = field(default_factory=FeatureOptions)
-    redo: str | None = None
 
 
 @dataclass(frozen=True)
@@ -164,9 +143,22 @@ class Prepared:
 
 
 def prepare(
-    survey: Survey, scene: Path, options: PrepareOptions, device: pycolmap.Device, console: Console
+    survey: Survey,
+    scene: Path,
+    features: FeatureOptions,
+    device: pycolmap.Device,
+    console: Console,
+    *,
+    keep_all: bool = False,
+    colour: Literal["auto", "on", "off"] = "auto",
+    redo: str | None = None,
 ) -> Prepared:
     """Make a scene of a survey, or continue an interrupted run.
+
+    Args:
+        keep_all: use photographs of low quality too.
+        colour: correct exposures and lens falloff: where it helps, always, or never.
+        redo: a stage to repeat, with all that follow.
 
     Raises:
         RunError: the scene's folder contains something else, or cannot be written to.
@@ -175,9 +167,9 @@ def prepare(
     _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
     database, model = work / "database.db", work / "model"
-    if options.redo not in (None, *STAGES):
-        raise RunError(f"there is no stage {options.redo!r}: expected one of {', '.join(STAGES)}; name one of these")
-    stages = Stages(work, _fingerprint(survey), options.redo)
+    if redo not in (None, *STAGES):
+        raise RunError(f"there is no stage {redo!r}: expected one of {', '.join(STAGES)}; name one of these")
+    stages = Stages(work, _fingerprint(survey), redo)
 
     def judge_quality(_: bool) -> Facts:
         with ProgressBar(console, "Judging photographs") as bar:
@@ -185,18 +177,29 @@ def prepare(
 
     quality = stages.run("quality", {}, [], judge_quality)
     verdicts = tuple(_verdict_from_json(verdict) for verdict in quality["verdicts"])
-    good = select_photographs(survey, verdicts, options.keep_all)
+    good = select_photographs(survey, verdicts, keep_all)
     names = [photograph.name for photograph in good.photographs]
 
-    stages.run(
-        "features",
-        [names, asdict(options.features)],
-        [database],
-        lambda resume: extract_features(good.photographs, database, options.features, device, console, resume),
-    )
+    def extract_features(resume: bool) -> Facts:
+        if not resume:
+            database.unlink(missing_ok=True)
+        with ProgressBar(console, "Extracting features") as bar:
+            return {"features": extract(good.photographs, database, features, device, bar)}
+
+    stages.run("features", [names, asdict(features)], [database], extract_features)
     chosen = stages.run("pairs", {}, [], lambda _: choose_pairs(good.photographs, database, console))
     pairs = [(first, second) for first, second in chosen["pairs"]]
-    stages.run("matches", {}, [database], lambda resume: match_pairs(pairs, database, device, console, resume))
+
+    def match_pairs(resume: bool) -> Facts:
+        if not resume:
+            with pycolmap.Database.open(database) as db:
+                db.clear_matches()
+                db.clear_two_view_geometries()
+        with ProgressBar(console, "Matching") as bar:
+            agree, inliers = match(database, pairs, device, bar)
+        return {"agree": agree, "inliers": inliers}
+
+    stages.run("matches", {}, [database], match_pairs)
     poses = stages.run("poses", {}, [model], lambda _: estimate_poses(survey, database, model, console))
     stages.run(
         "georeference",
@@ -208,9 +211,9 @@ def prepare(
     placed = [photograph for photograph in good.photographs if photograph.name in registered]
     written = stages.run(
         "images",
-        {"colour": options.colour},
+        {"colour": colour},
         [images, scene / "transforms.json"],
-        lambda _: write_scene(placed, scene, options.colour, console),
+        lambda _: write_scene(placed, scene, colour, console),
     )
 
     located = read_georeference(scene)
@@ -227,21 +230,6 @@ def prepare(
     )
 
 
-def extract_features(
-    photographs: Sequence[Photograph],
-    database: Path,
-    options: FeatureOptions,
-    device: pycolmap.Device,
-    console: Console,
-    resume: bool,
-) -> Facts:
-    """Extract features of the good photographs into the database."""
-    if not resume:
-        database.unlink(missing_ok=True)
-    with ProgressBar(console, "Extracting features") as bar:
-        return {"features": extract(photographs, database, options, device, bar)}
-
-
 def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
     """Choose the pairs of photographs to match, by name."""
     with pycolmap.Database.open(database) as db:
@@ -250,19 +238,6 @@ def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Con
     with ProgressBar(console, "Choosing pairs") as bar:
         pairs = select_pairs(candidate_pairs(photographs), preview_descriptors(largest), bar)
     return {"pairs": [[photographs[i].name, photographs[j].name] for i, j in pairs]}
-
-
-def match_pairs(
-    pairs: Sequence[tuple[str, str]], database: Path, device: pycolmap.Device, console: Console, resume: bool
-) -> Facts:
-    """Match the pairs and verify their geometry, in the database."""
-    if not resume:
-        with pycolmap.Database.open(database) as db:
-            db.clear_matches()
-            db.clear_two_view_geometries()
-    with ProgressBar(console, "Matching") as bar:
-        agree, inliers = match(database, pairs, device, bar)
-    return {"agree": agree, "inliers": inliers}
 
 
 def estimate_poses(survey: Survey, database: Path, folder: Path, console: Console) -> Facts:

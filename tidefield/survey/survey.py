@@ -6,10 +6,13 @@ scenes that were prepared earlier start again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+Progress = Callable[[int, int], object]
+"""Called with (done, of how many)."""
 VerticalDatum = Literal["mean sea level", "ellipsoid", "unknown"]
 
 

@@ -9,7 +9,7 @@ kept.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pycolmap
@@ -18,7 +18,8 @@ from jaxtyping import Float64
 from tidefield.errors import list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.geometry.similarity import outliers
-from tidefield.survey.georeference.gps_alignment import GivenPositions, PositionFit, camera_centres, metres
+from tidefield.survey.georeference.gps_alignment import GivenPositions, PositionFit, camera_centres, metres, rms_m
+from tidefield.survey.survey import Progress
 
 DIFFERENTIAL_M = 0.3
 """Positions with a stated standard deviation below this are from a differential receiver."""
@@ -42,10 +43,7 @@ _TOLERANCE = 1e-7
 
 
 def adjust_to_positions(
-    model: pycolmap.Reconstruction,
-    positions: GivenPositions,
-    fit: PositionFit,
-    progress: Callable[[int, int], object],
+    model: pycolmap.Reconstruction, positions: GivenPositions, fit: PositionFit, progress: Progress
 ) -> tuple[str, ...]:
     """Adjust an aligned model to differential positions, in place, if cross-validation shows that this helps.
 
@@ -54,7 +52,6 @@ def adjust_to_positions(
     Args:
         positions: with the accuracies that the receivers state.
         fit: of the model to the positions, which names gross errors.
-        progress: called with the numbers of finished and of all adjustments.
 
     Returns:
         Notes on the adjustment; none if the model was not adjusted.
@@ -94,7 +91,7 @@ def adjust_to_positions(
     rejected = [name for name, is_wrong in zip(names, wrong, strict=True) if is_wrong]
     carry_over(_adjusted(model, priors, rejected, free), model)
     was, now = (
-        f"{metres(_rms(error[~wrong, :2]))} horizontally and {metres(_rms(error[~wrong, 2:]))} vertically"
+        f"{metres(rms_m(error[~wrong, :2]))} horizontally and {metres(rms_m(error[~wrong, 2:]))} vertically"
         for error in (before, after)
     )
     notes = [
@@ -227,7 +224,3 @@ def _residual_m(
 
 def _median(error_m: Float64[np.ndarray, "N 3"]) -> float:
     return float(np.median(np.linalg.norm(error_m, axis=1)))
-
-
-def _rms(error_m: Float64[np.ndarray, "N K"]) -> float:
-    return float(np.sqrt((error_m**2).sum(1).mean()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
 from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions
-from tidefield.survey.georeference.control_adjustment import adjust_to_control
 from tidefield.survey.georeference.gps_alignment import (
     GivenPositions,
     camera_centres,
@@ -22,14 +21,12 @@ from tidefield.survey.georeference.gps_alignment import (
     fit_positions,
     given_positions,
 )
-from tidefield.survey.georeference.ground_control import fit_control, locate_marks
+from tidefield.survey.georeference.ground_control import adjust_to_control, fit_control, locate_marks
 from tidefield.survey.io.gcp_file import refuse_elsewhere
-from tidefield.survey.survey import Photograph, Survey
+from tidefield.survey.survey import Photograph, Progress, Survey
 
 
-def georeference(
-    model: pycolmap.Reconstruction, survey: Survey, progress: Callable[[int, int], object]
-) -> Georeference:
+def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progress) -> Georeference:
     """Transform a model of any frame into the world, in place, and adjust it to positions and ground control.
 
     Positions of differential receivers remove the bend of the model. With three control points or more the model is

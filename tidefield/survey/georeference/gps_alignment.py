@@ -186,10 +186,19 @@ def fit_positions(
         error = similarity(centres) - given
         used = ~outliers(np.linalg.norm(error, axis=1), 5 * np.linalg.norm(nominal, axis=1))
         sigma = _observed_sigma(error, used, stated)
-        similarity, notes = _refined(similarity, centres[used], given[used], sigma[used], down)
+        refined, notes = refine_similarity(similarity, centres[used], given[used], sigma[used]), ()
+        if refined.tilt_rad >= _MAX_TILT_RAD:
+            prior = down.direction_model, down.sigma_rad
+            refined = refine_similarity(similarity, centres[used], given[used], sigma[used], *prior)
+            notes = (
+                "The cameras' positions alone do not determine the vertical (they lie on one line, or are too "
+                f"inaccurate): it is taken from {down.source}, to within about "
+                f"{math.degrees(refined.tilt_rad):.1f} degrees.",
+            )
+        similarity = refined.similarity
     error = similarity(centres) - given
-    spread = np.linalg.norm((given[used] - given[used].mean(0))[:, :2], axis=1)
-    if len(spread) < 3 or _rms(np.linalg.norm(error[used, :2], axis=1)) >= 0.5 * _rms(spread):
+    spread_m = rms_m((given[used] - given[used].mean(0))[:, :2])
+    if np.count_nonzero(used) < 3 or rms_m(error[used, :2]) >= 0.5 * spread_m:
         return None
     distance = np.linalg.norm(error, axis=1)
     typical = metres(float(np.median(distance[used])))
@@ -205,13 +214,18 @@ def fit_positions(
     return PositionFit(positions.names, similarity, centres, given, used, sigma, gross_errors, notes)
 
 
+def rms_m(error_m: Float64[np.ndarray, "N K"]) -> float:
+    """Compute the root mean square length of errors."""
+    return float(np.sqrt((error_m**2).sum(1).mean()))
+
+
 def metres(length_m: float) -> str:
     """Format a length with the digits that matter."""
     if length_m >= 10_000:
         return f"{length_m / 1000:,.0f} km"
-    return (
-        f"{length_m:,.0f} m" if length_m >= 20 else f"{length_m:.1f} m" if length_m >= 2 else f"{100 * length_m:.0f} cm"
-    )
+    if length_m >= 2:
+        return f"{length_m:,.0f} m" if length_m >= 20 else f"{length_m:.1f} m"
+    return f"{100 * length_m:.0f} cm"
 
 
 def _observed_sigma(
@@ -229,24 +243,6 @@ def _observed_sigma(
     horizontal = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, :2])))
     vertical = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, 2])))
     return relative * [horizontal, horizontal, vertical]
-
-
-def _refined(
-    start: Similarity,
-    source: Float64[np.ndarray, "N 3"],
-    target: Float64[np.ndarray, "N 3"],
-    sigma: Float64[np.ndarray, "N 3"],
-    down: Down,
-) -> tuple[Similarity, tuple[str, ...]]:
-    """Refine a similarity, with the prior of the vertical where positions do not determine it; also what to note."""
-    fit = refine_similarity(start, source, target, sigma)
-    if fit.tilt_rad < _MAX_TILT_RAD:
-        return fit.similarity, ()
-    held = refine_similarity(start, source, target, sigma, down.direction_model, down.sigma_rad)
-    return held.similarity, (
-        "The cameras' positions alone do not determine the vertical (they lie on one line, or are too inaccurate): it "
-        f"is taken from {down.source}, to within about {math.degrees(held.tilt_rad):.1f} degrees.",
-    )
 
 
 def _robust_start(
@@ -280,10 +276,6 @@ def _refuse_mirrored(
                 "expected latitude, counted positive to the north, and longitude, to the east; correct them where they "
                 "were given"
             )
-
-
-def _rms(values: Float64[np.ndarray, " N"]) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _unit(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:

@@ -10,6 +10,7 @@ from PIL import ExifTags
 
 from tidefield.survey.io.image_decoding import upright_rotation, upright_uv
 from tidefield.survey.io.metadata import PhotographMetadata
+from tidefield.survey.io.text_files import leading_numbers
 from tidefield.survey.survey import LensPrior
 
 # Diagonal of the 36 x 24 mm frame of 35 mm film. CIPA's guideline DCG-001 defines the equivalent by the angle over the
@@ -43,7 +44,6 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
     EXIF's focal length over a sensor of known width, its 35 mm equivalent, its focal plane resolution.
 
     Args:
-        metadata: EXIF and XMP of the file.
         width, height: size of the image as stored, in pixels.
         orientation: EXIF orientation.
     """
@@ -81,13 +81,10 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
 def _dji_dewarp(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
     """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3` in pixels of the full image, cx and cy from its centre
     (https://www.easymanua.ls/dji/mavic-3m/manual?p=90)."""
-    numbers = metadata.xmp.get("DewarpData", "").rpartition(";")[2].split(",")
-    try:
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = map(float, numbers)
-    except ValueError:  # absent, or of another format
+    numbers = leading_numbers(metadata.xmp.get("DewarpData", "").rpartition(";")[2].split(","))
+    if len(numbers) != 9 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:  # absent, or of another format
         return None
-    if not (np.isfinite([fx, fy, cx, cy, k1, k2, p1, p2, k3]).all() and min(fx, fy) > 0):
-        return None
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     _, scale = _dji_reduction(metadata, width, height)
     focal_px = scale * (fx + fy) / 2
     if metadata.xmp.get("DewarpFlag") == "1":

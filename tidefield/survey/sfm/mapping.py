@@ -25,10 +25,10 @@ import pycolmap
 from tidefield.errors import SurveyError
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
-from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions
-from tidefield.survey.sfm.features import Progress, decode_name
+from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
+from tidefield.survey.sfm.features import decode_name
 from tidefield.survey.sfm.matching import interruptible
-from tidefield.survey.survey import Photograph
+from tidefield.survey.survey import Photograph, Progress
 
 MIN_PHOTOGRAPHS = 3
 """Photographs of the smallest model."""
@@ -211,8 +211,7 @@ def _try_lens(
     _adjust(model, lens, refine_focal)
     fit, off_m = _fit_to_positions(model, photographs), None
     if fit is not None:
-        error_m = (fit.world_from_model(fit.centres_model) - fit.given_world)[fit.used]
-        off_m = float(np.sqrt((error_m**2).sum(1).mean()))
+        off_m = rms_m((fit.world_from_model(fit.centres_model) - fit.given_world)[fit.used])
     camera = model.cameras[min(model.cameras)]
     return LensTrial(lens, model.compute_mean_reprojection_error(), off_m, camera.mean_focal_length())
 

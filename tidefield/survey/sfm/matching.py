@@ -22,8 +22,8 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from tidefield.survey.sfm.features import Progress, encode_name
-from tidefield.survey.survey import Photograph
+from tidefield.survey.sfm.features import encode_name
+from tidefield.survey.survey import Photograph, Progress
 
 Result = TypeVar("Result")
 Pair = tuple[int, int]
