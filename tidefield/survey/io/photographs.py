@@ -152,7 +152,6 @@ def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
         focal_mm=metadata.exif.number(ExifTags.Base.FocalLength),
         lens=lens_prior(metadata, *stored, metadata.orientation),
         time_s=metadata.exif.time_s,
-        log_exposure=sum(metadata.exif.log_exposure_terms),
         position=metadata.position,
         relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
