@@ -75,9 +75,7 @@ def photograph(i: int, place: np.ndarray | None, names: list[str] | None = None)
         position = Position(latitude, longitude, height, math.nan, math.nan, "ellipsoid", "EXIF")
     name = name_of(i, names)
     size = (2 * WIDTH, 2 * HEIGHT)
-    return Photograph(
-        Path(name), name, *size, 1, "Maker Drone", "", 8.8, lens, 1.6e9 + 2 * i, math.nan, position, math.nan, None
-    )
+    return Photograph(Path(name), name, *size, 1, "Maker Drone", "", 8.8, lens, 1.6e9 + 2 * i, position, math.nan, None)
 
 
 def residuals(kind: str, count: int = 5, seed: int = 0, error_m: np.ndarray | None = None) -> Residuals:

@@ -8,7 +8,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from tidefield.data.georeference import Georeference
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.survey import Control, Mark, Photograph, Position, Survey
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 570.0  # of the model's images; photographs are twice as large
@@ -82,7 +84,7 @@ def photograph(i: int, longitude_latitude_height: np.ndarray) -> Photograph:
     position = Position(latitude, longitude, height, math.nan, math.nan, "mean sea level", "EXIF")
     size = (ZOOM * WIDTH, ZOOM * HEIGHT)
     nan = math.nan
-    return Photograph(Path(name_of(i)), name_of(i), *size, 1, "", "", nan, None, nan, nan, position, nan, None)
+    return Photograph(Path(name_of(i)), name_of(i), *size, 1, "", "", nan, None, nan, position, nan, None)
 
 
 def photographed(
@@ -149,6 +151,17 @@ def in_a_frame_of_its_own(model: pycolmap.Reconstruction, seed: int = 0) -> pyco
     return turned
 
 
+def quiet(done: int, whole: int) -> None:
+    """Progress that nobody sees."""
+    assert 0 <= done <= whole
+
+
+def located(flight: Flight, survey: Survey | None = None) -> tuple[pycolmap.Reconstruction, Georeference]:
+    """Georeference a copy of the flight's model that starts in an arbitrary frame."""
+    model = in_a_frame_of_its_own(flight.model)
+    return model, georeference(model, survey or flight.survey, quiet)
+
+
 def unlocated_photograph(
     k: int, latitude: float | None, longitude: float = 0.0, time_s: float | None = None
 ) -> Photograph:
@@ -165,7 +178,6 @@ def unlocated_photograph(
         focal_mm=nan,
         lens=None,
         time_s=float(k) if time_s is None else time_s,
-        log_exposure=nan,
         position=place,
         relative_altitude_m=nan,
         gimbal_deg=None,

@@ -6,22 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
+from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, located, name_of, with_control
 
 from tidefield.errors import SurveyError
-from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.georeference.gps_alignment import camera_centres, find_down
 from tidefield.survey.survey import Survey
-
-
-def quiet(done: int, whole: int) -> None:
-    assert 0 <= done <= whole
-
-
-def located(flight, survey: Survey | None = None):
-    """Georeference a copy of the flight's model that starts in an arbitrary frame."""
-    model = in_a_frame_of_its_own(flight.model)
-    return model, georeference(model, survey or flight.survey, quiet)
 
 
 def moved(survey: Survey, changes: dict[str, dict]) -> Survey:
@@ -188,14 +177,6 @@ def test_positions_across_the_date_line():
     _, found = located(flight, survey)
     assert found.frame.epsg in (32601, 32660)
     assert found.gps.horizontal_rms_m < 0.05
-
-
-def test_positions_at_zero_are_left_out():
-    flight = fly(noise_px=0.0)
-    survey = moved(flight.survey, {name_of(3): {"latitude_deg": 0.0, "longitude_deg": 0.0}})
-    _, found = located(flight, survey)
-    assert [(item.kind, item.name) for item in found.left_out] == [("GPS", name_of(3))]
-    assert found.gps.horizontal_rms_m < 0.01
 
 
 def differential(survey: Survey) -> Survey:

@@ -5,21 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, in_a_frame_of_its_own, name_of, with_control
+from located_surveys import (
+    CONTROL,
+    FOCAL,
+    FRAME,
+    HEIGHT,
+    WIDTH,
+    fly,
+    in_a_frame_of_its_own,
+    located,
+    name_of,
+    quiet,
+    with_control,
+)
 
 from tidefield.errors import SurveyError
 from tidefield.survey.georeference.bundle_adjustment import reliable
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.survey import Control, Survey
-
-
-def quiet(done: int, whole: int) -> None:
-    assert 0 <= done <= whole
-
-
-def located(flight, survey: Survey):
-    model = in_a_frame_of_its_own(flight.model)
-    return model, georeference(model, survey, quiet)
 
 
 def without_positions(survey: Survey) -> Survey:

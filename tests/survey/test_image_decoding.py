@@ -26,7 +26,7 @@ def read(path: Path) -> Photograph:
 def unread(path: Path) -> Photograph:
     """A photograph without metadata, for files that cannot be read."""
     nan = float("nan")
-    return Photograph(path, path.name, 1, 1, 1, "", "", nan, None, nan, nan, None, nan, None)
+    return Photograph(path, path.name, 1, 1, 1, "", "", nan, None, nan, None, nan, None)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])

@@ -58,7 +58,7 @@ def assert_same(own: Scene, other: Scene) -> None:
 @pytest.mark.parametrize("truth", [survey(BARREL), with_one_larger(survey(BARREL)), survey(PINHOLE, offset=UTM)])
 def test_a_colmap_scene_is_imported_unchanged(tmp_path: Path, truth: Truth, text: bool) -> None:
     write_colmap(tmp_path / "theirs", truth, text)
-    made = import_project(tmp_path / "theirs", tmp_path / "ours")
+    made, _ = import_project(tmp_path / "theirs", tmp_path / "ours")
     theirs, ours = read_posed(tmp_path / "theirs", False), read_posed(tmp_path / "ours", False)
     np.testing.assert_allclose(ours.T_world_camera, theirs.T_world_camera, atol=1e-8)
     assert (ours.names, ours.lenses) == (theirs.names, theirs.lenses)
@@ -70,18 +70,19 @@ def test_a_colmap_scene_is_imported_unchanged(tmp_path: Path, truth: Truth, text
         return set(map(tuple, seen))
 
     assert observed(ours.points) == observed(theirs.points)
-    assert (made.photographs, made.held_out, made.cameras) == (9, 2, len(set(truth.lenses)))
-    assert (made.points, made.observations) == (len(theirs.points.xyz_world), len(theirs.points.uv_px))
+    assert (made.num_images(), made.num_cameras()) == (9, len(set(truth.lenses)))
+    assert made.num_points3D() == len(theirs.points.xyz_world)
+    assert made.compute_num_observations() == len(theirs.points.uv_px)
     assert_same(load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs"))
 
 
 @pytest.mark.parametrize("kind", ["perspective", "brown", "radial"])
 def test_an_opensfm_project_becomes_a_consistent_colmap_model(tmp_path: Path, kind: str) -> None:
     write_project(tmp_path / "project", kind)
-    made = import_project(tmp_path / "project", tmp_path / "scene")
+    made, _ = import_project(tmp_path / "project", tmp_path / "scene")
     model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
-    assert model.num_reg_images() == made.photographs == 9
-    assert model.compute_num_observations() == made.observations > 1000
+    assert model.num_reg_images() == made.num_images() == 9
+    assert model.compute_num_observations() == made.compute_num_observations() > 1000
     assert max(point.error for point in model.points3D.values()) < 1e-6
     expected = "FULL_OPENCV" if kind == "brown" else "OPENCV"  # only brown has a sixth order
     assert {camera.model_name for camera in model.cameras.values()} == {expected}
@@ -94,8 +95,8 @@ def test_an_opensfm_project_becomes_a_consistent_colmap_model(tmp_path: Path, ki
 
 def test_points_without_observations_are_kept(tmp_path: Path) -> None:
     write_project(tmp_path / "project", tracks=False)
-    made = import_project(tmp_path / "project", tmp_path / "scene")
-    assert (made.points, made.observations) == (600, 0)
+    made, _ = import_project(tmp_path / "project", tmp_path / "scene")
+    assert (made.num_points3D(), made.compute_num_observations()) == (600, 0)
     ours, theirs = load_scene(tmp_path / "scene"), load_scene(tmp_path / "project")
     assert ours.points is None
     torch.testing.assert_close(ours.cameras.near_far, theirs.cameras.near_far)
@@ -122,7 +123,7 @@ def test_other_layouts_are_imported_with_a_warning_of_losses(tmp_path: Path, cap
 
 def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
-    assert import_project(tmp_path / "project", tmp_path / "a").georeference is None
+    assert import_project(tmp_path / "project", tmp_path / "a")[1] is None
     (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
     import_project(tmp_path / "project", tmp_path / "b")
     import_project(tmp_path / "b", tmp_path / "c")
@@ -193,7 +194,8 @@ def test_missing_photographs_are_left_out_on_request(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="--allow-missing"):
         import_project(tmp_path / "project", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
-    assert import_project(tmp_path / "project", tmp_path / "scene", allow_missing=True).photographs == 8
+    model, _ = import_project(tmp_path / "project", tmp_path / "scene", allow_missing=True)
+    assert model.num_images() == 8
     assert len(load_scene(tmp_path / "scene").names) == 8
 
 

@@ -5,15 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly
+from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly, quiet
 
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options
 from tidefield.survey.sfm.mapping import MIN_SPREAD_DEG, TERMS, LensChoice, LensTrial, best_of, choose_lens, lens_notes
 from tidefield.survey.survey import LensPrior
-
-
-def quiet(done: int, whole: int) -> None:
-    assert 0 <= done <= whole
 
 
 def camera(k1: float, k2: float, p1: float = 0.0, p2: float = 0.0) -> pycolmap.Camera:

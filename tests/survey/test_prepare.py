@@ -2,8 +2,8 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import ground_flight
 import numpy as np
@@ -17,16 +17,16 @@ from tidefield.data.load import load_scene
 from tidefield.errors import RunError, SurveyError
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.prepare import Prepared, PrepareOptions, prepare
+from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.features import FeatureOptions
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
-OPTIONS = PrepareOptions(features=FeatureOptions(count=1500))
+OPTIONS = FeatureOptions(count=1500)
 
 
-def run(folder: Path, scene: Path, options: PrepareOptions = OPTIONS) -> Prepared:
-    return prepare(read_survey(folder), scene, options, pycolmap.Device.cpu, Console(quiet=True))
+def run(folder: Path, scene: Path, colour: Literal["auto", "off"] = "auto") -> Prepared:
+    return prepare(read_survey(folder), scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), colour=colour)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends
     assert again.models == made[1].models
     unchanged = {path for path, at in before.items() if path.stat().st_mtime_ns == at}
     assert unchanged >= set(before) - {scene / "prepare" / "stages.json"}
-    plain = run(flight.folder, scene, replace(OPTIONS, colour="off"))
+    plain = run(flight.folder, scene, "off")
     assert plain.correction is None
     assert (scene / "prepare" / "database.db").stat().st_mtime_ns == before[scene / "prepare" / "database.db"]
     name = flight.names[0]
@@ -173,7 +173,7 @@ def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: 
             table[ExifTags.Base.Orientation] = 6  # upright after a quarter turn clockwise
             turned = picture.transpose(Image.Transpose.ROTATE_90)
             turned.save(folder / name, quality=95, exif=table)
-    prepared = run(folder, tmp_path / "scene", replace(OPTIONS, colour="off"))
+    prepared = run(folder, tmp_path / "scene", "off")
     assert len(prepared.models[0]) == 12
     for name in flight.names[:2]:
         with Image.open(tmp_path / "scene" / "images" / name) as picture:

@@ -16,7 +16,7 @@ from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.quality.assessment import (
     QualityDecision,
     assess_quality,
-    find_off_survey,
+    find_beyond_gap,
     select_photographs,
 )
 from tidefield.survey.quality.measures import sharpness
@@ -120,19 +120,12 @@ def test_noise_and_contrast_do_not_change_sharpness():
     assert sharpness(100 + 0.5 * (grey - 100)) == pytest.approx(sharpness(grey), rel=0.1)
 
 
-@pytest.mark.parametrize("factor", [0.02, 0.1])
-def test_a_dark_photograph_is_under_exposed(tmp_path, factor):
-    found = left_out(flight(tmp_path, dark=with_light(view(500, 300), factor)))
-    assert list(found) == ["dark.jpg"]
-    assert found["dark.jpg"].startswith("under-exposed: ")
-
-
-@pytest.mark.parametrize("factor", [6, 20])
-def test_a_bright_photograph_is_over_exposed(tmp_path, factor):
-    found = left_out(flight(tmp_path, bright=with_light(view(500, 300), factor)))
-    assert list(found) == ["bright.jpg"]
-    assert found["bright.jpg"].startswith("over-exposed: ")
-    assert "the limit" in found["bright.jpg"]
+@pytest.mark.parametrize(("factor", "kind"), [(0.02, "under"), (0.1, "under"), (6, "over"), (20, "over")])
+def test_a_badly_exposed_photograph_is_found(tmp_path, factor, kind):
+    found = left_out(flight(tmp_path, odd=with_light(view(500, 300), factor)))
+    assert list(found) == ["odd.jpg"]
+    assert found["odd.jpg"].startswith(f"{kind}-exposed: ")
+    assert "the limit" in found["odd.jpg"]
 
 
 def test_one_stop_more_or_less_is_kept(tmp_path):
@@ -216,7 +209,7 @@ def test_a_survey_of_many_fields_is_one_survey(tmp_path):
             assert taken.position is not None
             east = replace(taken.position, longitude_deg=taken.position.longitude_deg + 0.01 * field)
             fields.append(replace(taken, name=f"{field:02d}/{taken.name}", position=east))
-    assert find_off_survey(fields) == {}
+    assert find_beyond_gap(fields) == {}
 
 
 def test_a_flat_set_is_one_clear_error(tmp_path):

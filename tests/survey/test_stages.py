@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.survey.stages import Facts, Stages, interruptible
+from tidefield.survey.prepare import Facts, Stages
+from tidefield.survey.sfm.matching import interruptible
 
 
 class Pipeline:

@@ -34,19 +34,21 @@ class Import:
 
 def import_project(options: Import, console: Console) -> None:
     """Run `tidefield import`."""
+    from tidefield.data.scene import every_eighth
     from tidefield.progress import ProgressBar
     from tidefield.survey import import_project as importing
 
     with ProgressBar(console, "Copying photographs") as bar:
-        made = importing.import_project(
+        model, located = importing.import_project(
             options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=bar
         )
-    observed = f", observed {made.observations:,} times" if made.observations else ""
-    frame = made.georeference and made.georeference.frame
+    photographs, cameras, observations = model.num_images(), model.num_cameras(), model.compute_num_observations()
+    observed = f", observed {observations:,} times" if observations else ""
+    frame = located and located.frame
     where = f"; in metres about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f} ({frame.crs})" if frame else ""
     console.print(
-        f"{options.scene}: {made.photographs} photographs, {made.held_out} of them held out; {made.cameras} "
-        f"camera{'s' * (made.cameras > 1)}; {made.points:,} sparse points{observed}{where}",
+        f"{options.scene}: {photographs} photographs, {len(every_eighth(photographs)[1])} of them held out; {cameras} "
+        f"camera{'s' * (cameras > 1)}; {model.num_points3D():,} sparse points{observed}{where}",
         highlight=False,
         soft_wrap=True,
     )

@@ -55,7 +55,6 @@ def prepare(options: Prepare, console: Console) -> None:
     import pycolmap
 
     from tidefield.survey.io.photographs import read_survey
-    from tidefield.survey.prepare import PrepareOptions
     from tidefield.survey.prepare import prepare as prepare_scene
     from tidefield.survey.report import collect_findings, write_report
     from tidefield.survey.sfm.features import FeatureOptions, choose_device
@@ -69,13 +68,16 @@ def prepare(options: Prepare, console: Console) -> None:
         survey = replace(survey, control=None)
     for remark in survey.remarks:
         log.warning(remark)
-    how = PrepareOptions(
+    prepared = prepare_scene(
+        survey,
+        options.scene,
+        FeatureOptions(options.feature_width, options.features),
+        choose_device(options.device),
+        console,
         keep_all=options.keep_all,
         colour=options.colour,
-        features=FeatureOptions(options.feature_width, options.features),
         redo=options.redo,
     )
-    prepared = prepare_scene(survey, options.scene, how, choose_device(options.device), console)
     given = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
     page = write_report(collect_findings(prepared, options.scene, given), options.scene)
     missing = len(survey.photographs) - len(prepared.models[0])

@@ -59,10 +59,13 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
     seen = observe(scene.photographs, scene.points, range(count)) if scene.points is not None else None
-    if seen is None or not len(seen.value):
+    if scene.points is None or seen is None or not len(seen.value):
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
-    power = _powers(scene, seen)
+    uv = scene.points.uv_px[torch.from_numpy(seen.row)].double()
+    which = torch.from_numpy(seen.photograph)
+    tangent = ((uv - scene.cameras.principal_px[which]) / scene.cameras.focal_px[which]).norm(dim=1).numpy()
+    power = _polynomial(tangent)
     # Points are divided, not observations: a point in both halves would be estimated and tested at once.
     odd = np.random.default_rng(0).permutation(int(seen.point.max()) + 1)[seen.point] % 2 == 1
     halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
@@ -74,7 +77,10 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     before, alone, after = scores.mean(0)
     helps = always or bool(min(alone, after) < HELPS * before)
     gains, falloff = _gains_and_falloff(seen, power, lens, count)
-    sees = helps and bool(after < FALLOFF_HELPS * alone) and _darkens(falloff[lens[seen.photograph]], power)
+    # With real lenses, the corners are darker than the centre.
+    corner = tangent >= np.quantile(tangent, 0.95)
+    darkens = (falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
+    sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
     if not sees:
         gains, falloff = robust_gains(seen, np.zeros(count))[0], np.zeros_like(falloff)
     gain = np.exp(gains - gains.mean(0)) if helps else np.exp(nothing)
@@ -101,15 +107,6 @@ def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
     """Compute r^2, r^4, r^6."""
     square = np.square(tangent)
     return np.stack([square, square**2, square**3], axis=-1)
-
-
-def _powers(scene: Scene, seen: Seen) -> Float64[np.ndarray, "O 3"]:
-    """Compute r^2, r^4, r^6 of every observation."""
-    assert scene.points is not None
-    uv = scene.points.uv_px[torch.from_numpy(seen.row)].double()
-    which = torch.from_numpy(seen.photograph)
-    xy = (uv - scene.cameras.principal_px[which]) / scene.cameras.focal_px[which]
-    return _polynomial(xy.norm(dim=1).numpy())
 
 
 def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
@@ -156,8 +153,3 @@ def _spread(
     residual = seen.centred(seen.value - gains[seen.photograph] - shade)
     sharing = np.bincount(seen.point)[seen.point]
     return float(1.4826 * np.median(np.abs(residual * np.sqrt(sharing / (sharing - 1))[:, None])))
-
-
-def _darkens(falloff: Float64[np.ndarray, "O 3"], power: Float64[np.ndarray, "O 3"]) -> bool:
-    """Check that the corners are darker than the centre, as with real lenses."""
-    return bool((falloff * power).sum(1)[power[:, 0] >= np.quantile(power[:, 0], 0.95)].mean() < 0)

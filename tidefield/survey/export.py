@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from PIL import ExifTags, Image
 
 from tidefield.data.scene import every_eighth
@@ -21,7 +21,7 @@ from tidefield.geometry.lenses import lens_from_colmap
 from tidefield.machine import cores
 from tidefield.survey.colour import ExposureCorrection, to_common_exposure
 from tidefield.survey.io.image_decoding import upright
-from tidefield.survey.survey import Photograph
+from tidefield.survey.survey import Photograph, Progress
 
 GRID_PX = 8
 """Spacing of the pixels whose viewing angles are computed; between them they are interpolated."""
@@ -35,7 +35,7 @@ def write_images(
     folder: Path,
     correction: ExposureCorrection | None,
     cameras: Sequence[pycolmap.Camera],
-    progress: Callable[[int, int], object],
+    progress: Progress,
 ) -> None:
     """Write photographs into a folder under their names, and remove everything else from it.
 
@@ -68,7 +68,13 @@ def write_images(
         if correction is not None:
             tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
-        _save(pixels, photograph.path, target)
+        with Image.open(photograph.path) as original:
+            exif = original.getexif()
+        exif[ExifTags.Base.Orientation] = 1
+        is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")
+        quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if is_jpeg else {}
+        with completed_file(target, overwrite=True) as partial:  # in the format of its name
+            Image.fromarray(pixels).save(partial, exif=exif, **quality)
 
     with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(write, range(len(photographs))), start=1):
@@ -87,17 +93,6 @@ def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     return cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR)
 
 
-def _save(pixels: UInt8[np.ndarray, "H W 3"], source: Path, target: Path) -> None:
-    """Write pixels in the format of the target's name, with the source's EXIF."""
-    with Image.open(source) as original:
-        exif = original.getexif()
-    exif[ExifTags.Base.Orientation] = 1
-    is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")
-    options: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if is_jpeg else {}
-    with completed_file(target, overwrite=True) as partial:
-        Image.fromarray(pixels).save(partial, exif=exif, **options)
-
-
 def write_transforms(
     folder: Path, model: pycolmap.Reconstruction, *, z_is_up: bool = False, overwrite: bool = False
 ) -> None:
@@ -107,10 +102,8 @@ def write_transforms(
     float32 are reduced by whole numbers, which `applied_transform` states.
 
     Args:
-        folder: the scene.
         model: cameras with Brown's distortion; photographs without a pose are left out.
         z_is_up: whether the world's z axis points up: nerfstudio then does not rotate the world.
-        overwrite: replace existing files.
 
     Raises:
         SceneError: a camera model that nerfstudio's and our lenses cannot express.

@@ -7,8 +7,7 @@ import logging
 import os
 import posixpath
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,11 @@ from jaxtyping import Int64
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
 from tidefield.data.images import Progress
 from tidefield.data.load import own_lens, read_posed
-from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
-from tidefield.data.scene import every_eighth
+from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
-from tidefield.geometry.lenses import Lens, colmap_parameters
+from tidefield.geometry.lenses import colmap_parameters
 from tidefield.geometry.similarity import Similarity
 from tidefield.survey.export import write_transforms
 
@@ -33,25 +31,6 @@ _CANNOT_LINK = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENO
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Imported:
-    """Contents of an imported scene.
-
-    Attributes:
-        photographs, held_out: number of photographs, and of those held out.
-        cameras: number of different lenses.
-        points, observations: number of sparse points, and of their observations in photographs.
-        georeference: of the world, if the project states it.
-    """
-
-    photographs: int
-    held_out: int
-    cameras: int
-    points: int
-    observations: int
-    georeference: Georeference | None
-
-
 def import_project(
     source: Path,
     out: Path,
@@ -59,7 +38,7 @@ def import_project(
     link: bool = False,
     allow_missing: bool = False,
     progress: Progress | None = None,
-) -> Imported:
+) -> tuple[pycolmap.Reconstruction, Georeference | None]:
     """Make a Scene of anything that `load_scene` reads; photographs (undecoded) and poses (float64) stay unchanged.
 
     Args:
@@ -70,56 +49,65 @@ def import_project(
         allow_missing: continue without photographs that are listed but do not exist.
         progress: called with (written, of how many) photographs.
 
+    Returns:
+        The scene's model, and its georeference if the project states it.
+
     Raises:
         SceneError: `source` is not a scene, or is damaged.
         RunError: `out` exists already or cannot be written.
     """
     refuse_existing(out, replaceable=False)
     posed = _at_file_size(read_posed(source, allow_missing), source)
-    located = read_georeference(source) or _georeference(posed.reference)
-    _warn_of_losses(posed, source)
+    located = read_georeference(source)
+    if located is None and posed.reference is not None:
+        place = posed.reference
+        located = Georeference(
+            frame=LocalFrame.at(WGS84, (place.longitude_deg, place.latitude_deg, place.height_m)),
+            source="project",
+            world_from_model=Similarity(1.0, np.eye(3), np.zeros(3)),  # it is in metres east, north and up already
+            gps=Residuals(),
+            control=Residuals(),
+            check=Residuals(),
+            left_out=(),
+            notes=("The origin is the imported project's; its accuracy is unknown.",),
+        )
+    if posed.split is not None:
+        _log.warning(f"{source} has its own split: the imported scene holds out every eighth photograph instead")
+    if posed.near_far is not None:
+        _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
     model = to_colmap(posed)
     with completed_folder(out) as folder:
-        _write_images(posed, folder / "images", link, progress)
+        for done, (path, name) in enumerate(zip(posed.paths, posed.names, strict=True), start=1):
+            target = folder / "images" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (_link if link else shutil.copyfile)(path, target)
+            if progress is not None:
+                progress(done, len(posed.names))
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
         write_transforms(folder, model, z_is_up=located is not None)
         if located is not None:
             located.write(folder)
-    return Imported(
-        photographs=len(posed.names),
-        held_out=len(every_eighth(len(posed.names))[1]),
-        cameras=model.num_cameras(),
-        points=model.num_points3D(),
-        observations=model.compute_num_observations(),
-        georeference=located,
-    )
-
-
-def _georeference(reference: Reference | None) -> Georeference | None:
-    """Make a georeference of a project's reference point; its world is in metres east, north and up already."""
-    if reference is None:
-        return None
-    return Georeference(
-        frame=LocalFrame.at(WGS84, (reference.longitude_deg, reference.latitude_deg, reference.height_m)),
-        source="project",
-        world_from_model=Similarity(1.0, np.eye(3), np.zeros(3)),
-        gps=Residuals(),
-        control=Residuals(),
-        check=Residuals(),
-        left_out=(),
-        notes=("The origin is the imported project's; its accuracy is unknown.",),
-    )
+    return model, located
 
 
 def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
-    """Make a COLMAP model of posed photographs; points without observations get empty tracks."""
+    """Make a COLMAP model of posed photographs, with the simplest camera model that has all of a lens's terms.
+
+    Points without observations get empty tracks.
+    """
     model = pycolmap.Reconstruction()
     camera_of = {lens: number for number, lens in enumerate(dict.fromkeys(posed.lenses), start=1)}
     for lens, number in camera_of.items():
-        model.add_camera_with_trivial_rig(_camera(lens, number))
-    points = posed.points or _unobserved(posed)
+        name, size = lens.colmap_model, {"width": lens.width, "height": lens.height}
+        camera = pycolmap.Camera(camera_id=number, model=name, params=colmap_parameters(lens, name), **size)
+        model.add_camera_with_trivial_rig(camera)
+    points = posed.points
+    if points is None:
+        nothing = np.zeros(0, dtype=np.int64)
+        cloud = np.zeros((0, 3)) if posed.cloud_world is None else posed.cloud_world
+        points = Observations(cloud, nothing, nothing, np.zeros((0, 2)), posed.cloud_rgb)
     rotation = posed.T_world_camera[:, :, :3].transpose(0, 2, 1)
     T_camera_world = np.concatenate([rotation, -rotation @ posed.T_world_camera[:, :, 3:]], axis=2)
     keypoint = np.zeros(len(points.uv_px), dtype=np.int64)
@@ -132,20 +120,6 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
     _add_points(model, points, keypoint)
     model.update_point_3d_errors()
     return model
-
-
-def _camera(lens: Lens, number: int) -> pycolmap.Camera:
-    """Make the simplest camera of COLMAP that has all of the lens's terms."""
-    model = lens.colmap_model
-    parameters = colmap_parameters(lens, model)
-    return pycolmap.Camera(camera_id=number, model=model, width=lens.width, height=lens.height, params=parameters)
-
-
-def _unobserved(posed: PosedPhotographs) -> Observations:
-    """Wrap the point cloud, which may be missing, as points without observations."""
-    nothing = np.zeros(0, dtype=np.int64)
-    cloud = np.zeros((0, 3)) if posed.cloud_world is None else posed.cloud_world
-    return Observations(cloud, nothing, nothing, np.zeros((0, 2)), posed.cloud_rgb)
 
 
 def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: Int64[np.ndarray, " O"]) -> None:
@@ -184,24 +158,6 @@ def _at_file_size(posed: PosedPhotographs, source: Path) -> PosedPhotographs:
         )
         points = replace(points, uv_px=points.uv_px * scale[points.photograph_index])
     return replace(posed, names=names, lenses=lenses, points=points)
-
-
-def _warn_of_losses(posed: PosedPhotographs, source: Path) -> None:
-    """Warn of what a Scene on disk cannot store."""
-    if posed.split is not None:
-        _log.warning(f"{source} has its own split: the imported scene holds out every eighth photograph instead")
-    if posed.near_far is not None:
-        _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
-
-
-def _write_images(posed: PosedPhotographs, images: Path, link: bool, progress: Progress | None) -> None:
-    write: Callable[[Path, Path], object] = _link if link else shutil.copyfile
-    for done, (path, name) in enumerate(zip(posed.paths, posed.names, strict=True), start=1):
-        target = images / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write(path, target)
-        if progress is not None:
-            progress(done, len(posed.names))
 
 
 def _link(path: Path, target: Path) -> None:

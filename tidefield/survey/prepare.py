@@ -1,14 +1,20 @@
 """Make a Scene on disk from a survey: one stage after the other, with files between them.
 
-SCENE/prepare contains the intermediate files, and the state of the stages in `stages.json`. The names of the stages,
-their options and the keys of their results are a file format: a change makes earlier scenes start again.
+SCENE/prepare contains the intermediate files, and the state of the stages in `stages.json`: the result of each, and a
+key, which is a digest of its options and of the key of the stage before it, so that a changed option repeats that stage
+and all that follow. The names of the stages, their options and the keys of their results are a file format: a change
+makes earlier scenes start again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +25,7 @@ from rich.console import Console
 from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
+from tidefield.files import write_json, writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import write_images, write_transforms
@@ -28,32 +35,86 @@ from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
-from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
 
+log = logging.getLogger(__name__)
+
+Facts = dict[str, Any]
+"""Result of a stage, as JSON."""
 COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
-
-
 STAGES = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
 """In their order."""
 
 
-@dataclass(frozen=True)
-class PrepareOptions:
-    """Options of `prepare`.
+class Stages:
+    """The stages of one working folder and their state.
+
+    Args:
+        folder: contains `stages.json` and the stages' files; created if it does not exist.
+        source: what the first stage depends on (any JSON).
+        redo: name of a stage to repeat, with all that follow, even if nothing has changed.
 
     Attributes:
-        keep_all: use photographs of low quality too.
-        colour: correct exposures and lens falloff: where it helps, always, or never.
-        features: options of feature extraction.
-        redo: a stage to repeat, with all that follow.
+        seconds: run time of each stage, including interrupted attempts.
+
+    Raises:
+        RunError: the folder cannot be written to, or `stages.json` is damaged.
     """
 
-    keep_all: bool = False
-    colour: Literal["auto", "on", "off"] = "auto"
-    features: FeatureOptions = field(default_factory=FeatureOptions)
-    redo: str | None = None
+    def __init__(self, folder: Path, source: object, redo: str | None = None) -> None:
+        with writing_to(folder.parent):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._file = folder, folder / "stages.json"
+        self._records: dict[str, Facts] = {}
+        if self._file.exists():
+            try:
+                self._records = json.loads(self._file.read_text(encoding="utf-8"))
+                if not isinstance(self._records, dict) or not all(isinstance(r, dict) for r in self._records.values()):
+                    raise ValueError("no table of stages")
+            except ValueError as error:
+                raise RunError(
+                    f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {folder} to start "
+                    "again"
+                ) from error
+        self._key, self._redo, self._is_redoing = _digest(source), redo, False
+        self.seconds: dict[str, float] = {}
+
+    def run(self, name: str, options: object, outputs: Sequence[Path], job: Callable[[bool], Facts]) -> Facts:
+        """Run a stage unless it is complete.
+
+        Args:
+            options: everything its result depends on, besides the previous stages (any JSON).
+            outputs: files or folders that must exist for the stage to count as complete.
+            job: runs the stage; called with whether an interrupted attempt with the same key can be continued.
+
+        Returns:
+            The job's result, of this run or of an earlier one.
+        """
+        self._key = _digest([self._key, name, options])
+        self._is_redoing = self._is_redoing or name == self._redo
+        record = self._records.get(name, {})
+        is_same = record.get("key") == self._key and not self._is_redoing
+        if is_same and record.get("done") and all(path.exists() for path in outputs):
+            self.seconds[name] = record["seconds"]
+            log.info(f"{name}: complete already")
+            return record["facts"]
+        earlier = record.get("seconds", 0.0) if is_same else 0.0
+        record = self._records[name] = {"key": self._key, "done": False, "seconds": earlier}
+        write_json(self._file, self._records)
+        start = time.monotonic()
+        try:
+            with writing_to(self._folder.parent):
+                facts = job(is_same)
+            record |= {"done": True, "facts": facts}
+        finally:
+            self.seconds[name] = record["seconds"] = earlier + time.monotonic() - start
+            write_json(self._file, self._records)
+        return facts
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -82,9 +143,22 @@ class Prepared:
 
 
 def prepare(
-    survey: Survey, scene: Path, options: PrepareOptions, device: pycolmap.Device, console: Console
+    survey: Survey,
+    scene: Path,
+    features: FeatureOptions,
+    device: pycolmap.Device,
+    console: Console,
+    *,
+    keep_all: bool = False,
+    colour: Literal["auto", "on", "off"] = "auto",
+    redo: str | None = None,
 ) -> Prepared:
     """Make a scene of a survey, or continue an interrupted run.
+
+    Args:
+        keep_all: use photographs of low quality too.
+        colour: correct exposures and lens falloff: where it helps, always, or never.
+        redo: a stage to repeat, with all that follow.
 
     Raises:
         RunError: the scene's folder contains something else, or cannot be written to.
@@ -93,24 +167,39 @@ def prepare(
     _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
     database, model = work / "database.db", work / "model"
-    if options.redo not in (None, *STAGES):
-        raise RunError(f"there is no stage {options.redo!r}: expected one of {', '.join(STAGES)}; name one of these")
-    stages = Stages(work, _fingerprint(survey), options.redo)
+    if redo not in (None, *STAGES):
+        raise RunError(f"there is no stage {redo!r}: expected one of {', '.join(STAGES)}; name one of these")
+    stages = Stages(work, _fingerprint(survey), redo)
 
-    quality = stages.run("quality", {}, [], lambda _: judge_quality(survey, console))
+    def judge_quality(_: bool) -> Facts:
+        with ProgressBar(console, "Judging photographs") as bar:
+            return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
+
+    quality = stages.run("quality", {}, [], judge_quality)
     verdicts = tuple(_verdict_from_json(verdict) for verdict in quality["verdicts"])
-    good = select_photographs(survey, verdicts, options.keep_all)
+    good = select_photographs(survey, verdicts, keep_all)
     names = [photograph.name for photograph in good.photographs]
 
-    stages.run(
-        "features",
-        [names, asdict(options.features)],
-        [database],
-        lambda resume: extract_features(good.photographs, database, options.features, device, console, resume),
-    )
+    def extract_features(resume: bool) -> Facts:
+        if not resume:
+            database.unlink(missing_ok=True)
+        with ProgressBar(console, "Extracting features") as bar:
+            return {"features": extract(good.photographs, database, features, device, bar)}
+
+    stages.run("features", [names, asdict(features)], [database], extract_features)
     chosen = stages.run("pairs", {}, [], lambda _: choose_pairs(good.photographs, database, console))
     pairs = [(first, second) for first, second in chosen["pairs"]]
-    stages.run("matches", {}, [database], lambda resume: match_pairs(pairs, database, device, console, resume))
+
+    def match_pairs(resume: bool) -> Facts:
+        if not resume:
+            with pycolmap.Database.open(database) as db:
+                db.clear_matches()
+                db.clear_two_view_geometries()
+        with ProgressBar(console, "Matching") as bar:
+            agree, inliers = match(database, pairs, device, bar)
+        return {"agree": agree, "inliers": inliers}
+
+    stages.run("matches", {}, [database], match_pairs)
     poses = stages.run("poses", {}, [model], lambda _: estimate_poses(survey, database, model, console))
     stages.run(
         "georeference",
@@ -122,9 +211,9 @@ def prepare(
     placed = [photograph for photograph in good.photographs if photograph.name in registered]
     written = stages.run(
         "images",
-        {"colour": options.colour},
+        {"colour": colour},
         [images, scene / "transforms.json"],
-        lambda _: write_scene(placed, scene, options.colour, console),
+        lambda _: write_scene(placed, scene, colour, console),
     )
 
     located = read_georeference(scene)
@@ -141,27 +230,6 @@ def prepare(
     )
 
 
-def judge_quality(survey: Survey, console: Console) -> Facts:
-    """Judge the quality of every photograph."""
-    with ProgressBar(console, "Judging photographs") as bar:
-        return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
-
-
-def extract_features(
-    photographs: Sequence[Photograph],
-    database: Path,
-    options: FeatureOptions,
-    device: pycolmap.Device,
-    console: Console,
-    resume: bool,
-) -> Facts:
-    """Extract features of the good photographs into the database."""
-    if not resume:
-        database.unlink(missing_ok=True)
-    with ProgressBar(console, "Extracting features") as bar:
-        return {"features": extract(photographs, database, options, device, bar)}
-
-
 def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
     """Choose the pairs of photographs to match, by name."""
     with pycolmap.Database.open(database) as db:
@@ -172,29 +240,16 @@ def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Con
     return {"pairs": [[photographs[i].name, photographs[j].name] for i, j in pairs]}
 
 
-def match_pairs(
-    pairs: Sequence[tuple[str, str]], database: Path, device: pycolmap.Device, console: Console, resume: bool
-) -> Facts:
-    """Match the pairs and verify their geometry, in the database."""
-    if not resume:
-        with pycolmap.Database.open(database) as db:
-            db.clear_matches()
-            db.clear_two_view_geometries()
-    with ProgressBar(console, "Matching") as bar:
-        agree, inliers = match(database, pairs, device, bar)
-    return {"agree": agree, "inliers": inliers}
-
-
 def estimate_poses(survey: Survey, database: Path, folder: Path, console: Console) -> Facts:
     """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder."""
     with ProgressBar(console, "Estimating poses") as bar:
         models = reconstruct(database, folder.with_name("models"), bar)
     has_prior = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Choosing a lens") as bar:
-        choice = choose_lens(models.best, survey.photographs, has_prior, bar)
+        choice = choose_lens(models[0], survey.photographs, has_prior, bar)
     folder.mkdir(exist_ok=True)
-    models.best.write_binary(folder)
-    return {"models": [registered_names(models.best), *map(list, models.others)], "lens": _to_json(choice)}
+    models[0].write_binary(folder)
+    return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 
 def georeference_model(good: Survey, model: Path, sparse: Path, console: Console) -> Facts:

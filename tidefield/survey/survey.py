@@ -6,9 +6,14 @@ scenes that were prepared earlier start again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
+Progress = Callable[[int, int], object]
+"""Called with (done, of how many)."""
+VerticalDatum = Literal["mean sea level", "ellipsoid", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Position:
     height_m: float
     horizontal_m: float
     vertical_m: float
-    datum: Literal["mean sea level", "ellipsoid", "unknown"]
+    datum: VerticalDatum
     source: str
 
 
@@ -68,7 +73,6 @@ class Photograph:
         focal_mm: nominal focal length, which differs between zoom settings; NaN if unknown.
         lens: prior of the lens, or None.
         time_s: seconds since 1970 by the camera's clock; NaN if unknown.
-        log_exposure: natural log of exposure time x ISO / f-number squared; NaN if unknown.
         position: of the camera, or None.
         relative_altitude_m: height above take-off; NaN if unknown.
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
@@ -84,7 +88,6 @@ class Photograph:
     focal_mm: float
     lens: LensPrior | None
     time_s: float
-    log_exposure: float
     position: Position | None
     relative_altitude_m: float
     gimbal_deg: tuple[float, float, float] | None

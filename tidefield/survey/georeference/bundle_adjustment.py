@@ -9,8 +9,7 @@ kept.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pycolmap
@@ -19,7 +18,8 @@ from jaxtyping import Float64
 from tidefield.errors import list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.geometry.similarity import outliers
-from tidefield.survey.georeference.gps_alignment import camera_centres, metres
+from tidefield.survey.georeference.gps_alignment import GivenPositions, PositionFit, camera_centres, metres, rms_m
+from tidefield.survey.survey import Progress
 
 DIFFERENTIAL_M = 0.3
 """Positions with a stated standard deviation below this are from a differential receiver."""
@@ -42,57 +42,56 @@ _STEPS = 200
 _TOLERANCE = 1e-7
 
 
-@dataclass(frozen=True)
-class Differential:
-    """Positions of a differential receiver, by photograph.
-
-    Attributes:
-        given_world: the positions.
-        sigma_m: their stated standard deviations, east, north and up.
-    """
-
-    given_world: dict[str, Float64[np.ndarray, " 3"]]
-    sigma_m: dict[str, Float64[np.ndarray, " 3"]]
-
-
 def adjust_to_positions(
-    model: pycolmap.Reconstruction, positions: Differential, progress: Callable[[int, int], object]
+    model: pycolmap.Reconstruction, positions: GivenPositions, fit: PositionFit, progress: Progress
 ) -> tuple[str, ...]:
     """Adjust an aligned model to differential positions, in place, if cross-validation shows that this helps.
 
     Each quarter of the positions is left out in turn, with the distortion fixed and free.
 
     Args:
-        progress: called with the numbers of finished and of all adjustments.
+        positions: with the accuracies that the receivers state.
+        fit: of the model to the positions, which names gross errors.
 
     Returns:
         Notes on the adjustment; none if the model was not adjusted.
     """
-    names = sorted(positions.given_world)
+    stated_m = positions.stated_m[:, [0, 0, 1]]
+    good = np.flatnonzero(fit.used & (stated_m < DIFFERENTIAL_M).all(axis=1))
+    given = {fit.names[i]: fit.given_world[i] for i in good}
+    sigma_m = {fit.names[i]: stated_m[i] for i in good}
+    names = sorted(given)
     if len(names) < max(_FEWEST, model.num_reg_images() / 2):
         return ()
-    before = _residual_m(model, positions, names)
+    priors: dict[str, pycolmap.PosePrior] = {}
+    for image in (model.image(number) for number in sorted(model.reg_image_ids())):
+        if image.name in given:
+            prior = priors[image.name] = pycolmap.PosePrior()
+            prior.corr_data_id, prior.position = image.data_id, given[image.name]
+            prior.position_covariance = np.diag(np.maximum(sigma_m[image.name], _LEAST_M) ** 2)
+            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+    before = _residual_m(model, given, names)
     light = thinned(model)
     left_out: dict[bool, Float64[np.ndarray, "N 3"]] = {}
     for done, free in enumerate((False, True)):
         # Each fold starts here, close to its own minimum.
-        start = _adjusted(light, positions, names, free)
+        start = _adjusted(light, priors, (), free)
         error = np.empty((len(names), 3))
         for fold in range(_FOLDS):
             progress(done * _FOLDS + fold, 2 * _FOLDS)
             own = names[fold::_FOLDS]
-            error[fold::_FOLDS] = _residual_m(_adjusted(start, positions, set(names) - set(own), free), positions, own)
+            error[fold::_FOLDS] = _residual_m(_adjusted(start, priors, own, free), given, own)
         left_out[free] = error
     progress(1, 1)
     free = min(left_out, key=lambda mode: _median(left_out[mode]))
     after = left_out[free]
     if _median(after) > _WORTH * _median(before):
         return ()
-    wrong = outliers(np.linalg.norm(after, axis=1), 5 * np.array([np.linalg.norm(positions.sigma_m[n]) for n in names]))
+    wrong = outliers(np.linalg.norm(after, axis=1), 5 * np.array([np.linalg.norm(sigma_m[n]) for n in names]))
     rejected = [name for name, is_wrong in zip(names, wrong, strict=True) if is_wrong]
-    carry_over(_adjusted(model, positions, set(names) - set(rejected), free), model)
+    carry_over(_adjusted(model, priors, rejected, free), model)
     was, now = (
-        f"{metres(_rms(error[~wrong, :2]))} horizontally and {metres(_rms(error[~wrong, 2:]))} vertically"
+        f"{metres(rms_m(error[~wrong, :2]))} horizontally and {metres(rms_m(error[~wrong, 2:]))} vertically"
         for error in (before, after)
     )
     notes = [
@@ -119,10 +118,7 @@ def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction
     config = all_images(model)
     for number in model.cameras:
         config.set_constant_cam_intrinsics(number)
-    options = adjustment_options()
-    options.refine_rig_from_world = False
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    model.update_point_3d_errors()
+    solve(model, config, refine_rig_from_world=False)
 
 
 def reliable(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -134,15 +130,17 @@ def reliable(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     free, copy = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
     config = all_images(free)
     generalise_lenses(free, config, free=True)
-    pycolmap.create_default_bundle_adjuster(adjustment_options(), config, free).solve()
-    free.update_point_3d_errors()
+    solve(free, config)
     typical = float(np.median([point.error for point in free.points3D.values()]))
     pycolmap.ObservationManager(free).filter_all_points3D(_MISMATCH * typical, 0.0)
     for number in list(copy.point3D_ids()):
         if not free.exists_point3D(number):
             copy.delete_point3D(number)
             continue
-        kept, before = (_observations(one.points3D[number]) for one in (free, copy))
+        before, kept = (
+            {(element.image_id, element.point2D_idx) for element in one.points3D[number].track.elements}
+            for one in (copy, free)
+        )
         for image, point2D in before - kept:
             copy.delete_observation(image, point2D)
     return copy
@@ -157,6 +155,18 @@ def adjustment_options() -> pycolmap.BundleAdjustmentOptions:
     solver.max_num_iterations, solver.function_tolerance = _STEPS, _TOLERANCE
     options.ceres.solver_options = solver
     return options
+
+
+def solve(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, **options: bool) -> None:
+    """Adjust a model in place, with some of the options changed.
+
+    Not `pycolmap.bundle_adjustment`, which prints whatever the log level.
+    """
+    adjustment = adjustment_options()
+    for name, value in options.items():
+        setattr(adjustment, name, value)
+    pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+    model.update_point_3d_errors()
 
 
 def all_images(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
@@ -192,41 +202,25 @@ def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def _adjusted(
-    model: pycolmap.Reconstruction, positions: Differential, names: Collection[str], free: bool
+    model: pycolmap.Reconstruction, priors: Mapping[str, pycolmap.PosePrior], left_out: Collection[str], free: bool
 ) -> pycolmap.Reconstruction:
-    """Copy a model and adjust it to its matches and the positions of some photographs."""
+    """Copy a model and adjust it to its matches and the positions of its photographs, without some of these."""
     copy = pycolmap.Reconstruction(model)
     config = all_images(copy)
-    priors = []
-    for number in sorted(copy.reg_image_ids()):
-        image = copy.image(number)
-        if image.name in names:
-            prior = pycolmap.PosePrior()
-            prior.corr_data_id, prior.position = image.data_id, positions.given_world[image.name]
-            prior.position_covariance = np.diag(np.maximum(positions.sigma_m[image.name], _LEAST_M) ** 2)
-            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-            priors.append(prior)
     generalise_lenses(copy, config, free)
     options = pycolmap.PosePriorBundleAdjustmentOptions()
     options.alignment_ransac.random_seed = 0
-    pycolmap.create_pose_prior_bundle_adjuster(adjustment_options(), options, config, priors, copy).solve()
+    used = [prior for name, prior in priors.items() if name not in left_out]
+    pycolmap.create_pose_prior_bundle_adjuster(adjustment_options(), options, config, used, copy).solve()
     return copy
 
 
-def _observations(point: pycolmap.Point3D) -> set[tuple[int, int]]:
-    return {(element.image_id, element.point2D_idx) for element in point.track.elements}
-
-
 def _residual_m(
-    model: pycolmap.Reconstruction, positions: Differential, names: Collection[str]
+    model: pycolmap.Reconstruction, given_world: Mapping[str, Float64[np.ndarray, " 3"]], names: Collection[str]
 ) -> Float64[np.ndarray, "N 3"]:
     centres = camera_centres(model)
-    return np.array([centres[name] - positions.given_world[name] for name in names])
+    return np.array([centres[name] - given_world[name] for name in names])
 
 
 def _median(error_m: Float64[np.ndarray, "N 3"]) -> float:
     return float(np.median(np.linalg.norm(error_m, axis=1)))
-
-
-def _rms(error_m: Float64[np.ndarray, "N K"]) -> float:
-    return float(np.sqrt((error_m**2).sum(1).mean()))

@@ -15,8 +15,7 @@ from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
-from tidefield.survey.io.positions import impossible
-from tidefield.survey.survey import Photograph, Position
+from tidefield.survey.survey import Photograph
 
 _NOMINAL_M = 3.0
 """Standard deviation assumed for a receiver that states none: a good fix, so that only gross errors are rejected."""
@@ -42,14 +41,12 @@ class GivenPositions:
         longitude_latitude_height: WGS 84, degrees and metres.
         stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none.
         vertical_datum: zero of the heights, as text.
-        left_out: impossible positions.
     """
 
     names: tuple[str, ...]
     longitude_latitude_height: Float64[np.ndarray, "N 3"]
     stated_m: Float64[np.ndarray, "N 2"]
     vertical_datum: str
-    left_out: tuple[LeftOut, ...]
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -63,18 +60,19 @@ class GivenPositions:
 
 
 def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
-    """Collect the photographs' positions, without impossible ones."""
-    located: list[tuple[Photograph, Position]] = []
-    left_out = []
-    for photograph in photographs:
-        if photograph.position is None:
-            continue
-        reason = impossible(photograph.position)
-        if reason is None:
-            located.append((photograph, photograph.position))
-        else:
-            left_out.append(LeftOut("GPS", photograph.name, reason))
-    located, heights, datum = _with_heights(located)
+    """Collect positions with heights: absolute ones, else above take-off, else all at one height."""
+    located = [(photograph, photograph.position) for photograph in photographs if photograph.position is not None]
+    absolute = [pair for pair in located if math.isfinite(pair[1].height_m)]
+    relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
+    if len(absolute) >= 3:
+        located, heights = absolute, [position.height_m for _, position in absolute]
+        datum = _DATUMS[Counter(position.datum for _, position in absolute).most_common(1)[0][0]]
+    elif len(relative) >= 3:
+        located, heights = relative, [photograph.relative_altitude_m for photograph, _ in relative]
+        datum = "the place of take-off"
+    else:
+        heights = [0.0] * len(located)
+        datum = "the mean height of flight, since the photographs have no heights"
     degrees = np.array([(p.longitude_deg, p.latitude_deg) for _, p in located], dtype=np.float64).reshape(-1, 2)
     stated = [(position.horizontal_m, position.vertical_m) for _, position in located]
     if len(degrees):  # all on one side of the date line
@@ -84,22 +82,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
         stated_m=np.array(stated, dtype=np.float64).reshape(-1, 2),
         vertical_datum=datum,
-        left_out=tuple(left_out),
     )
-
-
-def _with_heights(
-    located: list[tuple[Photograph, Position]],
-) -> tuple[list[tuple[Photograph, Position]], list[float], str]:
-    """Select positions with heights: absolute ones, else above take-off, else all at one height. Also their datum."""
-    absolute = [(photograph, position) for photograph, position in located if math.isfinite(position.height_m)]
-    if len(absolute) >= 3:
-        datum = Counter(position.datum for _, position in absolute).most_common(1)[0][0]
-        return absolute, [position.height_m for _, position in absolute], _DATUMS[datum]
-    relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
-    if len(relative) >= 3:
-        return relative, [photograph.relative_altitude_m for photograph, _ in relative], "the place of take-off"
-    return located, [0.0] * len(located), "the mean height of flight, since the photographs have no heights"
 
 
 @dataclass(frozen=True)
@@ -122,6 +105,7 @@ class PositionFit:
     """A model aligned with its cameras' positions.
 
     Attributes:
+        names: of the photographs.
         world_from_model: the similarity.
         centres_model: projection centres of the cameras.
         given_world: their given positions.
@@ -131,6 +115,7 @@ class PositionFit:
         notes: what the positions do not determine.
     """
 
+    names: tuple[str, ...]
     world_from_model: Similarity
     centres_model: Float64[np.ndarray, "N 3"]
     given_world: Float64[np.ndarray, "N 3"]
@@ -170,14 +155,15 @@ def find_down(model: pycolmap.Reconstruction, photographs: Sequence[Photograph])
 
 
 def fit_positions(
-    centres_model: Float64[np.ndarray, "N 3"], positions: GivenPositions, frame: LocalFrame, down: Down
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: GivenPositions, frame: LocalFrame
 ) -> PositionFit | None:
-    """Estimate the similarity from a model to its cameras' positions.
+    """Estimate the similarity from a model to its cameras' positions, without moving it.
 
     Args:
-        centres_model: projection centres, in the order of `positions`.
+        photographs: of the model. Their direction of gravity is a prior for positions that do not determine the
+            vertical (all on one line).
+        positions: of these photographs.
         frame: the world.
-        down: a prior for positions that do not determine the vertical (all on one line).
 
     Returns:
         None if there are fewer than three positions, or if they do not follow the model's cameras.
@@ -187,31 +173,59 @@ def fit_positions(
     """
     if len(positions.names) < 3:
         return None
+    down, centre_of = find_down(model, photographs), camera_centres(model)
+    centres = np.array([centre_of[name] for name in positions.names])
     given = frame.from_geographic(positions.longitude_latitude_height)
     stated = positions.stated_m[:, [0, 0, 1]]
     nominal = np.where(np.isfinite(stated), stated, _NOMINAL_M)
-    similarity, median = _robust_start(centres_model, given, down)
+    similarity, median = _robust_start(centres, given, down)
     if median > _NOMINAL_M:
-        _refuse_mirrored(centres_model, positions, down, median)
+        _refuse_mirrored(centres, positions, down, median)
     sigma, notes, used = nominal, (), np.ones(len(given), dtype=bool)
     for _ in range(3):
-        error = similarity(centres_model) - given
+        error = similarity(centres) - given
         used = ~outliers(np.linalg.norm(error, axis=1), 5 * np.linalg.norm(nominal, axis=1))
         sigma = _observed_sigma(error, used, stated)
-        similarity, notes = _refined(similarity, centres_model[used], given[used], sigma[used], down)
-    error = similarity(centres_model) - given
-    if not _follow(given[used], error[used]):
+        refined, notes = refine_similarity(similarity, centres[used], given[used], sigma[used]), ()
+        if refined.tilt_rad >= _MAX_TILT_RAD:
+            prior = down.direction_model, down.sigma_rad
+            refined = refine_similarity(similarity, centres[used], given[used], sigma[used], *prior)
+            notes = (
+                "The cameras' positions alone do not determine the vertical (they lie on one line, or are too "
+                f"inaccurate): it is taken from {down.source}, to within about "
+                f"{math.degrees(refined.tilt_rad):.1f} degrees.",
+            )
+        similarity = refined.similarity
+    error = similarity(centres) - given
+    spread_m = rms_m((given[used] - given[used].mean(0))[:, :2])
+    if np.count_nonzero(used) < 3 or rms_m(error[used, :2]) >= 0.5 * spread_m:
         return None
-    return PositionFit(similarity, centres_model, given, used, sigma, _gross(positions.names, error, used), notes)
+    distance = np.linalg.norm(error, axis=1)
+    typical = metres(float(np.median(distance[used])))
+    gross_errors = tuple(
+        LeftOut(
+            "GPS",
+            positions.names[i],
+            f"its position lies {metres(float(distance[i]))} from where the photographs place the camera; "
+            f"half of the others are within {typical}",
+        )
+        for i in np.flatnonzero(~used)
+    )
+    return PositionFit(positions.names, similarity, centres, given, used, sigma, gross_errors, notes)
+
+
+def rms_m(error_m: Float64[np.ndarray, "N K"]) -> float:
+    """Compute the root mean square length of errors."""
+    return float(np.sqrt((error_m**2).sum(1).mean()))
 
 
 def metres(length_m: float) -> str:
     """Format a length with the digits that matter."""
     if length_m >= 10_000:
         return f"{length_m / 1000:,.0f} km"
-    return (
-        f"{length_m:,.0f} m" if length_m >= 20 else f"{length_m:.1f} m" if length_m >= 2 else f"{100 * length_m:.0f} cm"
-    )
+    if length_m >= 2:
+        return f"{length_m:,.0f} m" if length_m >= 20 else f"{length_m:.1f} m"
+    return f"{100 * length_m:.0f} cm"
 
 
 def _observed_sigma(
@@ -229,46 +243,6 @@ def _observed_sigma(
     horizontal = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, :2])))
     vertical = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, 2])))
     return relative * [horizontal, horizontal, vertical]
-
-
-def _refined(
-    start: Similarity,
-    source: Float64[np.ndarray, "N 3"],
-    target: Float64[np.ndarray, "N 3"],
-    sigma: Float64[np.ndarray, "N 3"],
-    down: Down,
-) -> tuple[Similarity, tuple[str, ...]]:
-    """Refine a similarity, with the prior of the vertical where positions do not determine it; also what to note."""
-    fit = refine_similarity(start, source, target, sigma)
-    if fit.tilt_rad < _MAX_TILT_RAD:
-        return fit.similarity, ()
-    held = refine_similarity(start, source, target, sigma, down.direction_model, down.sigma_rad)
-    return held.similarity, (
-        "The cameras' positions alone do not determine the vertical (they lie on one line, or are too inaccurate): it "
-        f"is taken from {down.source}, to within about {math.degrees(held.tilt_rad):.1f} degrees.",
-    )
-
-
-def _follow(given: Float64[np.ndarray, "N 3"], error: Float64[np.ndarray, "N 3"]) -> bool:
-    """Test whether positions fit better than half of their own spread."""
-    spread = np.sqrt(((given - given.mean(0)) ** 2)[:, :2].sum(1).mean())
-    return len(given) >= 3 and bool(np.sqrt((error[:, :2] ** 2).sum(1).mean()) < 0.5 * spread)
-
-
-def _gross(
-    names: tuple[str, ...], error: Float64[np.ndarray, "N 3"], used: Bool[np.ndarray, " N"]
-) -> tuple[LeftOut, ...]:
-    distance = np.linalg.norm(error, axis=1)
-    typical = metres(float(np.median(distance[used])))
-    return tuple(
-        LeftOut(
-            "GPS",
-            names[i],
-            f"its position lies {metres(float(distance[i]))} from where the photographs place the camera; "
-            f"half of the others are within {typical}",
-        )
-        for i in np.flatnonzero(~used)
-    )
 
 
 def _robust_start(

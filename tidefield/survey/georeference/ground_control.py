@@ -1,27 +1,57 @@
-"""Ground control: marks in the photographs of a model, triangulation, and the similarity that fits most of them."""
+"""Ground control: its marks in a model, triangulation, the similarity that fits most of them, and the adjustment.
+
+A model that is only aligned with its control points keeps the bend of its own matches. Adjusted together with the
+matches, fixed control points remove the bend, and determine lens parameters that flat ground does not: a longer lens is
+equivalent to a higher flight, unless points lie at two heights or a bend shows the difference. Every point is left out
+in turn to check the rest; marks and points that disagree with the others are rejected.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, compress
+from itertools import combinations
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float64, Int, Shaped
 from scipy.optimize import least_squares
 
-from tidefield.data.georeference import LeftOut
+from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import COLLINEAR, Similarity, hypotheses, refine_similarity
-from tidefield.survey.georeference.gps_alignment import Down, PositionFit
-from tidefield.survey.survey import Control, Photograph
+from tidefield.survey.georeference.bundle_adjustment import (
+    all_images,
+    carry_over,
+    generalise_lenses,
+    reliable,
+    solve,
+    thinned,
+)
+from tidefield.survey.georeference.gps_alignment import Down, PositionFit, metres
+from tidefield.survey.survey import Control, Photograph, Progress
 
 GROSS_ERROR = 0.02
 """Of the image width: a mark with this reprojection error in an unadjusted model, which bends by less, is wrong."""
 _CONTROL_M = 0.02
 """Standard deviation of a surveyed point, as its weight relative to the cameras' positions."""
+_REPEATS = 4
+"""Weight of a mark. A matched point is as precise as a mark, but its errors are correlated with its neighbours' (lens,
+shutter), which the sum of squares ignores; the weight compensates for that."""
+_MARK_TOLERANCE = 0.005
+"""Of the image width. Marks with a larger reprojection error in an adjusted model are wrong, or, if others are as bad,
+those beyond five robust standard deviations."""
+_POINT_FACTOR = 5.0
+"""A point is wrong whose error, left out, is this many times the median of the others."""
+_WRONG_POINTS = 3
+"""No more points than this are rejected by cross-validation."""
+_WORTH_FREEING = 0.9
+"""The lens is adjusted if the errors of the points left out fall below this share."""
+_ROUNDS = 4
+_FOLDS = 12
+_FOLDS_OF_LARGE = 4
+_LARGE = 300  # photographs
 
 
 @dataclass(frozen=True)
@@ -38,8 +68,8 @@ class Marks:
         surveyed_world: the control point's coordinates.
     """
 
-    point: tuple[str, ...]
-    photograph: tuple[str, ...]
+    point: Shaped[np.ndarray, " M"]
+    photograph: Shaped[np.ndarray, " M"]
     image: Int[np.ndarray, " M"]
     uv_px: Float64[np.ndarray, "M 2"]
     zoom: Float64[np.ndarray, " M"]
@@ -51,15 +81,7 @@ class Marks:
 
     def where(self, mask: Bool[np.ndarray, " M"]) -> Marks:
         """Select marks by a mask."""
-        return Marks(
-            tuple(compress(self.point, mask)),
-            tuple(compress(self.photograph, mask)),
-            self.image[mask],
-            self.uv_px[mask],
-            self.zoom[mask],
-            self.width_px[mask],
-            self.surveyed_world[mask],
-        )
+        return Marks(**{name: values[mask] for name, values in vars(self).items()})
 
     def of(self, *points: str) -> Bool[np.ndarray, " M"]:
         """Mask the marks of these points."""
@@ -68,7 +90,7 @@ class Marks:
     @property
     def points(self) -> dict[str, Float64[np.ndarray, " 3"]]:
         """Surveyed coordinates of the marked points, by name."""
-        return {name: self.surveyed_world[self.point.index(name)] for name in sorted(set(self.point))}
+        return {name: self.surveyed_world[self.point == name][0] for name in sorted(set(self.point.tolist()))}
 
 
 def locate_marks(
@@ -99,8 +121,8 @@ def locate_marks(
     width = np.array([model.camera(images[mark.photograph].camera_id).width for mark in found], dtype=np.float64)
     zoom = np.array([sizes[mark.photograph] for mark in found]) / width
     marks = Marks(
-        tuple(mark.point for mark in found),
-        tuple(mark.photograph for mark in found),
+        np.array([mark.point for mark in found]),
+        np.array([mark.photograph for mark in found]),
         np.array([images[mark.photograph].image_id for mark in found], dtype=np.int64),
         np.array([mark.uv_px for mark in found], dtype=np.float64).reshape(-1, 2) / zoom[:, None],
         zoom,
@@ -219,7 +241,7 @@ def fit_control(
         )
     source, target = _pairs(model, marks.where(agree))
     sigma = np.full_like(target, _CONTROL_M)
-    if not are_collinear(target):
+    if not _are_collinear(target):
         similarity = refine_similarity(similarity, source, target, sigma).similarity
     elif positions is not None:
         similarity = _with_positions(similarity, source, target, positions)
@@ -229,11 +251,12 @@ def fit_control(
     return similarity, _share(model, marks, similarity) < 1
 
 
-def are_collinear(points: Float64[np.ndarray, "N 3"]) -> bool:
+def _are_collinear(points: Collection[Float64[np.ndarray, " 3"]]) -> bool:
     """Test whether points leave a rotation undetermined: fewer than three, or on one line."""
     if len(points) < 3:
         return True
-    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    xyz = np.array(list(points))
+    spread = np.linalg.svd(xyz - xyz.mean(0), compute_uv=False)
     return bool(spread[1] <= COLLINEAR * spread[0])
 
 
@@ -265,3 +288,185 @@ def _share(model: pycolmap.Reconstruction, marks: Marks, similarity: Similarity)
     """Compute reprojection errors of the surveyed points as shares of a gross error."""
     points = similarity.inverse()(marks.surveyed_world)
     return reprojection_px(model, marks, points) / marks.width_px / GROSS_ERROR
+
+
+def adjust_to_control(
+    model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"], progress: Progress
+) -> tuple[Residuals, Residuals, tuple[LeftOut, ...], tuple[str, ...]]:
+    """Adjust a model that is aligned with its control points, in place.
+
+    The lens is adjusted too if this reduces the errors of the points that are left out in turn. Marks are added when
+    the adjusted model agrees with them, and removed when it does not.
+
+    Args:
+        agree: the marks to start with.
+
+    Returns:
+        The residuals of the control points, those of each after an adjustment without it, the rejected marks and
+        points, and notes.
+    """
+    if _are_collinear(marks.where(agree).points.values()):
+        note = (
+            "Fewer than three control points can be used, or they lie on one line: the photographs were aligned with "
+            "them without adjustment, and cannot be checked."
+        )
+        return _control_residuals(model, marks.where(agree)), Residuals(), _rejected(model, marks, agree), (note,)
+    refused: set[str] = set()
+    sound = reliable(model)
+    while True:
+        agree = _consistent(sound, marks, agree, False, refused)
+        fixed = _cross_validate(sound, marks.where(agree), False, lambda done, whole: progress(done, 2 * whole))
+        free = _cross_validate(sound, marks.where(agree), True, lambda done, whole: progress(done + whole, 2 * whole))
+        free_lens = free.rms_m < _WORTH_FREEING * fixed.rms_m
+        check = free if free_lens else fixed
+        wrong = _worst(check, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
+        if wrong is None or len(refused) == _WRONG_POINTS:
+            break
+        refused.add(wrong)
+        agree = agree & ~marks.of(wrong)
+    final = _consistent(sound, marks, agree, free_lens, refused)
+    if (final != agree).any():
+        agree, check = final, _cross_validate(sound, marks.where(final), free_lens, progress)
+    adjusted = _adjusted(sound, marks.where(agree), free_lens)
+    notes = []
+    if free_lens:
+        changes = [
+            f"{camera.mean_focal_length():.1f} to {adjusted.camera(number).mean_focal_length():.1f} px"
+            for number, camera in sorted(model.cameras.items())
+        ]
+        notes.append(
+            f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): "
+            "this reduces the errors of points that are left out in turn."
+        )
+    unchecked = sorted(marks.where(agree).points.keys() - set(check.names))
+    if unchecked:
+        why = "one photograph shows it, or too few points would be left"
+        notes.append(f"Used, but not checked: {list_names(unchecked)}; {why}.")
+    carry_over(adjusted, model)
+    return _control_residuals(adjusted, marks.where(agree)), check, _rejected(adjusted, marks, agree), tuple(notes)
+
+
+def _adjusted(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool) -> pycolmap.Reconstruction:
+    """Copy a model in the world and adjust it to its matches and to marks of fixed points.
+
+    Args:
+        free_lens: adjust focal length, principal point and distortion too, of COLMAP's OPENCV.
+    """
+    copy = pycolmap.Reconstruction(model)
+    config = all_images(copy)
+    generalise_lenses(copy, config, free_lens)
+    for name, surveyed in marks.points.items():
+        track, own = pycolmap.Track(), marks.of(name)
+        for number, uv in zip(marks.image[own], marks.uv_px[own], strict=True):
+            points = copy.image(int(number)).points2D
+            for _ in range(_REPEATS):
+                points.append(pycolmap.Point2D(uv))
+                track.add_element(int(number), len(points) - 1)
+        config.add_constant_point(copy.add_point3D(surveyed, track))
+    solve(copy, config, refine_focal_length=True)
+    return copy
+
+
+def _cross_validate(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool, progress: Progress) -> Residuals:
+    """Leave out each control point in turn, adjust, and triangulate it from its marks.
+
+    With more than a dozen points a twelfth of them is left out at a time, with more than 300 photographs a quarter.
+    Large models are thinned, which hardly changes the errors.
+
+    Args:
+        model: in the world, not yet adjusted to any of the points.
+    """
+    surveyed = marks.points
+    seen = [name for name in surveyed if np.count_nonzero(marks.of(name)) >= 2]
+    count = _FOLDS if model.num_reg_images() <= _LARGE else _FOLDS_OF_LARGE
+    folds = [fold for fold in (seen[start::count] for start in range(count)) if fold]
+    names, errors = [], []
+    light = thinned(model)
+    for done, fold in enumerate(folds):
+        progress(done, len(folds))
+        rest = marks.where(~marks.of(*fold))
+        if _are_collinear(rest.points.values()):
+            continue
+        adjusted = _adjusted(light, rest, free_lens)
+        for name in fold:
+            point = triangulate(adjusted, marks.where(marks.of(name)))
+            if point is not None:
+                names.append(name)
+                errors.append(point - surveyed[name])
+    progress(len(folds), len(folds))
+    return Residuals(tuple(names), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def _control_residuals(adjusted: pycolmap.Reconstruction, marks: Marks) -> Residuals:
+    """Compute triangulated minus surveyed coordinates of the control points."""
+    seen, surveyed = triangulate_points(adjusted, marks, 1.0), marks.points
+    errors = [point - surveyed[name] for name, point in seen.items()]
+    return Residuals(tuple(seen), np.array(errors, dtype=np.float64).reshape(-1, 3))
+
+
+def _consistent(
+    model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"], free_lens: bool, refused: set[str]
+) -> Bool[np.ndarray, " M"]:
+    """Find marks with which a model agrees that is adjusted to them."""
+    allowed = ~marks.of(*refused)
+    for _ in range(_ROUNDS):
+        adjusted = _adjusted(model, marks.where(agree), free_lens)
+        share = reprojection_px(adjusted, marks, marks.surveyed_world) / marks.width_px
+        found = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
+        # Where most of a point's marks disagree, those that agree do so by chance.
+        found &= ~marks.of(*(n for n in marks.points if 2 * (found & marks.of(n)).sum() < marks.of(n).sum()))
+        if (found == agree).all() or _are_collinear(marks.where(found).points.values()):
+            break
+        agree = found
+    return agree
+
+
+def _worst(check: Residuals, floor_m: float) -> str | None:
+    """Find the point of the largest error, if this is far larger than the others' median."""
+    if len(check.names) < 4:
+        return None
+    distance = np.linalg.norm(check.error_m, axis=1)
+    last = int(np.argmax(distance))
+    typical = float(np.median(np.delete(distance, last)))
+    return check.names[last] if distance[last] > max(_POINT_FACTOR * typical, floor_m) else None
+
+
+def _pixel_m(model: pycolmap.Reconstruction) -> float:
+    """Compute the ground sampling distance of the model's images: the median over the cameras."""
+    ground = np.median([point.xyz[2] for point in model.points3D.values()])
+    images = [model.image(number) for number in model.reg_image_ids()]
+    return float(
+        np.median([(i.projection_center()[2] - ground) / model.camera(i.camera_id).mean_focal_length() for i in images])
+    )
+
+
+def _rejected(model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"]) -> tuple[LeftOut, ...]:
+    """Describe rejected marks: a point as a whole where its marks agree with one another, else mark by mark."""
+    found = []
+    pixels = reprojection_px(model, marks, marks.surveyed_world) * marks.zoom
+    for name, surveyed in marks.points.items():
+        own = marks.of(name)
+        wrong = np.flatnonzero(own & ~agree)
+        if len(wrong) == np.count_nonzero(own) >= 2:
+            seen = triangulate_points(model, marks.where(own), 2 * _MARK_TOLERANCE)
+            share = reprojection_px(model, marks.where(own), np.tile(seen.get(name, surveyed), (len(wrong), 1)))
+            if name in seen and (share < 2 * _MARK_TOLERANCE * marks.width_px[own]).all():
+                east, north, up = error_m = seen[name] - surveyed
+                reason = (
+                    f"its {len(wrong)} marks agree with one another, but show it "
+                    f"{metres(float(np.linalg.norm(error_m)))} from where it was surveyed ({east:+.2f} m east, "
+                    f"{north:+.2f} m north, {up:+.2f} m up): check its coordinates and its name"
+                )
+                found.append(LeftOut("control point", name, reason))
+                continue
+        found += [
+            LeftOut(
+                "mark",
+                f"{name} in {marks.photograph[i]}",
+                f"it is {pixels[i]:,.0f} pixels from where the surveyed point shows"
+                if np.isfinite(pixels[i])
+                else "the surveyed point is behind the camera",
+            )
+            for i in wrong
+        ]
+    return tuple(found)

@@ -92,17 +92,12 @@ def refuse_truncated(path: Path, image: Image.Image) -> None:
             raise OSError("its end is missing")
     else:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            at = 2
+            while content[at + 1] != 0xDA:  # to the scan, where the segments end
+                at += 1 if content[at + 1] == 0xFF else 2 + int.from_bytes(content[at + 2 : at + 4], "big")
             # The two bytes of the end marker cannot occur in entropy-coded data; in the segments before, they may.
-            if content.rfind(b"\xff\xd9", _start_of_scan(content)) < 0:
+            if content.rfind(b"\xff\xd9", at) < 0:
                 raise OSError("its end is missing")
-
-
-def _start_of_scan(content: mmap.mmap) -> int:
-    """Offset of the scan of a JPEG, where its segments end."""
-    at = 2
-    while content[at + 1] != 0xDA:
-        at += 1 if content[at + 1] == 0xFF else 2 + int.from_bytes(content[at + 2 : at + 4], "big")
-    return at
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from PIL import ExifTags
 
 from tidefield.survey.io.image_decoding import upright_rotation, upright_uv
 from tidefield.survey.io.metadata import PhotographMetadata
+from tidefield.survey.io.text_files import leading_numbers
 from tidefield.survey.survey import LensPrior
 
 # Diagonal of the 36 x 24 mm frame of 35 mm film. CIPA's guideline DCG-001 defines the equivalent by the angle over the
@@ -43,37 +44,47 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
     EXIF's focal length over a sensor of known width, its 35 mm equivalent, its focal plane resolution.
 
     Args:
-        metadata: EXIF and XMP of the file.
         width, height: size of the image as stored, in pixels.
         orientation: EXIF orientation.
     """
-    prior = (
-        _dji_dewarp(metadata, width, height)
-        or _pix4d(metadata, width, height)
-        or _dji_design(metadata, width, height)
-        or _sensor_table(metadata, width, height)
-        or _film_equivalent(metadata, width, height)
-        or _focal_plane(metadata, width, height)
-    )
+    design_px = _dji_design_px(metadata, width, height)
+    prior = _dji_dewarp(metadata, width, height) or _pix4d(metadata, width, height)
+    if prior is None:
+        nominal = {
+            "DJI design focal length": design_px,
+            "EXIF focal length and the sensor's width": _sensor_table_px(metadata, width, height),
+            "EXIF 35 mm equivalent": _film_equivalent_px(metadata, width, height),
+            "EXIF focal plane resolution": (
+                metadata.exif.number(ExifTags.Base.FocalLength)
+                / _sensor_mm(metadata, width, height)
+                * max(width, height)
+            ),
+        }
+        prior = next((LensPrior(px, None, None, source, False) for source, px in nominal.items() if px > 0), None)
     smallest, largest = (side * max(width, height) for side in _FOCAL_IN_WIDTHS)
     if prior is None or not smallest < prior.focal_px < largest:
         return None
-    design = _dji_design(metadata, width, height)
-    if prior.trusted and design is not None:
-        prior = replace(prior, design_focal_px=design.focal_px)
-    return _upright_prior(prior, width, height, orientation)
+    if prior.trusted and design_px > 0:
+        prior = replace(prior, design_focal_px=design_px)
+    # From the stored image to the upright one.
+    principal_px, distortion = prior.principal_px, prior.distortion
+    if principal_px is not None:
+        principal_px = upright_uv(principal_px, width, height, orientation)
+    if distortion is not None:
+        k1, k2, p1, p2, k3 = distortion
+        # The tangential part is r^2 q + 2 x (q . x) with q = (p2, p1), which rotates like a vector.
+        p2, p1 = (float(part) for part in upright_rotation(orientation) @ (p2, p1))
+        distortion = k1, k2, p1, p2, k3
+    return replace(prior, principal_px=principal_px, distortion=distortion)
 
 
 def _dji_dewarp(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
     """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3` in pixels of the full image, cx and cy from its centre
     (https://www.easymanua.ls/dji/mavic-3m/manual?p=90)."""
-    numbers = metadata.xmp.get("DewarpData", "").rpartition(";")[2].split(",")
-    try:
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = map(float, numbers)
-    except ValueError:  # absent, or of another format
+    numbers = leading_numbers(metadata.xmp.get("DewarpData", "").rpartition(";")[2].split(","))
+    if len(numbers) != 9 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:  # absent, or of another format
         return None
-    if not (np.isfinite([fx, fy, cx, cy, k1, k2, p1, p2, k3]).all() and min(fx, fy) > 0):
-        return None
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     _, scale = _dji_reduction(metadata, width, height)
     focal_px = scale * (fx + fy) / 2
     if metadata.xmp.get("DewarpFlag") == "1":
@@ -126,35 +137,28 @@ def _pix4d(metadata: PhotographMetadata, width: int, height: int) -> LensPrior |
     return LensPrior(focal * px_per_unit, principal_px, distortion_cv, "XMP perspective focal length", True)
 
 
-def _dji_design(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
-    """CalibratedFocalLength, which DJI's manuals call the design focal length. Metres, of old drones, are rejected."""
+def _dji_design_px(metadata: PhotographMetadata, width: int, height: int) -> float:
+    """CalibratedFocalLength, which DJI's manuals call the design focal length; NaN if absent, or in metres as of old
+    drones."""
     focal = metadata.xmp_number("CalibratedFocalLength")
     full_width, scale = _dji_reduction(metadata, width, height)
-    if not focal > _FOCAL_IN_WIDTHS[0] * full_width:
-        return None
-    return LensPrior(focal * scale, None, None, "DJI design focal length", False)
+    return focal * scale if focal > _FOCAL_IN_WIDTHS[0] * full_width else math.nan
 
 
-def _sensor_table(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
-    sensor_mm = _SENSOR_WIDTH_MM.get(metadata.camera)
-    focal_mm = metadata.exif.number(ExifTags.Base.FocalLength)
-    if sensor_mm is None or not focal_mm > 0:
-        return None
-    columns = _uncropped_px(width, height, 4 / 3)[0]
-    return LensPrior(focal_mm / sensor_mm * columns, None, None, "EXIF focal length and the sensor's width", False)
+def _sensor_table_px(metadata: PhotographMetadata, width: int, height: int) -> float:
+    """EXIF's focal length over a sensor of known width; NaN if one of them is unknown."""
+    sensor_mm = _SENSOR_WIDTH_MM.get(metadata.camera, math.nan)
+    return metadata.exif.number(ExifTags.Base.FocalLength) / sensor_mm * _uncropped_px(width, height, 4 / 3)[0]
 
 
-def _film_equivalent(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
-    """EXIF's 35 mm equivalent, which is for the whole sensor, also where the image is a crop of it."""
+def _film_equivalent_px(metadata: PhotographMetadata, width: int, height: int) -> float:
+    """EXIF's 35 mm equivalent, which is for the whole sensor, also where the image is a crop of it; NaN if absent."""
     equivalent_mm = metadata.exif.number(ExifTags.Base.FocalLengthIn35mmFilm)
-    if not equivalent_mm > 0:
-        return None
     crop = equivalent_mm / metadata.exif.number(ExifTags.Base.FocalLength)
     columns, rows = width, height
     if crop > 0:
         columns, rows = _uncropped_px(width, height, next(shape for limit, shape in _SHAPES if crop < limit))
-    focal_px = equivalent_mm / _FILM_DIAGONAL_MM * math.hypot(columns, rows)
-    return LensPrior(focal_px, None, None, "EXIF 35 mm equivalent", False)
+    return equivalent_mm / _FILM_DIAGONAL_MM * math.hypot(columns, rows)
 
 
 def _uncropped_px(width: int, height: int, shape: float) -> tuple[float, float]:
@@ -169,13 +173,6 @@ def _uncropped_px(width: int, height: int, shape: float) -> tuple[float, float]:
     return (longer, shorter) if abs(longer / shorter - 5 / 4) < 0.03 else (shorter * shape, shorter)
 
 
-def _focal_plane(metadata: PhotographMetadata, width: int, height: int) -> LensPrior | None:
-    focal_px = (
-        metadata.exif.number(ExifTags.Base.FocalLength) / _sensor_mm(metadata, width, height) * max(width, height)
-    )
-    return LensPrior(focal_px, None, None, "EXIF focal plane resolution", False) if focal_px > 0 else None
-
-
 def _sensor_mm(metadata: PhotographMetadata, width: int, height: int) -> float:
     """Longer side of the sensor by EXIF's focal plane resolution; NaN where that is absent or no sensor has that size.
 
@@ -187,16 +184,3 @@ def _sensor_mm(metadata: PhotographMetadata, width: int, height: int) -> float:
     unit_mm = _MM_PER_UNIT.get(int(unit) if unit > 0 else 2, math.nan)
     sensor_mm = max(_size_of_original(metadata, width, height)) / per_unit * unit_mm
     return sensor_mm if _SENSOR_MM[0] <= sensor_mm <= _SENSOR_MM[1] else math.nan
-
-
-def _upright_prior(prior: LensPrior, width: int, height: int, orientation: int) -> LensPrior:
-    """Transform a prior from the stored image to the upright one."""
-    principal_px, distortion = prior.principal_px, prior.distortion
-    if principal_px is not None:
-        principal_px = upright_uv(principal_px, width, height, orientation)
-    if distortion is not None:
-        k1, k2, p1, p2, k3 = distortion
-        # The tangential part is r^2 q + 2 x (q . x) with q = (p2, p1), which rotates like a vector.
-        p2, p1 = (float(part) for part in upright_rotation(orientation) @ (p2, p1))
-        distortion = k1, k2, p1, p2, k3
-    return replace(prior, principal_px=principal_px, distortion=distortion)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 from xml.etree.ElementTree import Element, ParseError
 
 from defusedxml.common import DefusedXmlException
@@ -13,7 +12,7 @@ from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
 from tidefield.data.exif import Exif, as_number, read_exif
-from tidefield.survey.survey import Position
+from tidefield.survey.survey import Position, VerticalDatum
 
 _XMP_TAG = 700
 # https://www.easymanua.ls/dji/mavic-3m/manual?p=89: 0 no position, 16 single point, 32 to 49 float, 50 fixed.
@@ -74,11 +73,6 @@ class PhotographMetadata:
         return int(value) if value in range(1, 9) else 1
 
     @property
-    def log_exposure(self) -> float:
-        """Natural log of exposure time x ISO / f-number squared; NaN unless all three are known."""
-        return sum(self.exif.log_exposure_terms)
-
-    @property
     def gimbal_deg(self) -> tuple[float, float, float] | None:
         """Yaw (clockwise from north), pitch (-90 looks straight down) and roll of the camera, or None."""
         for prefix, suffix in (("Gimbal", "Degree"), ("CameraOrientationNED/", "")):
@@ -88,11 +82,6 @@ class PhotographMetadata:
                 return yaw, pitch, roll
         yaw, pitch, roll = (self.xmp_number(f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
         return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
-
-    @property
-    def relative_altitude_m(self) -> float:
-        """Height above the take-off point; NaN if unknown."""
-        return self.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude")
 
     @property
     def position(self) -> Position | None:
@@ -113,8 +102,18 @@ class PhotographMetadata:
         rtk = self.xmp_number("RtkFlag")
         if rtk >= _RTK_FLOAT:
             source += ", RTK fixed" if rtk == _RTK_FIXED else ", RTK float"
-        horizontal_m, vertical_m = _accuracy_m(self, rtk)
-        return Position(latitude, longitude, _height_m(self), horizontal_m, vertical_m, _datum(self, rtk), source)
+        accuracies_m = [
+            (self.xmp_number("Camera:GPSXYAccuracy"), self.xmp_number("Camera:GPSZAccuracy")),
+            (as_number(self.exif.gps.get(ExifTags.GPS.GPSHPositioningError)), math.nan),
+        ]
+        if rtk >= _RTK_SINGLE:
+            sides = self.xmp_number("RtkStdLon"), self.xmp_number("RtkStdLat")
+            accuracies_m.insert(0, (max(sides), self.xmp_number("RtkStdHgt")))
+        horizontal_m, vertical_m = (
+            next((value for value in values if value > 0), math.nan) for values in zip(*accuracies_m, strict=True)
+        )
+        height_m, datum = _height(self, rtk)
+        return Position(latitude, longitude, height_m, horizontal_m, vertical_m, datum, source)
 
 
 def read_metadata(image: Image.Image) -> PhotographMetadata:
@@ -190,48 +189,24 @@ def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> fl
     return -degrees if reference.strip("\0 ").upper().startswith(negative) else degrees
 
 
-def _height_m(metadata: PhotographMetadata) -> float:
-    # DJI's EXIF repeats it as an unsigned number, which turns a height below zero into millions of metres.
-    height = metadata.xmp_number("AbsoluteAltitude")
-    if math.isfinite(height):
-        return height
-    height = as_number(metadata.exif.gps.get(ExifTags.GPS.GPSAltitude))
-    return -height if _altitude_reference(metadata) in (1, 3) else height
-
-
-def _altitude_reference(metadata: PhotographMetadata) -> int | None:
-    value = metadata.exif.gps.get(ExifTags.GPS.GPSAltitudeRef)
-    if isinstance(value, bytes):
-        return value[0] if value else None
-    return value if isinstance(value, int) else None
-
-
-def _datum(metadata: PhotographMetadata, rtk: float) -> Literal["mean sea level", "ellipsoid", "unknown"]:
-    """Vertical datum of the height.
+def _height(metadata: PhotographMetadata, rtk: float) -> tuple[float, VerticalDatum]:
+    """Height, and its vertical datum.
 
     DJI's RTK drones and those with "RtkAlt" write ellipsoidal heights whatever EXIF states; its others write that of a
     barometer in a standard atmosphere. EXIF up to 2.32 has sea level only (0 above, 1 below); EXIF 3.0 gave these
     numbers to the ellipsoid, and 2 and 3 to the sea level.
     """
+    reference = metadata.exif.gps.get(ExifTags.GPS.GPSAltitudeRef)
+    if isinstance(reference, bytes) and reference:
+        reference = reference[0]
+    # DJI's EXIF repeats it as an unsigned number, which turns a height below zero into millions of metres.
+    height_m = metadata.xmp_number("AbsoluteAltitude")
+    if not math.isfinite(height_m):
+        height_m = as_number(metadata.exif.gps.get(ExifTags.GPS.GPSAltitude))
+        height_m = -height_m if reference in (1, 3) else height_m
     if rtk >= _RTK_FLOAT or "rtk" in metadata.xmp.get("AltitudeType", "").casefold():
-        return "ellipsoid"
-    reference = _altitude_reference(metadata)
+        return height_m, "ellipsoid"
     if "AbsoluteAltitude" in metadata.xmp or reference not in range(4):
-        return "unknown"
+        return height_m, "unknown"
     version = metadata.text(ExifTags.Base.ExifVersion)
-    return "ellipsoid" if reference in (0, 1) and version >= "0300" else "mean sea level"
-
-
-def _accuracy_m(metadata: PhotographMetadata, rtk: float) -> tuple[float, float]:
-    """Horizontal and vertical standard deviation; NaN where none is stated."""
-    candidates = [
-        (metadata.xmp_number("Camera:GPSXYAccuracy"), metadata.xmp_number("Camera:GPSZAccuracy")),
-        (as_number(metadata.exif.gps.get(ExifTags.GPS.GPSHPositioningError)), math.nan),
-    ]
-    if rtk >= _RTK_SINGLE:
-        sides = metadata.xmp_number("RtkStdLon"), metadata.xmp_number("RtkStdLat")
-        candidates.insert(0, (max(sides), metadata.xmp_number("RtkStdHgt")))
-    horizontal, vertical = (
-        next((value for value in values if value > 0), math.nan) for values in zip(*candidates, strict=True)
-    )
-    return horizontal, vertical
+    return height_m, "ellipsoid" if reference in (0, 1) and version >= "0300" else "mean sea level"

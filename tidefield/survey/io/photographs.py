@@ -31,8 +31,9 @@ _RAWS = (
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
 _OTHER_IMAGES = (".heic", ".heif", ".avif", ".webp", ".jp2", ".jxl", ".bmp")
-# Folders of network storage and of macOS archives, and OpenDroneMap's results.
-_FOREIGN_FOLDERS = ("@eadir", "__macosx", "opensfm", "odm_")
+# Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
+_FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
+_SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
 
 
 def read_survey(folder: Path, gps: Path | None = None, control: Path | None = None) -> Survey:
@@ -68,7 +69,11 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
             f"{folder} has {len(photographs)} photographs that can be read: expected at least {FEWEST} that overlap by "
             "more than half; add more" + "".join(f"\n{problem}" for problem in unread)
         )
-    remarks += unread + _damage_remarks(photographs)
+    remarks += unread
+    for block in ("EXIF", "XMP"):
+        names = [photograph.name for photograph, damaged in photographs if block in damaged]
+        if names:
+            remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
     located, about_positions = locate_photographs(folder, [photograph for photograph, _ in photographs], gps)
     control = control or find_file(folder, CONTROL_FILES)
     survey = Survey(folder, tuple(sorted(located, key=lambda photograph: photograph.name)), None)
@@ -104,14 +109,13 @@ def _walk(folder: Path) -> Iterator[Path]:
         raise SurveyError(f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one")
 
     for parent, folders, files in os.walk(folder, onerror=refuse):
-        folders[:] = [name for name in folders if not (name.startswith(".") or _is_foreign(Path(parent, name)))]
+        folders[:] = [
+            name
+            for name in folders
+            if not name.casefold().startswith(_FOREIGN_FOLDERS)
+            and not any(Path(parent, name, part).exists() for part in _SCENE_PARTS)
+        ]
         yield from (Path(parent, name) for name in files if not name.startswith("."))
-
-
-def _is_foreign(folder: Path) -> bool:
-    # The last exists in a scene that is still being prepared.
-    is_scene = any((folder / part).exists() for part in ("sparse", "georeference.json", "prepare/stages.json"))
-    return is_scene or folder.name.casefold().startswith(_FOREIGN_FOLDERS)
 
 
 def _refuse_collisions(names: Sequence[str]) -> None:
@@ -148,18 +152,8 @@ def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
         focal_mm=metadata.exif.number(ExifTags.Base.FocalLength),
         lens=lens_prior(metadata, *stored, metadata.orientation),
         time_s=metadata.exif.time_s,
-        log_exposure=metadata.log_exposure,
         position=metadata.position,
-        relative_altitude_m=metadata.relative_altitude_m,
+        relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
     )
     return photograph, metadata.damaged
-
-
-def _damage_remarks(photographs: Sequence[tuple[Photograph, tuple[str, ...]]]) -> list[str]:
-    remarks = []
-    for block in ("EXIF", "XMP"):
-        names = [photograph.name for photograph, damaged in photographs if block in damaged]
-        if names:
-            remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
-    return remarks

@@ -1,9 +1,10 @@
-"""Parse what the text files of a survey share: names of photographs, and coordinate reference systems."""
+"""Read the text files of a survey: lists of lines, numbers, photographs' names, coordinate reference systems."""
 
 from __future__ import annotations
 
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -22,12 +23,13 @@ class PhotographNames:
     """
 
     def __init__(self, names: Iterable[str]) -> None:
-        self._by_rule: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
+        self._names: dict[tuple[str, str], list[str]] = defaultdict(list)
         for name in names:
             path = PurePosixPath(normalise_name(name))
-            keys = str(path), path.name, str(path.with_suffix("")), path.stem
-            for found, key in zip(self._by_rule, keys, strict=True):
-                found.setdefault(key, []).append(name)
+            self._names["path", str(path)].append(name)
+            self._names["name", path.name].append(name)
+            self._names["bare path", str(path.with_suffix(""))].append(name)
+            self._names["stem", path.stem].append(name)
 
     def find(self, text: str) -> str | None:
         """The photograph with this name, or None.
@@ -37,11 +39,10 @@ class PhotographNames:
         """
         wanted = normalise_name(text.strip().strip('"').replace("\\", "/").removeprefix("./"))
         path = PurePosixPath(wanted)
-        by_path, by_name, by_bare_path, by_stem = self._by_rule
         # A path of another machine still ends in the file name; a list of raw files still names their JPEGs.
         stem = path.stem if _SUFFIX.fullmatch(path.suffix) else path.name
-        rules = (by_path, wanted), (by_name, path.name), (by_bare_path, wanted), (by_stem, path.name), (by_stem, stem)
-        names = next((found[key] for found, key in rules if key in found), [])
+        keys = ("path", wanted), ("name", path.name), ("bare path", wanted), ("stem", path.name), ("stem", stem)
+        names = next((self._names[key] for key in keys if key in self._names), [])
         if len(names) > 1:
             raise SurveyError(
                 f"{text} names {len(names)} photographs ({list_names(names)}): expected one; write its folder, too"
@@ -70,7 +71,7 @@ def find_file(folder: Path, names: Sequence[str]) -> Path | None:
     return next((files[name] for name in names if name in files), None)
 
 
-def read_text(path: Path) -> str:
+def read_lines(path: Path) -> list[str]:
     """Read a small text file in UTF-8.
 
     Raises:
@@ -82,7 +83,7 @@ def read_text(path: Path) -> str:
             raise SurveyError(
                 f"{path} has {megabytes:.0f} MB: expected a list of at most {_MAX_MEGABYTES} MB; give the right file"
             )
-        return path.read_bytes().decode("utf-8-sig")
+        return path.read_bytes().decode("utf-8-sig").splitlines()
     except OSError as error:
         raise SurveyError(f"{path} cannot be read ({error.strerror}): expected a text file; give one") from error
     except UnicodeDecodeError as error:
@@ -92,28 +93,40 @@ def read_text(path: Path) -> str:
         ) from error
 
 
-def read_crs(header: str, where: str) -> str:
-    """Parse the coordinate reference system of a header line: "EPSG:27700", a proj4 string, WKT, or "WGS84 UTM 32N".
+def read_list(path: Path) -> tuple[str, list[tuple[str, str]]]:
+    """Read one of ODM's lists: a coordinate reference system, then one item per line, with comments (#) between.
 
-    Args:
-        header: the line.
-        where: name of the file, for the message.
+    The system is "EPSG:27700", a proj4 string, WKT, or "WGS84 UTM 32N".
 
     Returns:
-        A text that pyproj understands.
+        The system as pyproj understands it, and for every item its file and line number, for messages, and its text.
 
     Raises:
-        SurveyError: it is not a system, or one that is neither projected nor geographic.
+        SurveyError: the file cannot be read, or its first line is no projected or geographic system.
     """
-    text = header.strip()
-    utm = _UTM.fullmatch(text)
+    lines = read_lines(path)
+    header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    crs = header.strip()
+    utm = _UTM.fullmatch(crs)
     if utm:
-        text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
+        crs = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
     try:
-        parse_crs(text)
+        parse_crs(crs)
     except ValueError as error:
         raise SurveyError(
-            f"the first line of {where} is {header.strip()[:80]!r}: expected a projected or geographic coordinate "
+            f"the first line of {path} is {header.strip()[:80]!r}: expected a projected or geographic coordinate "
             'reference system such as "EPSG:27700", "+proj=utm +zone=32 +datum=WGS84" or "WGS84 UTM 32N"; write one'
         ) from error
-    return text
+    items = [(f"{path}, line {number}", line.strip()) for number, line in enumerate(lines, start=1) if line != header]
+    return crs, [(where, text) for where, text in items if text and not text.startswith("#")]
+
+
+def leading_numbers(cells: Iterable[str]) -> list[float]:
+    """Read the numbers with which a row of cells begins, up to the first cell that is none; NaN counts as one."""
+    numbers = []
+    for cell in cells:
+        try:
+            numbers.append(float(cell))
+        except ValueError:
+            break
+    return numbers

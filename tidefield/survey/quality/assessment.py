@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float64, Int, Int8
+from jaxtyping import Float, Float32, Int8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -22,10 +23,9 @@ from tidefield.errors import SurveyError
 from tidefield.machine import cores
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.io.photographs import FEWEST
-from tidefield.survey.io.positions import metres_around
-from tidefield.survey.quality.duplicates import capture_order, find_duplicates, outline
+from tidefield.survey.io.positions import positions_m
 from tidefield.survey.quality.measures import SIDE_PX, Measures, measure
-from tidefield.survey.survey import Photograph, Survey
+from tidefield.survey.survey import Photograph, Progress, Survey
 
 NEIGHBOURS = 6
 """Number of photographs, the nearest in position or else in time, with which one is compared."""
@@ -59,6 +59,19 @@ _MIN_GAP_M = 20.0  # positions of a hovering drone scatter
 _CELLS_IN_GAP = 8.0
 _UNKNOWN_FOCAL = 0.75  # of the longer side
 
+MAX_SHIFT = 0.03
+"""Largest shift of a duplicate, in longer sides: too short a baseline to measure heights."""
+MIN_AGREEMENT = 0.6
+"""Different views agree by at most 0.3, those of a hovering drone by 0.6 and more, even rotated by three degrees."""
+
+# Accuracy of receivers, or this part of the flight height where it is larger.
+_NEAR_M, _NEAR_OF_HEIGHT = 3.0, 0.05
+_FAR_M = 20.0  # larger than the error of a receiver with a fix
+_IN_SEQUENCE = 3
+_COARSE = 16, 12
+_MIN_CORRELATION = 0.5  # of the coarse outlines of two photographs, to compare them in full
+_BLOCK = 20
+
 
 @dataclass(frozen=True)
 class QualityDecision:
@@ -75,14 +88,10 @@ class QualityDecision:
     left_out: str | None
 
 
-def assess_quality(survey: Survey, progress: Callable[[int, int], None] | None = None) -> tuple[QualityDecision, ...]:
+def assess_quality(survey: Survey, progress: Progress | None = None) -> tuple[QualityDecision, ...]:
     """Decide on all photographs, in their order.
 
     Decodes one reduced image per processor at a time; about 20 kB of each are kept until the end.
-
-    Args:
-        survey: the photographs.
-        progress: called with the number of photographs that are measured, and of all.
     """
     photographs = survey.photographs
     measured, outlines, reasons = _measure(photographs, progress)
@@ -90,20 +99,21 @@ def assess_quality(survey: Survey, progress: Callable[[int, int], None] | None =
     for index, measures in enumerate(measured):
         if measures is not None:
             neighbours = [other for other in (measured[i] for i in near[index]) if other is not None]
-            reasons[index] = _flat(measures) or _exposed(measures, neighbours)
+            reasons[index] = _flat_or_badly_exposed(measures, neighbours)
     # Photographs that are left out already must not be what the others are compared with.
     sharp = [math.nan if reason or not m else m.sharpness for m, reason in zip(measured, reasons, strict=True)]
-    of_survey = _median_of_camera(photographs, sharp)
+    kinds = [(p.camera, min(p.width, p.height), max(p.width, p.height)) for p in photographs]
+    of_kind = {k: _median([s for kind, s in zip(kinds, sharp, strict=True) if kind == k]) for k in set(kinds)}
     for index, measures in enumerate(measured):
         if measures is not None and reasons[index] is None:
             of_neighbours = _median([sharp[i] for i in near[index]])
-            reasons[index] = _blurred(sharp[index], of_survey[index], of_neighbours) or _horizon(
+            reasons[index] = _blurred(sharp[index], of_kind[kinds[index]], of_neighbours) or _horizon(
                 photographs[index], measures
             )
-    for index, reason in find_off_survey(photographs).items():
+    for index, reason in {**find_beyond_gap(photographs), **_low(photographs)}.items():
         reasons[index] = reasons[index] or reason
     kept = [index for index, reason in enumerate(reasons) if reason is None]
-    duplicates = find_duplicates([photographs[i] for i in kept], [outlines[i] for i in kept], [sharp[i] for i in kept])
+    duplicates = _find_duplicates([photographs[i] for i in kept], [outlines[i] for i in kept], [sharp[i] for i in kept])
     for index, reason in duplicates.items():
         reasons[kept[index]] = reason
     found = zip(photographs, measured, reasons, strict=True)
@@ -114,8 +124,7 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
     """Remove the photographs that are to be left out, their marks, and control points without marks.
 
     Args:
-        survey: the survey that was assessed.
-        decisions: on all its photographs.
+        decisions: on all photographs of the survey.
         keep_all: keep all photographs that can be decoded.
 
     Raises:
@@ -140,13 +149,8 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
     return replace(survey, photographs=photographs, control=control)
 
 
-def find_off_survey(photographs: Sequence[Photograph]) -> dict[int, str]:
-    """Find the photographs that are far from the others or far below them; returns the reason by index."""
-    return {**_beyond_gap(photographs), **_low(photographs)}
-
-
 def _measure(
-    photographs: Sequence[Photograph], progress: Callable[[int, int], None] | None
+    photographs: Sequence[Photograph], progress: Progress | None
 ) -> tuple[list[Measures | None], list[Int8[np.ndarray, "_ _"]], list[str | None]]:
     """Measures, outlines and reasons; of photographs that cannot be decoded, the reason alone."""
 
@@ -155,7 +159,7 @@ def _measure(
             measures, small = measure(thumbnail(photograph, SIDE_PX))
         except SurveyError as error:
             return None, np.zeros((16, 16), np.int8), f"undecodable: {error}"
-        return measures, outline(small), None
+        return measures, _outline(small), None
 
     found = []
     pool = ThreadPoolExecutor(min(8, cores()))
@@ -172,34 +176,18 @@ def _measure(
 def _neighbours(photographs: Sequence[Photograph]) -> list[list[int]]:
     """The nearest photographs of each; in time where its position is unknown."""
     count = min(NEIGHBOURS, len(photographs) - 1)
-    by_time = capture_order(photographs)
+    by_time = _capture_order(photographs)
     near: list[list[int]] = [[] for _ in photographs]
     for rank, index in enumerate(by_time):
         first = max(0, min(rank - count // 2, len(by_time) - count - 1))
         near[index] = [other for other in by_time[first : first + count + 1] if other != index]
-    located, xy_m = _located(photographs)
+    xy_m = positions_m(photographs)
+    located = np.flatnonzero(np.isfinite(xy_m[:, 0])).tolist()
     if len(located) > count:
-        _, found = KDTree(xy_m).query(xy_m, count + 1)
+        _, found = KDTree(xy_m[located]).query(xy_m[located], count + 1)
         for row, index in zip(found.reshape(len(located), -1), located, strict=True):
             near[index] = [located[other] for other in row if located[other] != index][:count]
     return near
-
-
-def _located(photographs: Sequence[Photograph]) -> tuple[list[int], Float64[np.ndarray, "N 2"]]:
-    """Indices of the photographs with a position, and their east and north in metres."""
-    located = [(index, p.position) for index, p in enumerate(photographs) if p.position is not None]
-    xy_m = metres_around([position for _, position in located]) if located else np.zeros((0, 2))
-    return [index for index, _ in located], xy_m
-
-
-def _median_of_camera(photographs: Sequence[Photograph], values: Sequence[float]) -> list[float]:
-    """For each photograph the median over all of its camera and size."""
-    kinds = [(p.camera, min(p.width, p.height), max(p.width, p.height)) for p in photographs]
-    by_kind: dict[tuple[str, int, int], list[float]] = {}
-    for kind, value in zip(kinds, values, strict=True):
-        by_kind.setdefault(kind, []).append(value)
-    median = {kind: _median(several) for kind, several in by_kind.items()}
-    return [median[kind] for kind in kinds]
 
 
 def _median(values: Sequence[float]) -> float:
@@ -208,16 +196,12 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(finite)) if finite else math.nan
 
 
-def _flat(measures: Measures) -> str | None:
-    if measures.contrast >= FLAT_CONTRAST:
-        return None
-    return (
-        f"flat: 98% of the image lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
-        f"{FLAT_CONTRAST:.0f} or more."
-    )
-
-
-def _exposed(measures: Measures, neighbours: Sequence[Measures]) -> str | None:
+def _flat_or_badly_exposed(measures: Measures, neighbours: Sequence[Measures]) -> str | None:
+    if measures.contrast < FLAT_CONTRAST:
+        return (
+            f"flat: 98% of the image lies within {measures.contrast:.1f} of 255 levels; a photograph of the ground has "
+            f"{FLAT_CONTRAST:.0f} or more."
+        )
     if measures.white > WHITE:
         return f"over-exposed: {measures.white:.0%} of it is white; {WHITE:.0%} is the limit."
     if measures.highlights < DARK_HIGHLIGHTS:
@@ -258,7 +242,12 @@ def _blurred(sharpness: float, usual: float, of_neighbours: float) -> str | None
 
 def _horizon(photograph: Photograph, measures: Measures) -> str | None:
     """Use the gimbal pitch where the image confirms it (makers define it differently), else the image alone."""
-    above = _above_horizon(photograph)
+    above = math.nan  # share of the image above the horizon, if the camera does not roll
+    if photograph.gimbal_deg is not None:
+        lens, pitch_deg = photograph.lens, min(89.0, max(-89.0, photograph.gimbal_deg[1]))
+        focal_px = lens.focal_px if lens else _UNKNOWN_FOCAL * max(photograph.width, photograph.height)
+        above = 0.5 + focal_px * math.tan(math.radians(pitch_deg)) / photograph.height
+        above = min(1.0, max(0.0, above))
     if above > SKY_BELOW_HORIZON and measures.sky > SKY_AT_LEAST:
         return f"horizon: {above:.0%} of it is above the horizon; {SKY_BELOW_HORIZON:.0%} is the limit."
     if math.isnan(above) and measures.sky > SKY:
@@ -266,24 +255,22 @@ def _horizon(photograph: Photograph, measures: Measures) -> str | None:
     return None
 
 
-def _above_horizon(photograph: Photograph) -> float:
-    """Share of the image above the horizon, if the camera does not roll; NaN where its pitch is unknown."""
-    if photograph.gimbal_deg is None:
-        return math.nan
-    lens, side = photograph.lens, max(photograph.width, photograph.height)
-    focal_px = lens.focal_px if lens else _UNKNOWN_FOCAL * side
-    pitch = math.radians(min(89.0, max(-89.0, photograph.gimbal_deg[1])))
-    return min(1.0, max(0.0, 0.5 + focal_px * math.tan(pitch) / photograph.height))
-
-
-def _beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
-    located, xy_m = _located(photographs)
+def find_beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
+    """Find the few photographs beyond a gap in the survey; returns the reason by index."""
+    xy_m = positions_m(photographs)
+    located = np.flatnonzero(np.isfinite(xy_m[:, 0])).tolist()
+    xy_m = xy_m[located]
     if len(located) < 4:
         return {}
     nearest_m = float(np.median(KDTree(xy_m).query(xy_m, 2)[0][:, 1]))
     height_m = _flight_height_m(photographs)
     gap_m = max(_MIN_GAP_M, GAP_SPACINGS * nearest_m, GAP_HEIGHTS * height_m if height_m > 0 else 0.0)
-    cluster = _clusters(xy_m, gap_m)
+    # Single linkage with distances shorter than a gap. Positions are rounded to an eighth of the gap first, because
+    # thousands at one position would be millions of pairs.
+    cells, cell_of = np.unique(np.round(xy_m * (_CELLS_IN_GAP / gap_m)), axis=0, return_inverse=True)
+    pairs = KDTree(cells).query_pairs(_CELLS_IN_GAP, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    cluster = connected_components(graph, directed=False)[1][cell_of.reshape(-1)]
     sizes = np.bincount(cluster)
     largest = sizes.argmax()
     small = sizes <= max(1.0, min(MAX_FEW, FEW * len(located)))
@@ -296,18 +283,6 @@ def _beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
         "is the limit."
         for row in np.flatnonzero(small[cluster])
     }
-
-
-def _clusters(xy_m: Float64[np.ndarray, "N 2"], gap_m: float) -> Int[np.ndarray, " N"]:
-    """Number of the cluster of each position: single linkage with distances shorter than a gap.
-
-    Positions are rounded to an eighth of the gap first, because thousands at one position would be millions of pairs.
-    """
-    cells, cell_of = np.unique(np.round(xy_m * (_CELLS_IN_GAP / gap_m)), axis=0, return_inverse=True)
-    pairs = KDTree(cells).query_pairs(_CELLS_IN_GAP, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    _, cluster = connected_components(graph, directed=False)
-    return cluster[cell_of.reshape(-1)]
 
 
 def _low(photographs: Sequence[Photograph]) -> dict[int, str]:
@@ -324,3 +299,112 @@ def _low(photographs: Sequence[Photograph]) -> dict[int, str]:
 
 def _flight_height_m(photographs: Sequence[Photograph]) -> float:
     return _median([p.relative_altitude_m for p in photographs if p.relative_altitude_m > 0])
+
+
+def _find_duplicates(
+    photographs: Sequence[Photograph], outlines: Sequence[Int8[np.ndarray, "_ _"]], sharpness: Sequence[float]
+) -> dict[int, str]:
+    """Find the photographs of which a sharper duplicate exists.
+
+    Compared are photographs taken within 3 m (or 5% of the flight height) of each other; and, if their positions are
+    unknown or within 20 m, those within three of each other in time or with similar coarse outlines.
+
+    Returns:
+        The reason by index of the photograph.
+    """
+    coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(-1, _COARSE[0] * _COARSE[1])
+    order = sorted(range(len(photographs)), key=lambda i: (-(sharpness[i] if sharpness[i] > 0 else 0.0), i))
+    rank = np.argsort(np.array(_capture_order(photographs), dtype=np.int64))
+    xy_m = positions_m(photographs)
+    kept: list[int] = []
+    reasons = {}
+    for index in order:
+        others = np.array(kept, dtype=np.int64)
+        height_m = photographs[index].relative_altitude_m
+        near_m = max(_NEAR_M, _NEAR_OF_HEIGHT * height_m if height_m > 0 else 0.0)
+        away_m = np.linalg.norm(xy_m[others] - xy_m[index], axis=1)  # NaN where a position is unknown
+        likely = (np.abs(rank[others] - rank[index]) <= _IN_SEQUENCE) | (
+            coarse[others] @ coarse[index] > _MIN_CORRELATION
+        )
+        for other in others[(away_m < near_m) | (likely & ~(away_m > _FAR_M))].tolist():
+            if outlines[other].shape != outlines[index].shape:
+                continue
+            shift, agree = _agreement(outlines[index], outlines[other])
+            if shift < MAX_SHIFT and agree > MIN_AGREEMENT:
+                reasons[index] = (
+                    f"duplicate: it has the view of {photographs[other].name}, shifted by {shift:.1%} of its longer "
+                    f"side (agreement {agree:.2f}); {MAX_SHIFT:.0%} (and {MIN_AGREEMENT}) is the limit."
+                )
+                break
+        else:
+            kept.append(index)
+    return reasons
+
+
+def _capture_order(photographs: Sequence[Photograph]) -> list[int]:
+    """Indices of photographs by time of capture, then by name; those without time first."""
+    times = [photograph.time_s if math.isfinite(photograph.time_s) else 0.0 for photograph in photographs]
+    return sorted(range(len(photographs)), key=lambda i: (times[i], photographs[i].name))
+
+
+def _outline(thumbnail: Float32[np.ndarray, "h w"]) -> Int8[np.ndarray, "h w"]:
+    """Band-pass the log brightness of a grey thumbnail and normalise its contrast, so that exposure does not matter."""
+    bright = np.log(thumbnail + 8)
+    middle = cv2.GaussianBlur(bright, (0, 0), 1.5) - cv2.GaussianBlur(bright, (0, 0), 8)
+    normalised = middle / np.sqrt(cv2.blur(middle * middle, (25, 25)) + 1e-4)  # the constant keeps flat regions flat
+    return np.clip(np.round(normalised * 32), -127, 127).astype(np.int8)
+
+
+def _agreement(first: Int8[np.ndarray, "h w"], second: Int8[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Register two outlines; returns their shift, in longer sides, and their agreement after it.
+
+    The shift is found by phase correlation. The agreement is the median correlation of blocks of 20 pixels, 1 for equal
+    outlines. Roads and shores of the same direction agree in some blocks only.
+    """
+    a, b = first.astype(np.float32), second.astype(np.float32)
+    right, down = _phase_correlation(a, b)
+    move = np.array([[1, 0, right], [0, 1, down]], np.float32)
+    moved = cv2.warpAffine(b, move, b.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    margin = 1 + math.ceil(max(abs(right), abs(down), 3))
+    shift = math.hypot(right, down) / max(a.shape)
+    if min(a.shape) < 2 * margin + _BLOCK:
+        return shift, 0.0
+    cells = []
+    for image in (a, moved):
+        inner = image[margin:-margin, margin:-margin]
+        rows, columns = inner.shape[0] // _BLOCK, inner.shape[1] // _BLOCK
+        whole = inner[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+        cell = whole.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+        cells.append(cell - cell.mean(axis=1, keepdims=True))
+    energy = np.sqrt((cells[0] ** 2).sum(axis=1) * (cells[1] ** 2).sum(axis=1))
+    return shift, float(np.median((cells[0] * cells[1]).sum(axis=1) / (energy + 1.0)))
+
+
+def _phase_correlation(a: Float32[np.ndarray, "h w"], b: Float32[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Shift to the right and down in pixels, with b(x + shift) = a(x).
+
+    `cv2.phaseCorrelate` is three times as fast, but 0.1 pixels off where this is 0.02 off: its peak is a centroid.
+    """
+    height, width = a.shape
+    window = np.hanning(height)[:, None] * np.hanning(width)
+    spectrum = np.fft.rfft2(a * window).conj() * np.fft.rfft2(b * window)
+    size = np.abs(spectrum)
+    # The constants keep frequencies that neither has from weighing as much as the others.
+    surface = np.fft.irfft2(spectrum / (size + 1e-9 * size.max() + 1e-30), a.shape)
+    surface: Float[np.ndarray, "h w"] = cv2.GaussianBlur(np.fft.fftshift(surface), (0, 0), 0.8)
+    y, x = np.unravel_index(surface.argmax(), surface.shape)
+
+    def between(before: float, peak: float, after: float) -> float:
+        curvature = before - 2 * peak + after
+        return 0.0 if curvature == 0 else float(np.clip((before - after) / (2 * curvature), -0.5, 0.5))
+
+    right = between(surface[y, x - 1], surface[y, x], surface[y, (x + 1) % width])
+    down = between(surface[y - 1, x], surface[y, x], surface[(y + 1) % height, x])
+    return float(x + right - width // 2), float(y + down - height // 2)
+
+
+def _coarse(outline: Int8[np.ndarray, "h w"]) -> Float32[np.ndarray, " 192"]:
+    """A reduced outline of unit norm, insensitive to shifts of a fiftieth."""
+    small = cv2.resize(outline.astype(np.float32), _COARSE, interpolation=cv2.INTER_AREA).ravel()
+    small = small - small.mean()
+    return small / max(float(np.linalg.norm(small)), 1e-6)  # a flat one correlates with none

@@ -69,24 +69,19 @@ def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Float32[np.nd
     thumbnail = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     low, high = np.percentile(thumbnail, (1, 99))
     median, highlights = np.percentile(grey, (50, 95))
+    value = float(median) / 255  # to linear light (IEC 61966-2-1)
     clipped = (pixels >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
     measures = Measures(
         sharpness=sharpness(grey.astype(np.float32)),
         brightness=float(median),
         highlights=float(highlights),
-        light=_linear(float(median)),
+        light=value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4,
         clipped=float(np.mean(clipped >= 1)),
         white=float(np.mean(clipped >= 2)),
         contrast=float(high - low),
         sky=_sky(thumbnail),
     )
     return measures, thumbnail
-
-
-def _linear(level: float) -> float:
-    """Linear light of an 8-bit sRGB level (IEC 61966-2-1)."""
-    value = level / 255
-    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
 def sharpness(grey: Float32[np.ndarray, "H W"]) -> float:

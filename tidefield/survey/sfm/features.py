@@ -7,7 +7,7 @@ make matching slower) and reports no progress.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -17,15 +17,13 @@ from urllib.parse import quote, unquote
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, UInt8
 
 from tidefield.errors import DeviceError
 from tidefield.machine import cores
 from tidefield.survey.io.image_decoding import upright
-from tidefield.survey.survey import LensPrior, Photograph
+from tidefield.survey.survey import Photograph, Progress
 
-Progress = Callable[[int, int], object]
-"""Called with (done, of how many)."""
 Keypoints = Float32[np.ndarray, "K 4"]
 Descriptors = UInt8[np.ndarray, "K 128"]
 
@@ -84,22 +82,16 @@ def initial_camera(photograph: Photograph) -> pycolmap.Camera:
     if lens and lens.principal_px:
         camera.principal_point_x, camera.principal_point_y = lens.principal_px
     if lens and lens.distortion:
-        camera.params = [*camera.params[:4].tolist(), *_fit_without_k3(lens, width, height).tolist()]
+        k1, k2, p1, p2, k3 = lens.distortion
+        # OPENCV has no r^6: k1 and k2 are fitted to all three terms over the photograph.
+        r2 = np.linspace(0, 0.25 * (width**2 + height**2) / lens.focal_px**2, 50)
+        shift = k1 * r2 + k2 * r2**2 + k3 * r2**3
+        # The displacement is r times the radial factor, and the number of pixels at radius r is proportional to r.
+        terms = np.stack([r2, r2**2], 1) * r2[:, None]
+        k1, k2 = np.linalg.lstsq(terms, shift * r2, rcond=None)[0]
+        camera.params = [*camera.params[:4].tolist(), k1, k2, p1, p2]
     camera.has_prior_focal_length = lens is not None
     return camera
-
-
-def _fit_without_k3(lens: LensPrior, width: int, height: int) -> Float64[np.ndarray, " 4"]:
-    """Fit (k1, k2, p1, p2) to the five-term distortion over the photograph: OPENCV has no r^6."""
-    assert lens.distortion is not None
-    k1, k2, p1, p2, k3 = lens.distortion
-    r2 = np.linspace(0, 0.25 * (width**2 + height**2) / lens.focal_px**2, 50)
-    shift = k1 * r2 + k2 * r2**2 + k3 * r2**3
-    # The displacement is r times the radial factor, and the number of pixels at radius r is proportional to r.
-    weight = r2
-    terms = np.stack([r2, r2**2], 1) * weight[:, None]
-    k1, k2 = np.linalg.lstsq(terms, shift * weight, rcond=None)[0]
-    return np.array([k1, k2, p1, p2])
 
 
 def extract(

@@ -24,17 +24,11 @@ import pycolmap
 
 from tidefield.errors import SurveyError
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
-from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, thinned
-from tidefield.survey.georeference.gps_alignment import (
-    PositionFit,
-    camera_centres,
-    find_down,
-    fit_positions,
-    given_positions,
-)
-from tidefield.survey.sfm.features import Progress, decode_name
-from tidefield.survey.stages import interruptible
-from tidefield.survey.survey import Photograph
+from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
+from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
+from tidefield.survey.sfm.features import decode_name
+from tidefield.survey.sfm.matching import interruptible
+from tidefield.survey.survey import Photograph, Progress
 
 MIN_PHOTOGRAPHS = 3
 """Photographs of the smallest model."""
@@ -52,19 +46,6 @@ MIN_HEIGHT_M = 10.0
 """Below this, the height above take-off is too inaccurate to be compared."""
 MIN_SPREAD_DEG = 10.0
 """RMS angle of the optical axes from their mean that determines the focal length."""
-
-
-@dataclass(frozen=True)
-class Models:
-    """Result of incremental mapping.
-
-    Attributes:
-        best: the model with the most photographs, under their own names.
-        others: names of the photographs of the other, unconnected models, the larger first.
-    """
-
-    best: pycolmap.Reconstruction
-    others: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -122,11 +103,14 @@ class LensChoice:
     heights: Heights | None = None
 
 
-def reconstruct(database: Path, folder: Path, progress: Progress) -> Models:
+def reconstruct(database: Path, folder: Path, progress: Progress) -> list[pycolmap.Reconstruction]:
     """Run incremental mapping on the matches of a database.
 
     Args:
         folder: where pycolmap may write; created if it does not exist.
+
+    Returns:
+        The models that nothing connects, the one with the most photographs first, with the photographs' own names.
 
     Raises:
         SurveyError: no three photographs fit together.
@@ -159,7 +143,7 @@ def reconstruct(database: Path, folder: Path, progress: Progress) -> Models:
             f"none of the {count} photographs could be placed: expected photographs that overlap by half or more and "
             "show ground with some texture; fly with more overlap, or add the photographs in between"
         )
-    return Models(models[0], tuple(tuple(registered_names(model)) for model in models[1:]))
+    return models
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:
@@ -176,7 +160,10 @@ def choose_lens(
         photographs: of the survey.
         known: whether the model's focal length has a prior.
     """
-    light, trials, spread = thinned(model), [], axes_spread_deg(model)
+    axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
+    cosine = np.clip(axes @ axes.mean(0) / max(float(np.linalg.norm(axes.mean(0))), 1e-9), -1, 1)
+    spread = float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
+    light, trials = thinned(model), []
     try_focal = known and spread >= MIN_SPREAD_DEG
     steps = len(TERMS) + 1 + try_focal
 
@@ -216,26 +203,15 @@ def _is_better(richer: LensTrial, simpler: LensTrial) -> bool:
     return richer.error_px < MAX_ERROR_RATIO * simpler.error_px
 
 
-def axes_spread_deg(model: pycolmap.Reconstruction) -> float:
-    """Compute the RMS angle of the optical axes from their mean."""
-    axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
-    mean = axes.mean(axis=0)
-    cosine = np.clip(axes @ mean / max(float(np.linalg.norm(mean)), 1e-9), -1, 1)
-    return float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
-
-
 def _try_lens(
     model: pycolmap.Reconstruction, photographs: Sequence[Photograph], lens: str, refine_focal: bool
 ) -> LensTrial:
     """Adjust a copy of a model with a lens model."""
     model = pycolmap.Reconstruction(model)
     _adjust(model, lens, refine_focal)
-    fit, names = _fit_to_positions(model, photographs)
-    off_m = None
+    fit, off_m = _fit_to_positions(model, photographs), None
     if fit is not None:
-        centres = camera_centres(model)
-        error_m = (fit.world_from_model(np.array([centres[name] for name in names])) - fit.given_world)[fit.used]
-        off_m = float(np.sqrt((error_m**2).sum(1).mean()))
+        off_m = rms_m((fit.world_from_model(fit.centres_model) - fit.given_world)[fit.used])
     camera = model.cameras[min(model.cameras)]
     return LensTrial(lens, model.compute_mean_reprojection_error(), off_m, camera.mean_focal_length())
 
@@ -247,13 +223,9 @@ def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
         mean = (current.fx + current.fy) / 2
         camera.model = getattr(pycolmap.CameraModelId, lens)
         camera.params = colmap_parameters(replace(current, fx=mean, fy=mean), lens)
-    options = adjustment_options()
-    options.refine_focal_length, options.refine_principal_point = focal, False
     config = all_images(model)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not `bundle_adjustment`, which is the same but prints whatever the log level.
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    model.update_point_3d_errors()
+    solve(model, config, refine_focal_length=focal, refine_principal_point=False)
 
 
 def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> Heights | None:
@@ -262,13 +234,13 @@ def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photo
     if len(stated) != 1 or len(model.cameras) != 1:
         return None
     ((calibrated, design),) = stated
-    fit, names = _fit_to_positions(model, photographs)
+    fit = _fit_to_positions(model, photographs)
     if design is None or abs(math.log(design / calibrated)) < MIN_FOCAL_DIFFERENCE or fit is None:
         return None
     above_start_m = {p.name: p.relative_altitude_m for p in photographs}
     shares = []
     for image in (model.image(number) for number in model.reg_image_ids()):
-        if image.name in names and above_start_m[image.name] > MIN_HEIGHT_M:
+        if image.name in fit.names and above_start_m[image.name] > MIN_HEIGHT_M:
             seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
             ground, centre = fit.world_from_model(np.array(seen)), fit.world_from_model(image.projection_center()[None])
             shares.append((centre[0, 2] - np.median(ground[:, 2])) / above_start_m[image.name])
@@ -278,64 +250,44 @@ def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photo
     return Heights(calibrated, design, share, share * design / calibrated)
 
 
-def _fit_to_positions(
-    model: pycolmap.Reconstruction, photographs: Sequence[Photograph]
-) -> tuple[PositionFit | None, tuple[str, ...]]:
-    """Fit a similarity to the cameras' positions without moving the model; None if there are too few.
-
-    Returns:
-        The fit, and the names of the photographs that have a position.
-    """
-    centres = camera_centres(model)
-    own = [photograph for photograph in photographs if photograph.name in centres]
+def _fit_to_positions(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> PositionFit | None:
+    """Fit a similarity to the cameras' positions without moving the model; None if there are too few."""
+    registered = set(registered_names(model))
+    own = [photograph for photograph in photographs if photograph.name in registered]
     positions = given_positions(own)
-    if len(positions.names) < MIN_POSITIONS:
-        return None, positions.names
-    located = np.array([centres[name] for name in positions.names])
-    return fit_positions(located, positions, positions.frame(), find_down(model, own)), positions.names
+    return fit_positions(model, own, positions, positions.frame()) if len(positions.names) >= MIN_POSITIONS else None
 
 
 def lens_notes(choice: LensChoice) -> tuple[str, ...]:
     """Describe a choice for the report, where the surveyor should know of it."""
-    return (*_focal_notes(choice), *_height_notes(choice.heights), *_distortion_notes(choice.trials))
-
-
-def _focal_notes(choice: LensChoice) -> list[str]:
     axes = f"the directions of the photographs differ by {choice.spread_deg:.0f} degrees"
+    heights, (*others, best) = choice.heights, choice.trials
+    notes = []
     if choice.known and choice.freed:
-        prior_px, refined_px = choice.trials[0].focal_px, choice.trials[-1].focal_px
-        return [f"The focal length was refined from {prior_px:.1f} to {refined_px:.1f} px: {axes}."]
-    if not choice.known and choice.spread_deg < MIN_SPREAD_DEG:
-        return [
+        prior_px, refined_px = choice.trials[0].focal_px, best.focal_px
+        notes.append(f"The focal length was refined from {prior_px:.1f} to {refined_px:.1f} px: {axes}.")
+    elif not choice.known and choice.spread_deg < MIN_SPREAD_DEG:
+        notes.append(
             f"The photographs do not state the focal length, and matches alone determine it badly ({axes}): unless "
             "ground control or differential GPS correct it, heights may be wrong by tens of percent. Photographs with "
             "EXIF would help."
-        ]
-    return []
-
-
-def _height_notes(heights: Heights | None) -> list[str]:
-    if heights is None:
-        return []
-    calibrated = ("calibrated", heights.calibrated_px, heights.calibrated_share)
-    design = ("design", heights.design_px, heights.design_share)
-    used, other = (design, calibrated) if heights.prefers_design else (calibrated, design)
-    return [
-        f"The maker states two focal lengths. With the {used[0]} one ({used[1]:.1f} px) the flight height is "
-        f"{used[2]:.1%} of the drone's own, with the {other[0]} one ({other[1]:.1f} px) {other[2]:.1%}: the {used[0]} "
-        "one was used. The drone's height is above take-off, not above the ground."
-    ]
-
-
-def _distortion_notes(trials: Sequence[LensTrial]) -> list[str]:
-    """Explain why there are no more terms of distortion, where positions were the reason."""
-    *others, best = trials
+        )
+    if heights is not None:
+        calibrated = ("calibrated", heights.calibrated_px, heights.calibrated_share)
+        design = ("design", heights.design_px, heights.design_share)
+        used, other = (design, calibrated) if heights.prefers_design else (calibrated, design)
+        notes.append(
+            f"The maker states two focal lengths. With the {used[0]} one ({used[1]:.1f} px) the flight height is "
+            f"{used[2]:.1%} of the drone's own, with the {other[0]} one ({other[1]:.1f} px) {other[2]:.1%}: the "
+            f"{used[0]} one was used. The drone's height is above take-off, not above the ground."
+        )
+    # Why there are no more terms of distortion, where positions were the reason.
     richer = [t for t in others if TERMS[t.lens] > TERMS[best.lens] and t.error_px < MAX_ERROR_RATIO * best.error_px]
-    if not richer or best.off_m is None:
-        return []
-    other, terms = min(richer, key=lambda trial: trial.error_px), TERMS[best.lens]
-    return [
-        f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {TERMS[other.lens]} the matches would fit "
-        f"better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras fit their positions worse "
-        f"({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be curved."
-    ]
+    if richer and best.off_m is not None:
+        other, terms = min(richer, key=lambda trial: trial.error_px), TERMS[best.lens]
+        notes.append(
+            f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {TERMS[other.lens]} the matches would "
+            f"fit better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras fit their positions "
+            f"worse ({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be curved."
+        )
+    return tuple(notes)

@@ -7,21 +7,25 @@ pycolmap. Its own `match_spatial` needs a position of every photograph, and repo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotReady
+from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pycolmap
 import torch
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from tidefield.survey.sfm.features import Progress, encode_name
-from tidefield.survey.stages import interruptible
-from tidefield.survey.survey import Photograph
+from tidefield.survey.sfm.features import encode_name
+from tidefield.survey.survey import Photograph, Progress
 
+Result = TypeVar("Result")
 Pair = tuple[int, int]
 """Indices of two photographs, the smaller first."""
 
@@ -55,7 +59,9 @@ def candidate_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
     located = [k for k, p in enumerate(photographs) if p.position is not None]
     pairs: set[Pair] = set()
     if len(located) > NEIGHBOURS:
-        xy_m = _plane_m([photographs[k] for k in located])
+        # Metres per degree of the ellipsoid at the middle latitude are accurate enough for neighbours.
+        degrees = np.array([(p.position.longitude_deg, p.position.latitude_deg) for p in photographs if p.position])
+        xy_m = degrees * [111_320 * np.cos(np.radians(np.median(degrees[:, 1]))), 110_574]
         distances, nearest = map(np.asarray, KDTree(xy_m).query(xy_m, k=NEIGHBOURS + 1))
         # A field with fewer photographs than that has its next neighbours in another field, far away.
         limit = MAX_RELATIVE_DISTANCE * np.median(distances[:, NEIGHBOURS // 2])
@@ -75,14 +81,8 @@ def candidate_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
     return sorted(pairs)
 
 
-def _plane_m(photographs: Sequence[Photograph]) -> Float64[np.ndarray, "N 2"]:
-    """Project positions onto a plane, accurately enough for neighbours: metres per degree at the middle latitude."""
-    degrees = np.array([[p.position.longitude_deg, p.position.latitude_deg] for p in photographs if p.position])
-    return degrees * [111_320 * np.cos(np.radians(np.median(degrees[:, 1]))), 110_574]
-
-
 def _pair(i: int, j: int) -> Pair:
-    return (int(i), int(j)) if i < j else (int(j), int(i))
+    return (i, j) if i < j else (j, i)
 
 
 def preview_descriptors(descriptors: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Float[Tensor, "V K D"]:
@@ -136,6 +136,23 @@ def select_pairs(candidates: Sequence[Pair], previews: Float[Tensor, "V K D"], p
     return sorted(selected)
 
 
+def interruptible(job: Callable[[pycolmap.CancellationToken], Result]) -> Result:
+    """Run a long job of pycolmap in a thread and cancel it on Ctrl-C, which it would not notice itself."""
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(job, token)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=0.2)
+                except NotReady:
+                    if future.done():  # the job itself raised it
+                        raise
+        except BaseException:
+            token.cancel()
+            raise
+
+
 def match(
     database: Path, pairs: Sequence[tuple[str, str]], device: pycolmap.Device, progress: Progress
 ) -> tuple[int, int]:
@@ -152,20 +169,17 @@ def match(
     verification = pycolmap.TwoViewGeometryOptions()
     # A fixed seed, so that the same photographs give the same poses.
     verification.ransac.random_seed = 0
-
-    def match_listed(token: pycolmap.CancellationToken) -> None:
-        pycolmap.match_image_pairs(
-            database,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=device,
-            cancellation_token=token,
-        )
-
+    match_listed = partial(
+        pycolmap.match_image_pairs,
+        database,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=device,
+    )
     for start in range(0, len(todo), BATCH):
         batch = todo[start : start + BATCH]
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in batch), encoding="utf-8")
-        interruptible(match_listed)
+        interruptible(lambda token: match_listed(cancellation_token=token))
         progress(len(pairs) - len(todo) + start + len(batch), len(pairs))
     pairing.match_list_path.unlink(missing_ok=True)
     with pycolmap.Database.open(database) as db:
