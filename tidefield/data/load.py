@@ -15,7 +15,7 @@ from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
-from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
+from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.llff import read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
@@ -113,12 +113,23 @@ def load_scene(
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
     posed = _relative_to(posed, origin)
     pinholes = tuple(file.lens.pinhole().resized(file.width, file.height) for file in files)
-    cameras = _cameras(posed.T_world_camera, pinholes, _near_far(posed, pinholes))
+    near_far = posed.near_far
+    if near_far is None:
+        near_far = estimate_near_far(posed.T_world_camera, pinholes, posed.points)
+    cameras = Cameras(
+        T_world_camera=_float32(posed.T_world_camera),
+        focal_px=_float32([(lens.fx, lens.fy) for lens in pinholes]),
+        principal_px=_float32([(lens.cx, lens.cy) for lens in pinholes]),
+        size_px=torch.tensor([(lens.width, lens.height) for lens in pinholes]),
+        near_far=_float32(near_far),
+        gain=torch.ones(len(pinholes), 3),
+    )
     points = _sparse_points(posed, pinholes)
-
+    train, test = every_eighth(len(posed.names))
+    if posed.split is not None:
+        train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
     photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    train, test = _split(posed)
     gain = estimate_gains(photographs, cameras, points, train, read_exposures(posed.paths))
     return Scene(
         root=root,
@@ -149,7 +160,20 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
         raise SceneError(
             f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
         )
-    return _sorted(replace(posed, T_world_camera=proper_rotations(posed.T_world_camera, posed.names, root)))
+    T_world_camera = proper_rotations(posed.T_world_camera, posed.names, root)
+    order = sorted(range(len(posed.names)), key=lambda i: posed.names[i])
+    points = posed.points
+    if points is not None:
+        points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
+    return replace(
+        posed,
+        names=tuple(posed.names[i] for i in order),
+        paths=tuple(posed.paths[i] for i in order),
+        lenses=tuple(posed.lenses[i] for i in order),
+        T_world_camera=T_world_camera[order],
+        near_far=None if posed.near_far is None else posed.near_far[order],
+        points=points,
+    )
 
 
 def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
@@ -187,23 +211,6 @@ def _expected() -> str:
     )
 
 
-def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
-    """The same photographs in the order of their names."""
-    order = sorted(range(len(posed.names)), key=lambda i: posed.names[i])
-    points = posed.points
-    if points is not None:
-        points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
-    return replace(
-        posed,
-        names=tuple(posed.names[i] for i in order),
-        paths=tuple(posed.paths[i] for i in order),
-        lenses=tuple(posed.lenses[i] for i in order),
-        T_world_camera=posed.T_world_camera[order],
-        near_far=None if posed.near_far is None else posed.near_far[order],
-        points=points,
-    )
-
-
 def _photograph_file(path: Path, lens: Lens, width: int | None) -> PhotographFile:
     """Choose the size of a photograph; its file may differ in size from its lens, but not in aspect."""
     own, has_alpha = own_lens(path, lens)
@@ -216,39 +223,8 @@ def _relative_to(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> 
     """Subtract a new origin from all coordinates."""
     T_world_camera = posed.T_world_camera.copy()
     T_world_camera[:, :, 3] -= origin
-    points, cloud = posed.points, posed.cloud_world
-    return replace(
-        posed,
-        T_world_camera=T_world_camera,
-        points=points and replace(points, xyz_world=points.xyz_world - origin),
-        cloud_world=None if cloud is None else cloud - origin,
-    )
-
-
-def _near_far(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Float64[np.ndarray, "V 2"]:
-    """The layout's own ranges, or estimates from the best data available."""
-    if posed.near_far is not None:
-        return posed.near_far
-    if posed.points is not None:
-        return near_far_from_points(posed.T_world_camera, pinholes, posed.points)
-    if posed.cloud_world is not None:
-        return near_far_from_cloud(posed.T_world_camera, pinholes, posed.cloud_world)
-    return near_far_from_cameras(posed.T_world_camera)
-
-
-def _cameras(
-    T_world_camera: Float64[np.ndarray, "V 3 4"],
-    pinholes: tuple[Lens, ...],
-    near_far: Float64[np.ndarray, "V 2"],
-) -> Cameras:
-    return Cameras(
-        T_world_camera=_float32(T_world_camera),
-        focal_px=_float32([(lens.fx, lens.fy) for lens in pinholes]),
-        principal_px=_float32([(lens.cx, lens.cy) for lens in pinholes]),
-        size_px=torch.tensor([(lens.width, lens.height) for lens in pinholes]),
-        near_far=_float32(near_far),
-        gain=torch.ones(len(pinholes), 3),
-    )
+    points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
+    return replace(posed, T_world_camera=T_world_camera, points=points)
 
 
 def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> SparsePoints | None:
@@ -280,15 +256,6 @@ def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Spars
         camera_index=torch.from_numpy(points.photograph_index[good].astype(np.int64)),
         uv_px=_float32(uv_px[good]),
     )
-
-
-def _split(posed: PosedPhotographs) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The layout's own split, or else every eighth photograph is held out."""
-    if posed.split is None:
-        return every_eighth(len(posed.names))
-    train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
-    assert not set(train) & set(test), "readers return disjoint parts"
-    return train, test
 
 
 def _float32(values: np.ndarray | Sequence[tuple[float, float]]) -> Tensor:

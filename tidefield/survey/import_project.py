@@ -119,7 +119,7 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
     camera_of = {lens: number for number, lens in enumerate(dict.fromkeys(posed.lenses), start=1)}
     for lens, number in camera_of.items():
         model.add_camera_with_trivial_rig(_camera(lens, number))
-    points = posed.points or _unobserved(posed)
+    points = posed.points or Observations(np.zeros((0, 3)))
     rotation = posed.T_world_camera[:, :, :3].transpose(0, 2, 1)
     T_camera_world = np.concatenate([rotation, -rotation @ posed.T_world_camera[:, :, 3:]], axis=2)
     keypoint = np.zeros(len(points.uv_px), dtype=np.int64)
@@ -139,13 +139,6 @@ def _camera(lens: Lens, number: int) -> pycolmap.Camera:
     model = lens.colmap_model
     parameters = colmap_parameters(lens, model)
     return pycolmap.Camera(camera_id=number, model=model, width=lens.width, height=lens.height, params=parameters)
-
-
-def _unobserved(posed: PosedPhotographs) -> Observations:
-    """Wrap the point cloud, which may be missing, as points without observations."""
-    nothing = np.zeros(0, dtype=np.int64)
-    cloud = np.zeros((0, 3)) if posed.cloud_world is None else posed.cloud_world
-    return Observations(cloud, nothing, nothing, np.zeros((0, 2)), posed.cloud_rgb)
 
 
 def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: Int64[np.ndarray, " O"]) -> None:
