@@ -1,6 +1,7 @@
 """Read files of a scene safely: bounded in size, inside the scene's folder, and with checked JSON numbers.
 
-All readers open files with `opened`, take paths from files with `inside`, and numbers of JSON with `number`.
+All readers open files with `opened` and photographs with `open_picture`, take paths from files with `inside`, and
+numbers of JSON with `number`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
+
+from PIL import Image
 
 from tidefield.errors import SceneError, list_names
 
@@ -52,6 +55,24 @@ def parsing(path: Path, expected: str) -> Iterator[None]:
         raise SceneError(f"{path} cannot be read: {error.strerror}; make it a readable file") from error
     except (*_DAMAGE, struct.error) as error:
         raise SceneError(f"{path} is damaged ({error}): expected {expected}") from error
+
+
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image.Image]:
+    """Open a photograph without decoding it.
+
+    Raises:
+        SceneError: instead of Pillow's errors, also of those in the block.
+    """
+    try:
+        with Image.open(path) as picture:
+            yield picture
+    # Pillow raises SyntaxError for broken PNGs, and a plain Exception for decompression bombs.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise SceneError(
+            f"{path} cannot be read as a photograph ({error}): expected a complete JPEG or PNG; copy it again from the "
+            "camera, or remove it and use --allow-missing"
+        ) from error
 
 
 def inside(root: Path, name: str, named_by: Path) -> Path:
