@@ -17,7 +17,7 @@ from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
-from tidefield.geometry.cameras import Cameras, pixel_grid, project
+from tidefield.geometry.cameras import Cameras, pixel_grid
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def _crops(
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
     points = middle_world.repeat_interleave(neighbours.shape[1], 0)
-    uv = project(cameras, points[:, None])[0][:, 0]
+    uv = cameras.project(points[:, None])[0][:, 0]
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())

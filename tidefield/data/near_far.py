@@ -7,8 +7,8 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from tidefield.data.readers.posed import Observations
+from tidefield.geometry.cameras import intersect_axes
 from tidefield.geometry.lenses import Lens
-from tidefield.geometry.rays import intersect_axes
 
 # A camera's range is [0.5 x 1st, 1.4 x 99th percentile] of the depths of its sparse points. Over flat ground seen from
 # 60 m that leaves 30 m for trees whose tops were not matched, and 24 m for holes. In disparity, in which samples are

@@ -17,8 +17,7 @@ from torch.nn import functional as F
 
 from tidefield.data.depth_prior import unproject_to_surface
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import Cameras, pixel_grid
-from tidefield.geometry.rays import angle_between
+from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 
 FADE = 0.04
 """A view has the full weight when its rank exceeds that of the first view left out by this share of its own rank."""

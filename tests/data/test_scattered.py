@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
+from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.geometry.scattered import interpolate_on_pixels
 
 
 def around(width: int, height: int) -> np.ndarray:
