@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
 from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras, pixel_grid
@@ -111,15 +112,12 @@ def _seen_from_similar_direction(
 
     Only the candidates are tested: in a large scene they are few.
     """
-
-    def towards(position_world: Tensor, xyz: Tensor) -> Tensor:
-        return torch.nn.functional.normalize(xyz - position_world, dim=-1)
-
     observations = candidates[points.point_index].nonzero()[:, 0]
     which = points.point_index[observations].long()
     xyz = points.xyz_world[which]
-    theirs = towards(cameras.position_world[points.camera_index[observations]], xyz)
-    cosine = (towards(camera.position_world, xyz) * theirs).sum(-1)
+    ours = F.normalize(xyz - camera.position_world, dim=-1)
+    theirs = F.normalize(xyz - cameras.position_world[points.camera_index[observations]], dim=-1)
+    cosine = (ours * theirs).sum(-1)
     # A point without observations keeps the 1.
     best = torch.ones(len(candidates), device=cosine.device, dtype=cosine.dtype)
     best = best.scatter_reduce(0, which, cosine, "amax", include_self=False)
