@@ -65,17 +65,14 @@ def test_points_seen_only_from_behind_the_surface_are_left_out():
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_points_still_give_a_depth_everywhere(count: int):
+    """Without any, that of the plane at the harmonic mean of near and far."""
     own = wall.cameras(1)
     points = wall.points(own, count=400)
     visible = points.xyz_world[points.xyz_world[:, :2].abs().amax(1) < 1][:count]
     some = SparsePoints(visible, torch.zeros(count), torch.arange(count), torch.zeros(count).long(), visible[:, :2])
     middle = wall.DEPTH if count else 2 / (1 / 3.0 + 1 / 10.0)
-    torch.testing.assert_close(surface_depth(own, some, own), torch.full((36, 48), middle), rtol=1e-4, atol=0)
-
-
-def test_without_points_the_surface_is_the_plane_at_the_harmonic_mean_of_near_and_far():
-    own = wall.cameras(1)
-    torch.testing.assert_close(surface_depth(own, None, own), torch.full((36, 48), 2 / (1 / 3.0 + 1 / 10.0)))
+    for points in (some, None) if count == 0 else (some,):
+        torch.testing.assert_close(surface_depth(own, points, own), torch.full((36, 48), middle), rtol=1e-4, atol=0)
 
 
 def test_seen_count_is_how_many_frames_hold_the_surface_point():

@@ -19,7 +19,7 @@ from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.llff import read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
-from tidefield.data.readers.posed import PosedPhotographs, proper_rotations
+from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.errors import SceneError, list_names
@@ -109,39 +109,46 @@ def load_scene(
     if width is not None and width < _SMALLEST_WIDTH:
         raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
     posed = read_posed(root, allow_missing)
-    files = [_photograph_file(path, lens, width) for path, lens in zip(posed.paths, posed.lenses, strict=True)]
+    files = []
+    for path, lens in zip(posed.paths, posed.lenses, strict=True):
+        own, has_alpha = own_lens(path, lens)
+        new_width = min(width or own.width, own.width)
+        new_height = max(1, round(own.height * new_width / own.width))
+        files.append(PhotographFile(path, own, new_width, new_height, has_alpha))
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
-    posed = _relative_to(posed, origin)
+    T_world_camera = posed.T_world_camera.copy()
+    T_world_camera[:, :, 3] -= origin
+    points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
     pinholes = tuple(file.lens.pinhole().resized(file.width, file.height) for file in files)
     near_far = posed.near_far
     if near_far is None:
-        near_far = estimate_near_far(posed.T_world_camera, pinholes, posed.points)
+        near_far = estimate_near_far(T_world_camera, pinholes, points)
     cameras = Cameras(
-        T_world_camera=_float32(posed.T_world_camera),
+        T_world_camera=_float32(T_world_camera),
         focal_px=_float32([(lens.fx, lens.fy) for lens in pinholes]),
         principal_px=_float32([(lens.cx, lens.cy) for lens in pinholes]),
         size_px=torch.tensor([(lens.width, lens.height) for lens in pinholes]),
         near_far=_float32(near_far),
         gain=torch.ones(len(pinholes), 3),
     )
-    points = _sparse_points(posed, pinholes)
+    sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
     train, test = every_eighth(len(posed.names))
     if posed.split is not None:
         train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
     photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    gain = estimate_gains(photographs, cameras, points, train, read_exposures(posed.paths))
+    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))
     return Scene(
         root=root,
         names=posed.names,
         cameras=replace(cameras, gain=gain),
         photographs=photographs,
-        points=points,
+        points=sparse,
         train=train,
         test=test,
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
-        hull=visual_hull(cameras, photographs, train) if points is None and transparent else None,
+        hull=visual_hull(cameras, photographs, train) if sparse is None and transparent else None,
     )
 
 
@@ -211,31 +218,17 @@ def _expected() -> str:
     )
 
 
-def _photograph_file(path: Path, lens: Lens, width: int | None) -> PhotographFile:
-    """Choose the size of a photograph; its file may differ in size from its lens, but not in aspect."""
-    own, has_alpha = own_lens(path, lens)
-    new_width = min(width or own.width, own.width)
-    new_height = max(1, round(own.height * new_width / own.width))
-    return PhotographFile(path, own, new_width, new_height, has_alpha)
-
-
-def _relative_to(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedPhotographs:
-    """Subtract a new origin from all coordinates."""
-    T_world_camera = posed.T_world_camera.copy()
-    T_world_camera[:, :, 3] -= origin
-    points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
-    return replace(posed, T_world_camera=T_world_camera, points=points)
-
-
-def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> SparsePoints | None:
+def _sparse_points(
+    points: Observations,
+    T_world_camera: Float64[np.ndarray, "V 3 4"],
+    lenses: tuple[Lens, ...],
+    pinholes: tuple[Lens, ...],
+) -> SparsePoints | None:
     """Undistort the observations of sparse points; leave out those that then lie outside their photographs."""
-    points = posed.points
-    if points is None:
-        return None
     uv_px = np.full((len(points.uv_px), 2), np.nan)
     off_px = np.full(len(points.uv_px), np.nan)
     observations = points.by_photograph(len(pinholes))
-    for lens, pinhole, pose, mine in zip(posed.lenses, pinholes, posed.T_world_camera, observations, strict=True):
+    for lens, pinhole, pose, mine in zip(lenses, pinholes, T_world_camera, observations, strict=True):
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
         xy = lens.unproject(points.uv_px[mine])
         uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
