@@ -1,10 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import textured_wall as wall
 import torch
 
 from tidefield.data.scene import SparsePoints
 from tidefield.data.surface import doubly_seen, seen_count, surface_depth
-from tidefield.geometry.cameras import Cameras
 
 TILT = (0.2, -0.1)
 
@@ -56,7 +57,7 @@ def test_points_seen_only_from_behind_the_surface_are_left_out():
     pose = own.T_world_camera.clone()
     pose[1, :, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
     pose[1, :, 3] = torch.tensor([0.0, 0.0, 30.0])
-    own = Cameras(pose, own.focal_px, own.principal_px, own.size_px, own.near_far, own.gain)
+    own = replace(own, T_world_camera=pose)
     front = wall.points(own[0])
     behind = front.xyz_world + torch.tensor([0.01, 0.02, 3.0])
     depth = surface_depth(own[0], joined(front, behind, observer=1), own)
@@ -89,7 +90,7 @@ def test_a_point_behind_a_camera_is_not_seen_by_it():
     own = wall.cameras(2, step=0.0)
     pose = own.T_world_camera.clone()
     pose[1, 2, 3] = wall.DEPTH + 1
-    behind = Cameras(pose, own.focal_px, own.principal_px, own.size_px, own.near_far, own.gain)
+    behind = replace(own, T_world_camera=pose)
     count = seen_count(behind[0], torch.full((36, 48), wall.DEPTH), behind)
     assert torch.equal(count, torch.ones_like(count))
 

@@ -86,12 +86,8 @@ class PhotographFile:
     has_alpha: bool
 
     @property
-    def channels(self) -> int:
-        return 4 if self.has_alpha else 3
-
-    @property
     def bytes(self) -> int:
-        return self.width * self.height * self.channels
+        return self.width * self.height * (4 if self.has_alpha else 3)
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
