@@ -79,16 +79,6 @@ def test_the_interval_holds_the_surface_and_stays_within_the_cameras_range(count
         assert ((near >= true) & (true >= far)).all()
 
 
-def test_more_points_make_the_interval_narrower():
-    own = wall.cameras(3)
-    widths = []
-    for count in (20, 100, 1000):
-        _, near, far = surface_prior(own[1], wall.points(own, count, TILT), own)
-        widths.append(float((near - far).mean()))
-    assert widths[0] > widths[1] > widths[2]
-    assert widths[2] < 0.25 * (1 / 3 - 1 / 10)
-
-
 def test_without_points_the_interval_is_the_cameras_near_and_far():
     own = wall.cameras(2)
     own = replace(own, near_far=torch.tensor([[3.0, 10.0], [2.0, 8.0]]))

@@ -94,16 +94,6 @@ def test_a_view_that_misses_the_hull_keeps_its_near_and_far():
     assert (far == away.near_far[0, 1]).all()
 
 
-def test_alphas_of_held_out_photographs_do_not_change_the_hull():
-    cameras = around()
-    truth = pictures(cameras)
-    blank = replace(truth, alphas=(*truth.alphas[:20], *(torch.zeros(80, 80, dtype=torch.uint8) for _ in range(4))))
-    one, other = (visual_hull(cameras, photographs, range(20)) for photographs in (truth, blank))
-    assert one is not None
-    assert other is not None
-    assert torch.equal(one.filled, other.filled)
-
-
 def test_no_hull_without_silhouettes_or_if_they_contradict_each_other():
     cameras = around()
     truth = pictures(cameras)

@@ -125,23 +125,10 @@ def test_direction_strategy_ranks_by_angle_between_viewing_directions():
     assert select_best(rank, none_excluded(5), 5)[0][0].tolist() == [1, 4, 2, 0, 3]
 
 
-def test_direction_strategy_does_not_distinguish_nadir_photographs():
-    own = nadir_grid()
-    torch.testing.assert_close(rank_by_direction(own[:2], own), torch.ones(2, 25))
-
-
 def test_excluded_photographs_are_not_selected_even_if_all_others_have_rank_zero():
     rank = torch.tensor([[0.9, 0.0, 0.0, 0.8]])
     excluded = torch.tensor([[True, False, False, True]])
     assert set(select_best(rank, excluded, 3)[0][0].tolist()) == {1, 2}
-
-
-def test_neighbours_of_a_camera_in_a_row_are_the_adjacent_ones():
-    own = wall.cameras(7)
-    surface = own[3].position_world[:, None] + torch.tensor([[[0.0, 0.0, wall.DEPTH], [0.5, 0.3, wall.DEPTH]]])
-    chosen = select_best(rank_by_view(own[3], surface, own), torch.arange(7)[None] == 3, 4)[0][0].tolist()
-    assert set(chosen[:2]) == {2, 4}
-    assert set(chosen[2:]) == {1, 5}
 
 
 def test_blend_weight_falls_to_zero_before_a_view_is_replaced():

@@ -1,10 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import textured_wall as wall
 import torch
 
 from tidefield.data.scene import SparsePoints
 from tidefield.data.surface import doubly_seen, seen_count, surface_depth
-from tidefield.geometry.cameras import Cameras
 
 TILT = (0.2, -0.1)
 
@@ -56,7 +57,7 @@ def test_points_seen_only_from_behind_the_surface_are_left_out():
     pose = own.T_world_camera.clone()
     pose[1, :, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
     pose[1, :, 3] = torch.tensor([0.0, 0.0, 30.0])
-    own = Cameras(pose, own.focal_px, own.principal_px, own.size_px, own.near_far, own.gain)
+    own = replace(own, T_world_camera=pose)
     front = wall.points(own[0])
     behind = front.xyz_world + torch.tensor([0.01, 0.02, 3.0])
     depth = surface_depth(own[0], joined(front, behind, observer=1), own)
@@ -65,17 +66,14 @@ def test_points_seen_only_from_behind_the_surface_are_left_out():
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_points_still_give_a_depth_everywhere(count: int):
+    """Without any, that of the plane at the harmonic mean of near and far."""
     own = wall.cameras(1)
     points = wall.points(own, count=400)
     visible = points.xyz_world[points.xyz_world[:, :2].abs().amax(1) < 1][:count]
     some = SparsePoints(visible, torch.zeros(count), torch.arange(count), torch.zeros(count).long(), visible[:, :2])
     middle = wall.DEPTH if count else 2 / (1 / 3.0 + 1 / 10.0)
-    torch.testing.assert_close(surface_depth(own, some, own), torch.full((36, 48), middle), rtol=1e-4, atol=0)
-
-
-def test_without_points_the_surface_is_the_plane_at_the_harmonic_mean_of_near_and_far():
-    own = wall.cameras(1)
-    torch.testing.assert_close(surface_depth(own, None, own), torch.full((36, 48), 2 / (1 / 3.0 + 1 / 10.0)))
+    for points in (some, None) if count == 0 else (some,):
+        torch.testing.assert_close(surface_depth(own, points, own), torch.full((36, 48), middle), rtol=1e-4, atol=0)
 
 
 def test_seen_count_is_how_many_frames_hold_the_surface_point():
@@ -92,7 +90,7 @@ def test_a_point_behind_a_camera_is_not_seen_by_it():
     own = wall.cameras(2, step=0.0)
     pose = own.T_world_camera.clone()
     pose[1, 2, 3] = wall.DEPTH + 1
-    behind = Cameras(pose, own.focal_px, own.principal_px, own.size_px, own.near_far, own.gain)
+    behind = replace(own, T_world_camera=pose)
     count = seen_count(behind[0], torch.full((36, 48), wall.DEPTH), behind)
     assert torch.equal(count, torch.ones_like(count))
 

@@ -1,11 +1,12 @@
 import math
 from dataclasses import fields
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tidefield.geometry.cameras import Cameras, pixel_grid, project
+from tidefield.geometry.cameras import Cameras, angle_between, intersect_axes, pixel_grid
 
 
 def turned(angles: tuple[float, float, float]) -> Tensor:
@@ -62,7 +63,7 @@ def test_unprojecting_to_a_depth_and_projecting_is_the_identity():
     uv = 40 * torch.rand(3, 8, 2, generator=generator, dtype=torch.float64)
     depth = 1 + 5 * torch.rand(3, 8, generator=generator, dtype=torch.float64)
     points = own.position_world[:, None] + own.directions_world(uv) * depth[..., None]
-    pixels, z = project(own, points)
+    pixels, z = own.project(points)
     torch.testing.assert_close(pixels, uv)
     torch.testing.assert_close(z, depth)
 
@@ -123,3 +124,35 @@ def test_indexing_keeps_the_order_of_the_indices():
 def test_the_pixel_grid_goes_row_by_row_through_pixel_centres():
     expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
     assert pixel_grid(3, 2).tolist() == expected
+
+
+@pytest.mark.parametrize("angle", [1e-6, 1e-3, 1.0, math.pi / 2, 3.0, math.pi])
+def test_angles_keep_their_relative_precision(angle: float):
+    first = torch.tensor([1.0, 0.0, 0.0])
+    second = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    assert angle_between(first, second).item() == pytest.approx(angle, rel=1e-3 if angle > 3 else 1e-6)
+
+
+def test_angles_broadcast_and_are_zero_to_oneself():
+    axes = torch.eye(3)
+    expected = (1 - torch.eye(3)) * math.pi / 2
+    torch.testing.assert_close(angle_between(axes[:, None], axes[None]), expected)
+
+
+def test_axes_through_one_point_intersect_there():
+    random = np.random.default_rng(0)
+    target, position = np.array([3.0, -2.0, 5.0]), random.normal(0, 4, (12, 3))
+    forward = (target - position) / np.linalg.norm(target - position, axis=1, keepdims=True)
+    np.testing.assert_allclose(intersect_axes(position, forward), target, atol=1e-9)
+
+
+def test_two_skew_axes_give_the_middle_of_their_common_perpendicular():
+    point = intersect_axes(np.array([[-5.0, 0, 0], [0.0, 4, 2]]), np.array([[1.0, 0, 0], [0.0, 1, 0]]))
+    np.testing.assert_allclose(point, [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 5.0])
+def test_nearly_parallel_axes_have_no_intersection(degrees: float):
+    turn = np.deg2rad(degrees) * np.array([-1.0, 0, 1])
+    forward = np.stack([np.sin(turn), np.zeros(3), np.cos(turn)], axis=1)
+    assert intersect_axes(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), forward) is None

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -58,14 +57,6 @@ def test_pixels_come_back_from_their_rays_and_agree_with_colmap(model: str) -> N
     xy = lens(model).unproject(uv)
     np.testing.assert_allclose(lens(model).project(np.c_[xy, np.ones(500)]), uv, atol=1e-7)
     np.testing.assert_allclose(xy, colmap(model).cam_from_img(uv), atol=1e-7)
-
-
-def test_the_sixth_order_term_is_that_of_opencv() -> None:
-    own = Lens(320, 240, 200.0, 200.0, 160.0, 120.0, k1=0.1, k2=-0.05, p1=0.002, p2=0.001, k3=0.03)
-    xyz = np.random.default_rng(2).uniform((-0.7, -0.7, 1), (0.7, 0.7, 1), (50, 3))
-    matrix = np.array([[200.0, 0, 160], [0, 200, 120], [0, 0, 1]])
-    theirs, _ = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix, np.array(own.distortion))
-    np.testing.assert_allclose(own.project(xyz), theirs[:, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"])

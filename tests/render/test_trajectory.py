@@ -211,7 +211,7 @@ def test_a_malformed_path_is_one_clear_error(tmp_path: Path, poses: np.ndarray, 
 
 
 def test_invalid_json_and_missing_files_are_one_clear_error(tmp_path: Path):
-    with pytest.raises(TidefieldError, match="not whole JSON"):
+    with pytest.raises(TidefieldError, match="whole JSON"):
         load(tmp_path, '{"camera_path": [')
     with pytest.raises(TidefieldError, match=r"absent\.json"):
         make_trajectory(str(tmp_path / "absent.json"), survey(), frames=1, width=1, height=1)

@@ -47,7 +47,8 @@ def test_transforms_round_trip(tmp_path: Path, truth: Truth) -> None:
     assert posed.names == tuple(truth.names[i] for i in order)
     np.testing.assert_allclose(posed.T_world_camera, truth.T_world_camera[order], atol=1e-9)
     assert posed.lenses == tuple(truth.lenses[i] for i in order)
-    np.testing.assert_allclose(posed.cloud_world, points_of(tmp_path), rtol=1e-6)
+    assert posed.points is not None
+    np.testing.assert_allclose(posed.points.xyz_world, points_of(tmp_path), rtol=1e-6)
 
 
 def test_transforms_hold_out_the_same_photographs_as_the_model(tmp_path: Path) -> None:
@@ -102,7 +103,8 @@ def test_large_coordinates_are_reduced(tmp_path: Path) -> None:
     assert np.abs(posed.T_world_camera[:, :, 3]).max() < 20
     expected = truth.T_world_camera[np.argsort(truth.names)][:, :, 3] + applied[:, 3]
     np.testing.assert_allclose(posed.T_world_camera[:, :, 3], expected, atol=1e-8)
-    np.testing.assert_allclose(posed.cloud_world, points_of(tmp_path) + applied[:, 3], atol=1e-6)
+    assert posed.points is not None
+    np.testing.assert_allclose(posed.points.xyz_world, points_of(tmp_path) + applied[:, 3], atol=1e-6)
 
 
 def test_small_coordinates_stay_unchanged_and_orientation_is_fixed_on_request(tmp_path: Path) -> None:

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
-from tidefield.geometry.cameras import Cameras
-from tidefield.geometry.rays import angle_between
+from tidefield.geometry.cameras import Cameras, angle_between
 from tidefield.model.rendering import Render, Rendering, fill_unseen
 
 VIEWS = 4

@@ -17,7 +17,7 @@ from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
-from tidefield.geometry.cameras import Cameras, pixel_grid, project
+from tidefield.geometry.cameras import Cameras, pixel_grid
 
 
 @dataclass(frozen=True)
@@ -113,38 +113,35 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
     targets = train[picks].repeat_interleave(per_photograph)
     free = (scene.cameras.size_px[targets] - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * free).floor()
-    middles_world, neighbours, blend_weights, weights, depths = [], [], [], [], []
+    tiles = []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], priors[target]
-        middles_world.append(unproject_to_surface(camera, prior, at[None] + side / 2)[0])
+        middle_world = unproject_to_surface(camera, prior, at[None] + side / 2)[0]
         found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours, target)
-        neighbours.append(found.index[0])
-        blend_weights.append(found.blend_weight[0])
+        colours, inside = _tile(scene, target, at.long(), side)
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
             others = scene.cameras[train[train != target]]
             weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
-        weights.append(weight)
-        depths.append(_sparse_depth(priors.observed(target), at, side))
-    chosen = torch.stack(neighbours)
-    tiles = [_tile(scene, t, c, side) for t, c in zip(targets.tolist(), corner.long(), strict=True)]
-    colours, inside = (torch.stack(parts) for parts in zip(*tiles, strict=True))
-    inverse_depth, depth_weight = (torch.stack(parts) for parts in zip(*depths, strict=True))
+        depth = _sparse_depth(priors.observed(target), at, side)
+        tiles.append((colours, weight * inside, *depth, found.index[0], found.blend_weight[0], middle_world))
+    columns = (torch.stack(column) for column in zip(*tiles, strict=True))
+    colours, weight, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
     if not views:
-        which, images, corners = chosen, (), ()
+        which, images, corners = neighbours, (), ()
     elif config.crop_px is None:
-        which, images, corners = _whole(scene, chosen)
+        which, images, corners = _whole(scene, neighbours)
     else:
-        which, images, corners = _crops(scene, chosen, torch.stack(middles_world), config.crop_px)
+        which, images, corners = _crops(scene, neighbours, middles_world, config.crop_px)
     return Batch(
         targets=targets,
         corner_px=corner,
         colours=colours,
-        weight=torch.stack(weights) * inside,
+        weight=weight,
         inverse_depth=inverse_depth,
         depth_weight=depth_weight,
-        neighbours=chosen,
-        blend_weight=torch.stack(blend_weights),
+        neighbours=neighbours,
+        blend_weight=blend_weight,
         which=which,
         images=images,
         image_corner_px=corners,
@@ -182,7 +179,7 @@ def _crops(
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
     points = middle_world.repeat_interleave(neighbours.shape[1], 0)
-    uv = project(cameras, points[:, None])[0][:, 0]
+    uv = cameras.project(points[:, None])[0][:, 0]
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())

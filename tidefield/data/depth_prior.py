@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.hull import Hull, hull_range
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import depth_through, trusted_points
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
 
 STRIDE = 4
 """Pixels between the cells of a prior."""
@@ -44,20 +44,6 @@ class Observed:
     weight: Float[Tensor, " K"]
 
 
-def observed_depths(camera: Cameras, points: SparsePoints | None, index: int) -> Observed:
-    """Select the sparse points in front of a camera that its photograph, `index`, observed."""
-    if points is None:
-        return Observed(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0))
-    mine = points.camera_index == index
-    which = points.point_index[mine].long()
-    z = camera.project(points.xyz_world[which])[1][0]
-    # Cauchy's weight: a point of three times the median error counts a fifth of one of the median error.
-    median = points.error_px.median().clamp(min=1e-6)
-    weight = 1 / (1 + (points.error_px[which] / median) ** 2)
-    front = z > 0
-    return Observed(points.uv_px[mine][front], 1 / z[front], weight[front])
-
-
 def surface_prior(
     camera: Cameras, points: SparsePoints | None, cameras: Cameras, hull: Hull | None = None
 ) -> Float[Tensor, "3 h w"]:
@@ -83,11 +69,17 @@ def surface_prior(
     if len(uv) < INTERVAL_POINTS:
         lowest, highest = far.expand_as(expected), near.expand_as(expected)
     else:
-        lowest, highest, distance = _span(uv, inverse, width, height)
+        from scipy.spatial import KDTree
+
+        distance, index = KDTree(uv).query(pixel_grid(width, height).double().numpy(), k=INTERVAL_POINTS)
+        around = inverse[index]
         spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
-        sparse = np.minimum(distance / (SPARSE_DISTANCE * width), 1.0)
+        sparse = np.minimum(distance[:, 0] / (SPARSE_DISTANCE * width), 1.0)
         margin = spread * (MARGIN + (SPARSE_MARGIN - MARGIN) * sparse)
-        lowest, highest = (torch.from_numpy(x).to(expected) for x in (lowest - margin, highest + margin))
+        lowest, highest = (
+            torch.from_numpy(x.reshape(height, width)).to(expected)
+            for x in (around.min(1) - margin, around.max(1) + margin)
+        )
     # Within the camera's range and never empty: a camera's range may be narrower than that of its points.
     expected = expected.clamp(far * (1 + LEAST_MARGIN), near / (1 + LEAST_MARGIN))
     highest = torch.maximum(highest, expected * (1 + LEAST_MARGIN)).clamp(max=near)
@@ -104,19 +96,6 @@ def read_prior(
     values = F.grid_sample(priors, grid[:, :, None], padding_mode="border", align_corners=False)[..., 0]
     expected, near, far = values.unbind(1)
     return expected, near, far
-
-
-def _span(
-    uv: Float64[np.ndarray, "P 2"], inverse: Float64[np.ndarray, " P"], width: int, height: int
-) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """Least and greatest inverse depth of each cell's nearest points, and the distance to the nearest one, in cells."""
-    from scipy.spatial import KDTree
-
-    v, u = np.mgrid[:height, :width] + 0.5
-    distance, index = KDTree(uv).query(np.stack([u, v], -1).reshape(-1, 2), k=INTERVAL_POINTS)
-    around = inverse[index]
-    shape = (height, width)
-    return around.min(1).reshape(shape), around.max(1).reshape(shape), distance[:, 0].reshape(shape)
 
 
 def unproject_to_surface(
@@ -149,7 +128,20 @@ class DepthPriors:
         return self._priors[index]
 
     def observed(self, index: int) -> Observed:
-        """Return the sparse points that one photograph observed."""
+        """Return the sparse points in front of a camera that its photograph observed."""
         if index not in self._observed:
-            self._observed[index] = observed_depths(self.scene.cameras[index], self.points, index)
+            self._observed[index] = self._observe(index)
         return self._observed[index]
+
+    def _observe(self, index: int) -> Observed:
+        points = self.points
+        if points is None:
+            return Observed(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0))
+        mine = points.camera_index == index
+        which = points.point_index[mine].long()
+        z = self.scene.cameras[index].project(points.xyz_world[which])[1][0]
+        # Cauchy's weight: a point of three times the median error counts a fifth of one of the median error.
+        median = points.error_px.median().clamp(min=1e-6)
+        weight = 1 / (1 + (points.error_px[which] / median) ** 2)
+        front = z > 0
+        return Observed(points.uv_px[mine][front], 1 / z[front], weight[front])

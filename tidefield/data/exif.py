@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image, PngImagePlugin
 
+from tidefield.data.readers.files import open_picture
+
 EXPOSURE_POWERS = {
     ExifTags.Base.ExposureTime: 1,
     ExifTags.Base.ISOSpeedRatings: 1,
@@ -116,11 +118,11 @@ def read_exposures(paths: Sequence[Path]) -> Exposures:
     Damaged EXIF counts as absent.
 
     Raises:
-        OSError: a file does not exist or is not an image.
+        SceneError: a file does not exist or is not an image.
     """
     found = []
     for path in paths:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             found.append(read_exif(image))
     terms = np.array([exif.log_exposure_terms for exif in found], dtype=np.float64).reshape(-1, len(EXPOSURE_POWERS))
     known = np.isfinite(terms).all(axis=0)

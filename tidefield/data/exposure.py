@@ -182,8 +182,12 @@ def _solve(
     first, noise = robust_gains(seen, np.zeros(count))
     supported = train[np.bincount(seen.photograph, minlength=count)[train] >= SUPPORT]
     sequence = _in_sequence(clock, supported)
-    slope = _exposure_slope(sequence.difference(first), sequence.difference(exposure), sequence.distance)
-    prior = slope * exposure
+    # Log gain per log exposure, from consecutive photographs: over a longer time automatic exposure follows the
+    # daylight, and both cancel.
+    change = sequence.difference(exposure)
+    total = (change**2 / sequence.distance).sum() + SLOPE_WEIGHT
+    follows = (sequence.difference(first).mean(1) * change / sequence.distance).sum() + SLOPE_WEIGHT * DISPLAY_SLOPE
+    prior = float(np.clip(follows / total, 0.0, 1.0)) * exposure
     pairs, weights = [], []
     for supporting, everyone in (
         (sequence, _in_sequence(clock, np.arange(count))),
@@ -247,20 +251,6 @@ def huber_weights(residual: Float64[np.ndarray, "O 3"]) -> tuple[Float64[np.ndar
     size = np.sqrt((residual**2).mean(1))
     noise = max(float(1.4826 * np.median(size)), LEAST_NOISE)
     return np.minimum(1.0, HUBER * noise / np.maximum(size, 1e-12)), noise
-
-
-def _exposure_slope(
-    gain_change: Float64[np.ndarray, "N 3"],
-    exposure_change: Float64[np.ndarray, " N"],
-    distance: Float64[np.ndarray, " N"],
-) -> float:
-    """Log gain per log exposure, from consecutive photographs.
-
-    Over a longer time automatic exposure follows the daylight, and both cancel.
-    """
-    total = (exposure_change**2 / distance).sum() + SLOPE_WEIGHT
-    slope = ((gain_change.mean(1) * exposure_change / distance).sum() + SLOPE_WEIGHT * DISPLAY_SLOPE) / total
-    return float(np.clip(slope, 0.0, 1.0))
 
 
 def _exposure_and_clock(

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from tidefield.errors import SceneError
+from tidefield.data.readers.files import opened
 from tidefield.files import completed_file
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
 
 FILE_NAME = "georeference.json"
-_VERSION = 1
+_VERSION, _MEGABYTES = 1, 256
 
 Source = Literal["ground control", "GPS", "project", "none"]
 
@@ -59,6 +59,24 @@ class Residuals:
         """The common part, such as a shift between datums; NaN if there are none."""
         known = self.error_m[self.known]
         return np.median(known, axis=0) if len(known) else np.full(3, math.nan)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the values that `from_json` reads, and statistics."""
+        return {
+            "horizontal_rms_m": _number(self.horizontal_rms_m),
+            "vertical_rms_m": _number(self.vertical_rms_m),
+            "median_east_north_up_m": [_number(value) for value in self.median_m],
+            "each": [
+                {"name": name, "east_north_up_m": [_number(value) for value in error]}
+                for name, error in zip(self.names, self.error_m, strict=True)
+            ],
+        }
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Residuals:
+        rows = [[math.nan if v is None else float(v) for v in each["east_north_up_m"]] for each in values["each"]]
+        names = tuple(str(each["name"]) for each in values["each"])
+        return cls(names, np.array(rows, dtype=np.float64).reshape(-1, 3))
 
 
 @dataclass(frozen=True)
@@ -115,14 +133,10 @@ class Georeference:
         Raises:
             RunError: the folder cannot be written to.
         """
-        with completed_file(folder / FILE_NAME, overwrite=True) as partial:
-            partial.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to what `read_georeference` reads, with statistics for readers who have only the file."""
+        # With statistics for readers who have only the file.
         kinds = {"gps": self.gps, "gps_used": self.gps_used, "control": self.control, "check": self.check}
         similarity = self.world_from_model
-        return {
+        values = {
             "version": _VERSION,
             "source": self.source,
             "frame": None if self.frame is None else self.frame.to_json(),
@@ -131,10 +145,12 @@ class Georeference:
                 "rotation": similarity.rotation.tolist(),
                 "translation": similarity.translation.tolist(),
             },
-            "residuals": {kind: _residuals_to_json(residuals) for kind, residuals in kinds.items()},
-            "left_out": [{"kind": item.kind, "name": item.name, "reason": item.reason} for item in self.left_out],
+            "residuals": {kind: residuals.to_json() for kind, residuals in kinds.items()},
+            "left_out": [asdict(item) for item in self.left_out],
             "notes": list(self.notes),
         }
+        with completed_file(folder / FILE_NAME, overwrite=True) as partial:
+            partial.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_georeference(folder: Path) -> Georeference | None:
@@ -144,25 +160,24 @@ def read_georeference(folder: Path) -> Georeference | None:
         SceneError: the file is damaged, or of a later version.
     """
     path = folder / FILE_NAME
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+    if not path.exists():
+        return None
+    expected = (
+        "a file of `tidefield prepare`; prepare the scene again, or remove the file to use the scene without a "
+        "georeference"
+    )
+    with opened(path, expected, _MEGABYTES) as file:
+        values = json.load(file)
         if values["version"] != _VERSION:
             raise ValueError(f"it is of version {values['version']}, expected {_VERSION}")
         return _from_json(values)
-    except FileNotFoundError:
-        return None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SceneError(
-            f"{path} is damaged ({error}): expected a file of `tidefield prepare`; prepare the scene again, or "
-            "remove the file to use the scene without a georeference"
-        ) from error
 
 
 def _from_json(values: dict[str, Any]) -> Georeference:
     if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
     similarity = values["world_from_model"]
-    residuals = {kind: _residuals_from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}
+    residuals = {kind: Residuals.from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}
     return Georeference(
         frame=None if values["frame"] is None else LocalFrame.from_json(values["frame"]),
         source=values["source"],
@@ -174,25 +189,6 @@ def _from_json(values: dict[str, Any]) -> Georeference:
         left_out=tuple(LeftOut(item["kind"], item["name"], item["reason"]) for item in values["left_out"]),
         notes=tuple(str(note) for note in values["notes"]),
         **residuals,
-    )
-
-
-def _residuals_to_json(residuals: Residuals) -> dict[str, Any]:
-    return {
-        "horizontal_rms_m": _number(residuals.horizontal_rms_m),
-        "vertical_rms_m": _number(residuals.vertical_rms_m),
-        "median_east_north_up_m": [_number(value) for value in residuals.median_m],
-        "each": [
-            {"name": name, "east_north_up_m": [_number(value) for value in error]}
-            for name, error in zip(residuals.names, residuals.error_m, strict=True)
-        ],
-    }
-
-
-def _residuals_from_json(values: dict[str, Any]) -> Residuals:
-    rows = [[math.nan if v is None else float(v) for v in each["east_north_up_m"]] for each in values["each"]]
-    return Residuals(
-        tuple(str(each["name"]) for each in values["each"]), np.array(rows, dtype=np.float64).reshape(-1, 3)
     )
 
 

@@ -11,23 +11,23 @@ import hashlib
 import json
 import logging
 import os
-import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from tidefield.errors import SceneError
+from tidefield.data.readers.files import open_picture
+from tidefield.errors import RunError, SceneError
+from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens, rectify
 from tidefield.machine import cores
 
@@ -86,12 +86,8 @@ class PhotographFile:
     has_alpha: bool
 
     @property
-    def channels(self) -> int:
-        return 4 if self.has_alpha else 3
-
-    @property
     def bytes(self) -> int:
-        return self.width * self.height * self.channels
+        return self.width * self.height * (4 if self.has_alpha else 3)
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
@@ -100,7 +96,7 @@ def read_header(path: Path) -> tuple[int, int, bool]:
     Raises:
         SceneError: the file is not a supported picture.
     """
-    with _naming(path), Image.open(path) as picture:
+    with open_picture(path) as picture:
         if picture.mode not in _MODES:
             raise SceneError(f"{path} has pixels of the mode {picture.mode}: expected 8 bits per colour; convert it")
         return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
@@ -130,17 +126,26 @@ def open_photographs(
             os.utime(store)
         else:
             _delete_unused(store.parent)
-            _write(store, _decoded(files, background_rgb, progress), expected)
+            with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
+                for picture in _decoded(files, background_rgb, progress):
+                    file.write(picture.data)
         # Copy-on-write: changes to a view do not reach the file.
         return _views(np.memmap(store, dtype=np.uint8, mode="c"), files)
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
+    except (OSError, RunError) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        assert isinstance(cause, OSError), "completed_file tells what failed"
+        if cause.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise SceneError(
+                f"the disk of {store.parent} is full: {expected / 1e6:.0f} MB are needed there for the photographs; "
+                "free some space, choose a smaller --width, or set XDG_CACHE_HOME to a folder on another disk"
+            ) from error
+        if cause.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
             raise
         _log.warning(
             "the cache folder %s cannot be written (%s): photographs are held in memory and decoded again next time; "
             "set XDG_CACHE_HOME to a writable folder",
             store.parent,
-            error.strerror,
+            cause.strerror,
         )
     return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
 
@@ -169,29 +174,6 @@ def _delete_unused(folder: Path) -> None:
         with suppress(FileNotFoundError, PermissionError):
             if store.stat().st_mtime < limit:
                 store.unlink()
-
-
-def _write(store: Path, pictures: Iterator[np.ndarray], expected: int) -> None:
-    """Write a partial file and rename it to the store when it is complete."""
-    partial = store.with_name(f"{store.stem}-{secrets.token_hex(4)}.partial")
-    try:
-        store.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            for picture in pictures:
-                file.write(picture.data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, store)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise SceneError(
-            f"the disk of {store.parent} is full: {expected / 1e6:.0f} MB are needed there for the photographs; free "
-            "some space, choose a smaller --width, or set XDG_CACHE_HOME to a folder on another disk"
-        ) from error
-    finally:
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has been renamed
-            partial.unlink()
 
 
 def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
@@ -229,7 +211,7 @@ def _decoded(
 
 
 def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
-    with _naming(file.path), Image.open(file.path) as picture:
+    with open_picture(file.path) as picture:
         pixels = np.asarray(picture.convert("RGBA" if file.has_alpha else "RGB"))
     if not file.has_alpha:
         return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
@@ -239,16 +221,3 @@ def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) ->
     pixels = np.concatenate([np.round(flat).astype(np.uint8), pixels[..., 3:]], axis=-1)
     pixels = rectify(pixels, file.lens, file.width, file.height)
     return np.concatenate([pixels[..., :3].reshape(-1), pixels[..., 3].reshape(-1)])
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Turn errors of reading a photograph into one SceneError that names the file."""
-    try:
-        yield
-    # Pillow raises SyntaxError for broken PNGs, and a plain Exception for decompression bombs.
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise SceneError(
-            f"{path} cannot be read as a photograph ({error}): expected a complete JPEG or PNG; copy it again from the "
-            "camera, or remove it and use --allow-missing"
-        ) from error

@@ -15,11 +15,11 @@ from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
-from tidefield.data.near_far import near_far_from_cameras, near_far_from_cloud, near_far_from_points
+from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.llff import read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
-from tidefield.data.readers.posed import PosedPhotographs, proper_rotations
+from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.errors import SceneError, list_names
@@ -109,28 +109,46 @@ def load_scene(
     if width is not None and width < _SMALLEST_WIDTH:
         raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
     posed = read_posed(root, allow_missing)
-    files = [_photograph_file(path, lens, width) for path, lens in zip(posed.paths, posed.lenses, strict=True)]
+    files = []
+    for path, lens in zip(posed.paths, posed.lenses, strict=True):
+        own, has_alpha = own_lens(path, lens)
+        new_width = min(width or own.width, own.width)
+        new_height = max(1, round(own.height * new_width / own.width))
+        files.append(PhotographFile(path, own, new_width, new_height, has_alpha))
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
-    posed = _relative_to(posed, origin)
+    T_world_camera = posed.T_world_camera.copy()
+    T_world_camera[:, :, 3] -= origin
+    points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
     pinholes = tuple(file.lens.pinhole().resized(file.width, file.height) for file in files)
-    cameras = _cameras(posed.T_world_camera, pinholes, _near_far(posed, pinholes))
-    points = _sparse_points(posed, pinholes)
-
+    near_far = posed.near_far
+    if near_far is None:
+        near_far = estimate_near_far(T_world_camera, pinholes, points)
+    cameras = Cameras(
+        T_world_camera=_float32(T_world_camera),
+        focal_px=_float32([(lens.fx, lens.fy) for lens in pinholes]),
+        principal_px=_float32([(lens.cx, lens.cy) for lens in pinholes]),
+        size_px=torch.tensor([(lens.width, lens.height) for lens in pinholes]),
+        near_far=_float32(near_far),
+        gain=torch.ones(len(pinholes), 3),
+    )
+    sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
+    train, test = every_eighth(len(posed.names))
+    if posed.split is not None:
+        train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
     photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    train, test = _split(posed)
-    gain = estimate_gains(photographs, cameras, points, train, read_exposures(posed.paths))
+    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))
     return Scene(
         root=root,
         names=posed.names,
         cameras=replace(cameras, gain=gain),
         photographs=photographs,
-        points=points,
+        points=sparse,
         train=train,
         test=test,
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
-        hull=visual_hull(cameras, photographs, train) if points is None and transparent else None,
+        hull=visual_hull(cameras, photographs, train) if sparse is None and transparent else None,
     )
 
 
@@ -149,7 +167,20 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
         raise SceneError(
             f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
         )
-    return _sorted(replace(posed, T_world_camera=proper_rotations(posed.T_world_camera, posed.names, root)))
+    T_world_camera = proper_rotations(posed.T_world_camera, posed.names, root)
+    order = sorted(range(len(posed.names)), key=lambda i: posed.names[i])
+    points = posed.points
+    if points is not None:
+        points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
+    return replace(
+        posed,
+        names=tuple(posed.names[i] for i in order),
+        paths=tuple(posed.paths[i] for i in order),
+        lenses=tuple(posed.lenses[i] for i in order),
+        T_world_camera=T_world_camera[order],
+        near_far=None if posed.near_far is None else posed.near_far[order],
+        points=points,
+    )
 
 
 def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
@@ -187,79 +218,17 @@ def _expected() -> str:
     )
 
 
-def _sorted(posed: PosedPhotographs) -> PosedPhotographs:
-    """The same photographs in the order of their names."""
-    order = sorted(range(len(posed.names)), key=lambda i: posed.names[i])
-    points = posed.points
-    if points is not None:
-        points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
-    return replace(
-        posed,
-        names=tuple(posed.names[i] for i in order),
-        paths=tuple(posed.paths[i] for i in order),
-        lenses=tuple(posed.lenses[i] for i in order),
-        T_world_camera=posed.T_world_camera[order],
-        near_far=None if posed.near_far is None else posed.near_far[order],
-        points=points,
-    )
-
-
-def _photograph_file(path: Path, lens: Lens, width: int | None) -> PhotographFile:
-    """Choose the size of a photograph; its file may differ in size from its lens, but not in aspect."""
-    own, has_alpha = own_lens(path, lens)
-    new_width = min(width or own.width, own.width)
-    new_height = max(1, round(own.height * new_width / own.width))
-    return PhotographFile(path, own, new_width, new_height, has_alpha)
-
-
-def _relative_to(posed: PosedPhotographs, origin: Float64[np.ndarray, " 3"]) -> PosedPhotographs:
-    """Subtract a new origin from all coordinates."""
-    T_world_camera = posed.T_world_camera.copy()
-    T_world_camera[:, :, 3] -= origin
-    points, cloud = posed.points, posed.cloud_world
-    return replace(
-        posed,
-        T_world_camera=T_world_camera,
-        points=points and replace(points, xyz_world=points.xyz_world - origin),
-        cloud_world=None if cloud is None else cloud - origin,
-    )
-
-
-def _near_far(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Float64[np.ndarray, "V 2"]:
-    """The layout's own ranges, or estimates from the best data available."""
-    if posed.near_far is not None:
-        return posed.near_far
-    if posed.points is not None:
-        return near_far_from_points(posed.T_world_camera, pinholes, posed.points)
-    if posed.cloud_world is not None:
-        return near_far_from_cloud(posed.T_world_camera, pinholes, posed.cloud_world)
-    return near_far_from_cameras(posed.T_world_camera)
-
-
-def _cameras(
+def _sparse_points(
+    points: Observations,
     T_world_camera: Float64[np.ndarray, "V 3 4"],
+    lenses: tuple[Lens, ...],
     pinholes: tuple[Lens, ...],
-    near_far: Float64[np.ndarray, "V 2"],
-) -> Cameras:
-    return Cameras(
-        T_world_camera=_float32(T_world_camera),
-        focal_px=_float32([(lens.fx, lens.fy) for lens in pinholes]),
-        principal_px=_float32([(lens.cx, lens.cy) for lens in pinholes]),
-        size_px=torch.tensor([(lens.width, lens.height) for lens in pinholes]),
-        near_far=_float32(near_far),
-        gain=torch.ones(len(pinholes), 3),
-    )
-
-
-def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> SparsePoints | None:
+) -> SparsePoints | None:
     """Undistort the observations of sparse points; leave out those that then lie outside their photographs."""
-    points = posed.points
-    if points is None:
-        return None
     uv_px = np.full((len(points.uv_px), 2), np.nan)
     off_px = np.full(len(points.uv_px), np.nan)
     observations = points.by_photograph(len(pinholes))
-    for lens, pinhole, pose, mine in zip(posed.lenses, pinholes, posed.T_world_camera, observations, strict=True):
+    for lens, pinhole, pose, mine in zip(lenses, pinholes, T_world_camera, observations, strict=True):
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
         xy = lens.unproject(points.uv_px[mine])
         uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
@@ -280,15 +249,6 @@ def _sparse_points(posed: PosedPhotographs, pinholes: tuple[Lens, ...]) -> Spars
         camera_index=torch.from_numpy(points.photograph_index[good].astype(np.int64)),
         uv_px=_float32(uv_px[good]),
     )
-
-
-def _split(posed: PosedPhotographs) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The layout's own split, or else every eighth photograph is held out."""
-    if posed.split is None:
-        return every_eighth(len(posed.names))
-    train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
-    assert not set(train) & set(test), "readers return disjoint parts"
-    return train, test
 
 
 def _float32(values: np.ndarray | Sequence[tuple[float, float]]) -> Tensor:

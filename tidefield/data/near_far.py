@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from tidefield.data.readers.posed import Observations
+from tidefield.geometry.cameras import intersect_axes
 from tidefield.geometry.lenses import Lens
-from tidefield.geometry.rays import intersect_axes
 
 # A camera's range is [0.5 x 1st, 1.4 x 99th percentile] of the depths of its sparse points. Over flat ground seen from
 # 60 m that leaves 30 m for trees whose tops were not matched, and 24 m for holes. In disparity, in which samples are
@@ -17,32 +17,33 @@ _NEAREST, _FARTHEST = 0.5, 1.4
 _FEWEST_POINTS = 50  # for a 1st and a 99th percentile that one outlier does not decide
 
 
-def near_far_from_points(
-    T_world_camera: Float64[np.ndarray, "V 3 4"], pinholes: tuple[Lens, ...], points: Observations
+def estimate_near_far(
+    T_world_camera: Float64[np.ndarray, "V 3 4"], pinholes: tuple[Lens, ...], points: Observations | None
 ) -> Float64[np.ndarray, "V 2"]:
-    """Estimate ranges from the points that each camera observed.
+    """Estimate ranges from the points that each camera observed, or from the cameras alone if there are too few.
 
     Cameras with few of them take all points in their frustum; where these are few too, the widest range of any camera.
     """
+    if points is None:
+        return _from_cameras(T_world_camera)
     ranges = np.full((len(T_world_camera), 2), np.nan)
     observations = points.by_photograph(len(ranges))
     for i, (pose, pinhole) in enumerate(zip(T_world_camera, pinholes, strict=True)):
-        depth = _depth(pose, points.xyz_world[points.point_index[observations[i]]])
+        depth = (points.xyz_world[points.point_index[observations[i]]] - pose[:, 3]) @ pose[:, 2]
         depth = depth[depth > 0]
         if len(depth) < _FEWEST_POINTS:
-            inside, all_depths = _frustum(pose, pinhole, points.xyz_world)
-            depth = np.concatenate([depth, all_depths[inside]])
+            depth = np.concatenate([depth, _depths_in_frustum(pose, pinhole, points.xyz_world)])
         if len(depth) >= _FEWEST_POINTS:
             nearest, farthest = np.percentile(depth, [1, 99])
             ranges[i] = _NEAREST * nearest, _FARTHEST * farthest
     valid = np.isfinite(ranges[:, 0])
     if not valid.any():
-        return near_far_from_cameras(T_world_camera)
+        return _from_cameras(T_world_camera)
     ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
     return ranges
 
 
-def near_far_from_cameras(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> Float64[np.ndarray, "V 2"]:
+def _from_cameras(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> Float64[np.ndarray, "V 2"]:
     """Estimate ranges from the cameras alone.
 
     Cameras with a common focus (the point nearest to all optical axes, in front of nearly all of them) get a tenth to
@@ -64,23 +65,11 @@ def near_far_from_cameras(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> Float
     return np.tile([0.5 * neighbour, max(100 * neighbour, 2 * spread)], (len(position), 1))
 
 
-def near_far_from_cloud(
-    T_world_camera: Float64[np.ndarray, "V 3 4"], pinholes: tuple[Lens, ...], cloud_world: Float64[np.ndarray, "P 3"]
-) -> Float64[np.ndarray, "V 2"]:
-    """Estimate ranges from points without observations."""
-    none = np.zeros(0, dtype=np.int64)
-    return near_far_from_points(T_world_camera, pinholes, Observations(cloud_world, none, none, np.zeros((0, 2))))
-
-
-def _depth(pose: Float64[np.ndarray, "3 4"], xyz_world: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
-    return (xyz_world - pose[:, 3]) @ pose[:, 2]
-
-
-def _frustum(
+def _depths_in_frustum(
     pose: Float64[np.ndarray, "3 4"], pinhole: Lens, xyz_world: Float64[np.ndarray, "P 3"]
-) -> tuple[Bool[np.ndarray, " P"], Float64[np.ndarray, " P"]]:
-    """Which points lie in a camera's frustum, and the z-depths of all."""
+) -> Float64[np.ndarray, " _"]:
+    """The z-depths of the points in a camera's frustum."""
     xyz = (xyz_world - pose[:, 3]) @ pose[:, :3]
     front = xyz[:, 2] > 0
     uv = pinhole.project(np.where(front[:, None], xyz, 1.0))
-    return front & (uv >= 0).all(axis=1) & (uv <= (pinhole.width, pinhole.height)).all(axis=1), xyz[:, 2]
+    return xyz[front & (uv >= 0).all(axis=1) & (uv <= (pinhole.width, pinhole.height)).all(axis=1), 2]

@@ -17,8 +17,7 @@ from torch.nn import functional as F
 
 from tidefield.data.depth_prior import unproject_to_surface
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import Cameras, pixel_grid
-from tidefield.geometry.rays import angle_between
+from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 
 FADE = 0.04
 """A view has the full weight when its rank exceeds that of the first view left out by this share of its own rank."""
@@ -134,35 +133,22 @@ def choose_neighbours(
     corners_px = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
     uv = corners_px[:, None] + corner_px.new_tensor(SURFACE_OFFSETS) * side_px
     surface = unproject_to_surface(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
-    spare = EXTRA_VIEWS if count and strategy != "direction" else 0
-    chosen, blend_weight = _choose_at_corners(camera, surface, scene, count, spare, strategy, excluded)
-    first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
-    return _combine_corners(chosen, blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))
-
-
-def _choose_at_corners(
-    camera: Cameras,
-    surface_world: Float[Tensor, "K S 3"],
-    scene: Scene,
-    count: int,
-    spare: int,
-    strategy: str,
-    excluded: int | None,
-) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
-    """The best training photographs at each corner, and their blend weights (`select_best`)."""
+    by_direction = strategy == "direction"
+    spare = EXTRA_VIEWS if count and not by_direction else 0
     train = torch.tensor(scene.train)
-    if strategy != "direction" and len(train) > PRESELECT_ABOVE and len(surface_world) > PRESELECT_STEP:
+    if not by_direction and len(train) > PRESELECT_ABOVE and len(surface) > PRESELECT_STEP:
         # The best at some corners are the best at those in between: the cost stays bounded in large scenes.
-        some = rank_by_view(camera, surface_world[::PRESELECT_STEP], scene.cameras[train])
+        some = rank_by_view(camera, surface[::PRESELECT_STEP], scene.cameras[train])
         train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
     candidates = scene.cameras[train]
-    if strategy == "direction":
-        rank = rank_by_direction(camera, candidates).expand(len(surface_world), -1)
+    if by_direction:
+        rank = rank_by_direction(camera, candidates).expand(len(surface), -1)
     else:
-        rank = rank_by_view(camera, surface_world, candidates)
+        rank = rank_by_view(camera, surface, candidates)
     out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
     chosen, blend_weight = select_best(rank, out, count, spare)
-    return train[chosen], blend_weight
+    first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
+    return _combine_corners(train[chosen], blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))
 
 
 def _combine_corners(

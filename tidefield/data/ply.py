@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from tidefield.data.readers.files import check_size
-from tidefield.errors import SceneError
+from tidefield.data.readers.files import opened
 from tidefield.files import completed_file
 
 _MEGABYTES = 4_000
@@ -23,14 +22,14 @@ def read_ply(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, 
     """
     from plyfile import PlyData, PlyParseError
 
-    check_size(path, _MEGABYTES)
-    try:
-        vertex = PlyData.read(path)["vertex"].data
+    with opened(path, "a complete PLY file of points; export it again", _MEGABYTES):
+        try:
+            vertex = PlyData.read(path)["vertex"].data
+        except PlyParseError as error:
+            raise ValueError(str(error)) from error
         xyz = np.stack([vertex[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         coloured = all(c in vertex.dtype.names and vertex.dtype[c] == np.uint8 for c in _COLOURS)
         rgb = np.stack([vertex[c] for c in _COLOURS], axis=-1) if coloured else None
-    except (PlyParseError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as error:
-        raise SceneError(f"{path} is not a complete PLY file of points ({error}); export it again") from error
     finite = np.isfinite(xyz).all(axis=1)
     return (xyz[finite], None if rgb is None else rgb[finite]) if finite.any() else None
 

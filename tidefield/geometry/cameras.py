@@ -1,4 +1,4 @@
-"""Batches of pinhole cameras.
+"""Batches of pinhole cameras, angles between their rays, and the point where their optical axes meet.
 
 Conventions (OpenCV): +x right, +y down, +z forward; pixel centres at +0.5, so an image of width W spans
 u in [0, W]. `T_world_camera` maps camera coordinates into the world. Lens distortion has been removed before
@@ -11,11 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import PurePath
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from tidefield.errors import SceneError
+
+_PARALLEL = 0.02
+"""Smallest eigenvalue of the mean projection across the axes (the mean squared sine of their angle to one direction)
+below which they count as parallel: they lie within 8 degrees of it, and where they meet is ill-determined."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +99,20 @@ class Cameras:
         depth = view[:, 2:]
         return torch.cat([self.focal_px[..., None] * view[:, :2] + self.principal_px[..., None] * depth, depth], dim=1)
 
-    def project(self, points_world: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
-        """Project the same points with every camera: pixels and z-depths.
+    def project(
+        self, points_world: Float[Tensor, "P 3"] | Float[Tensor, "V P 3"]
+    ) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
+        """Project points with every camera, the same ones or each camera's own: pixels and z-depths.
 
         Points at or behind a camera have z <= 0 and meaningless pixels: test z before using them.
         """
-        return project(self, points_world.expand(len(self), -1, -1))
+        matrix = self.projection
+        points = points_world.expand(len(self), -1, -1)
+        homogeneous = points @ matrix[:, :, :3].transpose(1, 2) + matrix[:, None, :, 3]
+        z = homogeneous[..., 2]
+        # Keeps the division finite for points in the camera's plane; they are invalid by z <= 0 or out of the image.
+        uv = homogeneous[..., :2] / torch.where(z.abs() < 1e-9, 1e-9, z)[..., None]
+        return uv, z
 
     def directions_world(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
         """Compute ray directions through pixels, scaled to a z-depth of 1."""
@@ -142,24 +155,31 @@ def describe_sizes(cameras: Cameras) -> str:
     return "x".join(map(str, sizes[0])) if len(sizes) == 1 else f"{len(sizes)} sizes"
 
 
-def project(
-    cameras: Cameras, points_world: Float[Tensor, "V P 3"]
-) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
-    """Project each camera's own P points: pixels and z-depths.
-
-    Points at or behind a camera have z <= 0 and meaningless pixels: test z before using them.
-    """
-    matrix = cameras.projection
-    homogeneous = points_world @ matrix[:, :, :3].transpose(1, 2) + matrix[:, None, :, 3]
-    z = homogeneous[..., 2]
-    # Keeps the division finite for points in the camera's plane; they are invalid by z <= 0 or out of the image.
-    uv = homogeneous[..., :2] / torch.where(z.abs() < 1e-9, 1e-9, z)[..., None]
-    return uv, z
-
-
 def pixel_grid(width: int, height: int, device: torch.device | str | None = None) -> Float[Tensor, "P 2"]:
     """List the centres of all pixels of an image, row by row: (0.5, 0.5), (1.5, 0.5), ..."""
     v, u = torch.meshgrid(
         torch.arange(height, device=device) + 0.5, torch.arange(width, device=device) + 0.5, indexing="ij"
     )
     return torch.stack([u, v], dim=-1).reshape(-1, 2)
+
+
+def angle_between(first: Float[Tensor, "*#B 3"], second: Float[Tensor, "*#B 3"]) -> Float[Tensor, "*B"]:
+    """Compute angles between unit vectors, radians.
+
+    They are computed from the chord: the arc cosine of the dot product loses small angles to rounding.
+    """
+    return 2 * ((second - first).norm(dim=-1) / 2).clamp(max=1).asin()
+
+
+def intersect_axes(
+    position: Float64[np.ndarray, "V 3"], forward: Float64[np.ndarray, "V 3"]
+) -> Float64[np.ndarray, " 3"] | None:
+    """Find the least-squares point nearest to all optical axes; None where these are nearly parallel.
+
+    Args:
+        forward: unit vectors along the axes.
+    """
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] <= _PARALLEL:
+        return None
+    return np.linalg.solve(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0))[:, 0]

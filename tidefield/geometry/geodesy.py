@@ -28,6 +28,7 @@ from pyproj.exceptions import CRSError, ProjError
 WGS84 = "EPSG:4326"
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius, for distances on a sphere that may be wrong by half a per cent."""
+_ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
 
@@ -63,7 +64,7 @@ class LocalFrame:
         system = parse_crs(crs)
         products = system
         if system.is_geographic:
-            degrees = np.rad2deg(_radians_per_unit(_base(system)))
+            degrees = np.rad2deg(_base(system).axis_info[0].unit_conversion_factor)
             products = _utm(origin[0] * degrees, origin[1] * degrees, system)
         name = _name(products)
         heights = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
@@ -75,11 +76,6 @@ class LocalFrame:
     def epsg(self) -> int | None:
         """EPSG code of the products' system, or None."""
         return int(self.crs.removeprefix("EPSG:")) if self.crs.startswith("EPSG:") else None
-
-    @property
-    def geographic_crs(self) -> str:
-        """Geographic system of the origin."""
-        return _name(self._datum)
 
     def from_system(self, crs: str, coordinates: Points) -> Points:
         """Convert (easting, northing, height) or (longitude, latitude, height) in any system to world.
@@ -117,10 +113,9 @@ class LocalFrame:
 
     def to_json(self) -> dict:
         """Return the values that `from_json` reads."""
-        origin = {"longitude_deg": self.longitude_deg, "latitude_deg": self.latitude_deg, "height_m": self.height_m}
         return {
-            "origin": origin,
-            "geographic_crs": self.geographic_crs,
+            "origin": {key: getattr(self, key) for key in _ORIGIN},
+            "geographic_crs": _name(self._datum),
             "crs": self.crs,
             "epsg": self.epsg,
             "vertical_datum": self.vertical_datum,
@@ -129,7 +124,7 @@ class LocalFrame:
     @classmethod
     def from_json(cls, values: dict) -> LocalFrame:
         """Read the values of `to_json`. Raises KeyError, TypeError or ValueError if they are incomplete or wrong."""
-        origin = [float(values["origin"][key]) for key in ("longitude_deg", "latitude_deg", "height_m")]
+        origin = [float(values["origin"][key]) for key in _ORIGIN]
         parse_crs(values["crs"])
         return cls(*origin, crs=str(values["crs"]), vertical_datum=str(values["vertical_datum"]))
 
@@ -158,7 +153,7 @@ class LocalFrame:
     @cached_property
     def _degrees(self) -> Float64[np.ndarray, " 3"]:
         """Degrees per unit of the datum's geographic system (grads in France), and metres per metre."""
-        unit = float(np.rad2deg(_radians_per_unit(self._datum)))
+        unit = float(np.rad2deg(self._datum.axis_info[0].unit_conversion_factor))
         return np.array([unit, unit, 1.0])
 
     @cached_property
@@ -275,7 +270,3 @@ def _metres_per_height(crs: CRS) -> float:
     if crs.is_compound:
         return crs.sub_crs_list[1].axis_info[0].unit_conversion_factor
     return crs.axis_info[2].unit_conversion_factor if len(crs.axis_info) == 3 else 1.0
-
-
-def _radians_per_unit(geographic: CRS) -> float:
-    return geographic.axis_info[0].unit_conversion_factor

@@ -76,11 +76,6 @@ class Lens:
         """The simplest of COLMAP's models that has all of the lens's terms."""
         return "FULL_OPENCV" if self.k3 else "OPENCV" if self.is_distorted else "PINHOLE"
 
-    def nerfstudio_keys(self) -> dict[str, int | float]:
-        """The keys of a frame in nerfstudio's transforms.json."""
-        pinhole = {"w": self.width, "h": self.height, "fl_x": self.fx, "fl_y": self.fy, "cx": self.cx, "cy": self.cy}
-        return {**pinhole, **dict(zip(("k1", "k2", "p1", "p2", "k3"), self.distortion, strict=True))}
-
     @property
     def is_distorted(self) -> bool:
         return any(self.distortion)
@@ -193,10 +188,6 @@ def _sides(x0: float, x1: float, y0: float, y1: float) -> list[Points]:
     """Sample the left, right, top and bottom side of a rectangle."""
     x, y = np.linspace(x0, x1, 201), np.linspace(y0, y1, 201)
     return [np.stack(np.broadcast_arrays(u, v), -1) for u, v in ((x0, y), (x1, y), (x, y0), (x, y1))]
-
-
-NERFSTUDIO_MODEL = "OPENCV"
-"""nerfstudio's name of the model that `Lens.nerfstudio_keys` writes."""
 
 
 def lens_from_colmap(

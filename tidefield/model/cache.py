@@ -15,7 +15,6 @@ from torch import Tensor
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import project
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
 
@@ -85,7 +84,7 @@ class FeatureCache:
         photographs = neighbours.reshape(-1)
         cameras = self.scene.cameras[photographs]
         points = middle_world.repeat_interleave(neighbours.shape[1], 0)
-        uv = project(cameras, points[:, None])[0][:, 0]
+        uv = cameras.project(points[:, None])[0][:, 0]
         last = _block_counts(cameras.size_px) - 1
         free = (cameras.size_px - BLOCK_PX).clamp(min=1)
         index = torch.minimum(((uv - BLOCK_PX / 2) / free * last).round().clamp(min=0), last.to(uv)).long()

@@ -20,7 +20,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import softmax
 
-from tidefield.data.near_far import near_far_from_cloud
+from tidefield.data.near_far import estimate_near_far
+from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
@@ -424,6 +425,6 @@ def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Le
         near, far = scene.cameras.near_far[list(scene.train)].double().cpu().numpy().T
         return np.tile([np.quantile(near, 0.05), np.quantile(far, 0.95)], (len(pose), 1))
     xyz = scene.points.xyz_world.double().cpu().numpy()
-    ranges = near_far_from_cloud(pose, lenses, xyz[:: len(xyz) // MAX_RANGE_POINTS + 1])
+    ranges = estimate_near_far(pose, lenses, Observations(xyz[:: len(xyz) // MAX_RANGE_POINTS + 1]))
     # A jump of the range would be a jump in the picture: samples lie elsewhere.
     return np.exp(gaussian_filter1d(np.log(ranges), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))

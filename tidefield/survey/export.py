@@ -14,8 +14,8 @@ import pycolmap
 from jaxtyping import Float32
 from PIL import ExifTags, Image
 
+from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
-from tidefield.data.transforms_file import write_transforms_file
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import lens_from_colmap
 from tidefield.machine import cores

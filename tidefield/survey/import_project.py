@@ -103,11 +103,7 @@ def to_colmap(posed: PosedPhotographs) -> pycolmap.Reconstruction:
         name, size = lens.colmap_model, {"width": lens.width, "height": lens.height}
         camera = pycolmap.Camera(camera_id=number, model=name, params=colmap_parameters(lens, name), **size)
         model.add_camera_with_trivial_rig(camera)
-    points = posed.points
-    if points is None:
-        nothing = np.zeros(0, dtype=np.int64)
-        cloud = np.zeros((0, 3)) if posed.cloud_world is None else posed.cloud_world
-        points = Observations(cloud, nothing, nothing, np.zeros((0, 2)), posed.cloud_rgb)
+    points = posed.points or Observations(np.zeros((0, 3)))
     rotation = posed.T_world_camera[:, :, :3].transpose(0, 2, 1)
     T_camera_world = np.concatenate([rotation, -rotation @ posed.T_world_camera[:, :, 3:]], axis=2)
     keypoint = np.zeros(len(points.uv_px), dtype=np.int64)

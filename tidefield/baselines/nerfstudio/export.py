@@ -10,8 +10,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor, ones, uint8
 
+from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
-from tidefield.data.transforms_file import write_transforms_file
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 

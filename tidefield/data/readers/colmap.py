@@ -9,21 +9,22 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Float64, Int, UInt8
+from jaxtyping import Float64, Int
 
-from tidefield.data.readers.files import bounded_bytes, inside, keep_present
+from tidefield.data.readers.files import inside, keep_present, opened
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, Lens, lens_from_colmap
 
 _NO_POINT = -1
-_Points = tuple[Int[np.ndarray, " P"], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+_POINT = np.dtype([("id", "i8"), ("xyz", "f8", 3), ("rgb", "u1", 3)])
+_EXPECTED = "a complete file of a COLMAP model; copy or export the model again"
 _MEGABYTES = 20_000
 
 
@@ -33,8 +34,7 @@ class _Image:
 
     name: str
     camera: int
-    quaternion: Float64[np.ndarray, " 4"]
-    translation: Float64[np.ndarray, " 3"]
+    pose: Float64[np.ndarray, " 7"]
     uv_px: Float64[np.ndarray, "O 2"]
     point: Int[np.ndarray, " O"]
 
@@ -53,13 +53,13 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     suffix = _suffix(model)
     assert suffix is not None, "find_colmap found no model here"
     cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
-    binary = suffix == ".bin"
-    with _name_errors(cameras_file):
-        lenses = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
-    with _name_errors(images_file):
-        images = list((_binary_images if binary else _text_images)(images_file))
-    with _name_errors(points_file):
-        point_ids, xyz_world, rgb = (_binary_points if binary else _text_points)(points_file)
+    is_binary = suffix == ".bin"
+    with opened(cameras_file, _EXPECTED, _MEGABYTES) as file:
+        lenses = dict(_binary_cameras(file) if is_binary else _text_cameras(file))
+    with opened(images_file, _EXPECTED, _MEGABYTES) as file:
+        images = list(_binary_images(file) if is_binary else _text_images(file))
+    with opened(points_file, _EXPECTED, _MEGABYTES) as file:
+        points = np.array(list(_binary_points(file) if is_binary else _text_points(file)), dtype=_POINT)
     unknown = next((image for image in images if image.camera not in lenses), None)
     if unknown:
         raise SceneError(
@@ -74,7 +74,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
         paths=tuple(paths[i] for i in present),
         lenses=tuple(lenses[image.camera] for image in images),
         T_world_camera=_poses(images),
-        points=_observations(images, point_ids, xyz_world, rgb),
+        points=_observations(images, points),
     )
 
 
@@ -83,20 +83,8 @@ def _suffix(model: Path) -> str | None:
     return next((suffix for suffix in (".bin", ".txt") if (model / f"cameras{suffix}").is_file()), None)
 
 
-@contextmanager
-def _name_errors(path: Path) -> Iterator[None]:
-    """Turn errors of parsing a file into a SceneError that names it."""
-    try:
-        yield
-    except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise SceneError(
-            f"{path} is damaged ({error}): expected a complete file of a COLMAP model; copy or export the model again"
-        ) from error
-
-
 def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
-    quaternion = np.array([image.quaternion for image in images]).reshape(-1, 4)
-    translation = np.array([image.translation for image in images]).reshape(-1, 3)
+    quaternion, translation = np.split(np.array([image.pose for image in images]).reshape(-1, 7), [4], axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):  # a quaternion of zeros becomes NaN, which is an error later
         w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     R_world_camera = np.array(  # the transpose of the quaternion's R_camera_world
@@ -109,28 +97,25 @@ def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
     return np.concatenate([R_world_camera, -R_world_camera @ translation[:, :, None]], axis=2)
 
 
-def _observations(
-    images: list[_Image],
-    point_ids: Int[np.ndarray, " P"],
-    xyz_world: Float64[np.ndarray, "P 3"],
-    rgb: UInt8[np.ndarray, "P 3"],
-) -> Observations | None:
-    if len(point_ids) == 0 or not images:
+def _observations(images: list[_Image], points: np.ndarray) -> Observations | None:
+    """Observations of points, an array of `_POINT`."""
+    if len(points) == 0 or not images:
         return None
+    point_ids, xyz_world = points["id"], points["xyz"]
     order = np.argsort(point_ids)
     seen = np.concatenate([image.point for image in images])
     uv_px = np.concatenate([image.uv_px for image in images])
     photograph = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
     row = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
     valid = (point_ids[row] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[row]).all(axis=1)
-    return Observations(xyz_world, row[valid], photograph[valid], uv_px[valid], rgb)
+    return Observations(xyz_world, row[valid], photograph[valid], uv_px[valid], points["rgb"])
 
 
 class _Reader:
-    """Read little-endian numbers from a file in sequence; struct.error where the file ends too early."""
+    """Read little-endian numbers from a file in sequence; struct.error where it ends too early."""
 
-    def __init__(self, path: Path) -> None:
-        self.bytes, self.at = bounded_bytes(path, _MEGABYTES), 0
+    def __init__(self, file: BinaryIO) -> None:
+        self.bytes, self.at = file.read(), 0
 
     def take(self, layout: str) -> tuple:
         values = struct.unpack_from("<" + layout, self.bytes, self.at)
@@ -144,26 +129,28 @@ class _Reader:
             raise ValueError(f"it ends before the {count} records that it announces")
         return count
 
-    def end(self) -> None:
+    def records(self, smallest: int) -> Iterator[None]:
+        """Count the records of a file, which must end after the last one."""
+        for _ in range(self.count(smallest)):
+            yield
         if self.at != len(self.bytes):
             raise ValueError(f"it goes on for {len(self.bytes) - self.at} bytes after its last record")
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    reader = _Reader(path)
-    for _ in range(reader.count(24)):
+def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+    reader = _Reader(file)
+    for _ in reader.records(24):
         camera, model, width, height = reader.take("IiQQ")
         if not 0 <= model < len(COLMAP_MODELS):
             raise ValueError(f"it has a camera of the model number {model}, which COLMAP does not have")
         name = COLMAP_MODELS[model]
         parameters = reader.take(f"{len(COLMAP_PARAMETERS.get(name, ()))}d")
         yield camera, lens_from_colmap(name, width, height, parameters)
-    reader.end()
 
 
-def _binary_images(path: Path) -> Iterator[_Image]:
-    reader = _Reader(path)
-    for _ in range(reader.count(73)):
+def _binary_images(file: BinaryIO) -> Iterator[_Image]:
+    reader = _Reader(file)
+    for _ in reader.records(73):
         _, *pose, camera = reader.take("I7dI")
         end = reader.bytes.index(b"\0", reader.at)
         name = reader.bytes[reader.at : end].decode()
@@ -172,59 +159,39 @@ def _binary_images(path: Path) -> Iterator[_Image]:
         seen = np.frombuffer(reader.bytes, _OBSERVATION, count, reader.at)
         seen = seen[seen["point"] != _NO_POINT]
         reader.at += count * _OBSERVATION.itemsize
-        yield _Image(name, camera, np.array(pose[:4]), np.array(pose[4:]), seen["uv"], seen["point"])
-    reader.end()
+        yield _Image(name, camera, np.array(pose), seen["uv"], seen["point"])
 
 
-def _binary_points(path: Path) -> _Points:
-    reader = _Reader(path)
-    ids, xyz, rgb = [], [], []
-    for _ in range(reader.count(51)):
-        point, *position = reader.take("Q3d")
-        *colour, _ = reader.take("3Bd")  # and the error
+def _binary_points(file: BinaryIO) -> Iterator[tuple[int, Sequence[float], Sequence[int]]]:
+    reader = _Reader(file)
+    for _ in reader.records(51):
+        point, x, y, z, *colour, _ = reader.take("Q3d3Bd")  # and the error
         track = reader.count(8)
         reader.at += 8 * track  # the images file has the same observations
-        ids.append(point)
-        xyz.append(position)
-        rgb.append(colour)
-    reader.end()
-    return _points(ids, xyz, rgb)
+        yield point, (x, y, z), colour
 
 
-def _lines(path: Path) -> Iterator[str]:
-    for line in bounded_bytes(path, _MEGABYTES).decode().splitlines():
-        if not line.startswith("#"):
-            yield line.strip()
+def _lines(file: BinaryIO) -> Iterator[str]:
+    return (line.strip() for line in file.read().decode().splitlines() if not line.startswith("#"))
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    for line in filter(None, _lines(path)):
+def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+    for line in filter(None, _lines(file)):
         camera, model, width, height, *parameters = line.split()
         yield int(camera), lens_from_colmap(model, int(width), int(height), [float(p) for p in parameters])
 
 
-def _text_images(path: Path) -> Iterator[_Image]:
-    lines = _lines(path)
-    for line in lines:
-        if not line:
-            continue
+def _text_images(file: BinaryIO) -> Iterator[_Image]:
+    lines = _lines(file)
+    for line in filter(None, lines):
         # Two lines per image; the second is empty without observations. A name may have spaces.
         _, *pose, camera, name = line.split(maxsplit=9)
         seen = np.array((next(lines, "")).split(), dtype=np.float64).reshape(-1, 3)
         seen = seen[seen[:, 2] != _NO_POINT]
-        values = np.array(pose, dtype=np.float64)
-        yield _Image(name, int(camera), values[:4], values[4:], seen[:, :2], seen[:, 2].astype(np.int64))
+        yield _Image(name, int(camera), np.array(pose, dtype=np.float64), seen[:, :2], seen[:, 2].astype(np.int64))
 
 
-def _text_points(path: Path) -> _Points:
-    records = [line.split(maxsplit=7)[:7] for line in _lines(path) if line]
-    ids, colours = [int(record[0]) for record in records], [[int(c) for c in record[4:]] for record in records]
-    return _points(ids, [record[1:4] for record in records], colours)
-
-
-def _points(ids: Sequence[int], xyz: Sequence[Sequence[float | str]], rgb: Sequence[Sequence[int]]) -> _Points:
-    return (
-        np.array(ids, dtype=np.int64),
-        np.array(xyz, dtype=np.float64).reshape(-1, 3),
-        np.array(rgb, dtype=np.uint8).reshape(-1, 3),
-    )
+def _text_points(file: BinaryIO) -> Iterator[tuple[int, Sequence[float], Sequence[int]]]:
+    for line in filter(None, _lines(file)):
+        point, x, y, z, *colour = line.split(maxsplit=7)[:7]
+        yield int(point), (float(x), float(y), float(z)), [int(c) for c in colour]

@@ -1,62 +1,78 @@
-"""Read files of a scene safely: bounded in size, inside the scene's folder, and with checked JSON numbers."""
+"""Read files of a scene safely: bounded in size, inside the scene's folder, and with checked JSON numbers.
+
+All readers open files with `opened` and photographs with `open_picture`, take paths from files with `inside`, and
+numbers of JSON with `number`.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import posixpath
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeVar
+
+from PIL import Image
 
 from tidefield.errors import SceneError, list_names
 
 _JSON_MEGABYTES = 256
-
-
-def bounded_bytes(path: Path, megabytes: int) -> bytes:
-    """Read a file of at most so many megabytes.
-
-    Raises:
-        SceneError: the file is larger, or cannot be read.
-    """
-    with _readable(path, megabytes):
-        return path.read_bytes()
-
-
-def bounded_lines(path: Path, megabytes: int) -> Iterator[str]:
-    """Read a text file of at most so many megabytes line by line.
-
-    Raises:
-        SceneError: the file is larger, or cannot be read.
-        UnicodeDecodeError: it is not UTF-8.
-    """
-    with _readable(path, megabytes), path.open(encoding="utf-8") as lines:
-        yield from lines
-
-
-def check_size(path: Path, megabytes: int) -> None:
-    """Check that a file can be read, and has at most so many megabytes.
-
-    Raises:
-        SceneError: it cannot, or is larger.
-    """
-    with _readable(path, megabytes), path.open("rb"):
-        pass
+_DAMAGE = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, MemoryError, RecursionError)
+T = TypeVar("T", dict, list)
 
 
 @contextmanager
-def _readable(path: Path, megabytes: int) -> Iterator[None]:
-    try:
-        if path.stat().st_size > megabytes * 1_000_000:
+def opened(path: Path, expected: str, megabytes: int) -> Iterator[BinaryIO]:
+    """Open a file of at most so many megabytes, and name it in the errors of reading it (see `parsing`).
+
+    Raises:
+        SceneError: the file is larger, cannot be read, or the block fails on what it holds.
+    """
+    with parsing(path, expected), path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > megabytes * 1_000_000:
             raise SceneError(
-                f"{path} has {path.stat().st_size / 1e6:.0f} MB: expected at most {megabytes} MB for a file "
-                "of this kind; export it again"
+                f"{path} has {size / 1e6:.0f} MB: expected at most {megabytes} MB for a file of this kind; "
+                "export it again"
             )
+        yield file
+
+
+@contextmanager
+def parsing(path: Path, expected: str) -> Iterator[None]:
+    """Turn every error of reading a file, or of what it holds, into one SceneError that names it.
+
+    Args:
+        expected: what the file should hold, and what to do.
+    """
+    try:
         yield
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}; make it a readable file") from error
+    except (*_DAMAGE, struct.error) as error:
+        raise SceneError(f"{path} is damaged ({error}): expected {expected}") from error
+
+
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image.Image]:
+    """Open a photograph without decoding it.
+
+    Raises:
+        SceneError: instead of Pillow's errors, also of those in the block.
+    """
+    try:
+        with Image.open(path) as picture:
+            yield picture
+    # Pillow raises SyntaxError for broken PNGs, and a plain Exception for decompression bombs.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise SceneError(
+            f"{path} cannot be read as a photograph ({error}): expected a complete JPEG or PNG; copy it again from the "
+            "camera, or remove it and use --allow-missing"
+        ) from error
 
 
 def inside(root: Path, name: str, named_by: Path) -> Path:
@@ -93,37 +109,27 @@ def keep_present(paths: Sequence[Path], named_by: Path, allow_missing: bool) -> 
         SceneError: some are missing, and that is not allowed.
     """
     present = [i for i, path in enumerate(paths) if path.is_file()]
-    missing = [path for path in paths if not path.is_file()]
-    if missing and not allow_missing:
+    if len(present) < len(paths) and not allow_missing:
+        missing = [str(path) for path in paths if not path.is_file()]
         raise SceneError(
             f"{len(missing)} of the {len(paths)} photographs that {named_by} names are missing: "
-            f"{list_names([str(path) for path in missing])}; add them, or use --allow-missing to leave them out"
+            f"{list_names(missing)}; add them, or use --allow-missing to leave them out"
         )
     return present
 
 
-def read_json(file: Path, megabytes: int = _JSON_MEGABYTES) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
+def read_json(file: Path, kind: type[T] = dict, megabytes: int = _JSON_MEGABYTES) -> T:
+    """Read a JSON file that holds an object, or a list.
 
     Raises:
         SceneError: the file cannot be read, or holds anything else.
     """
-    top = read_json_value(file, megabytes)
-    if not isinstance(top, dict):
-        raise SceneError(f"{file} holds a {type(top).__name__}: expected an object; export it again")
+    with opened(file, "whole JSON; copy or export it again", megabytes) as content:
+        top = json.load(content)
+    if not isinstance(top, kind):
+        wanted = "an object" if kind is dict else "a list"
+        raise SceneError(f"{file} holds a {type(top).__name__}: expected {wanted}; export it again")
     return top
-
-
-def read_json_value(file: Path, megabytes: int) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        SceneError: the file cannot be read, or is not valid JSON.
-    """
-    try:
-        return json.loads(bounded_bytes(file, megabytes))
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file} is not whole JSON ({error}); copy or export it again") from error
 
 
 def number(values: Mapping[str, Any], key: str, file: Path, default: float | None = None) -> float:

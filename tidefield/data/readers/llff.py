@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tidefield.data.readers.files import parsing
 from tidefield.data.readers.posed import PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
@@ -28,11 +29,9 @@ def read_llff(root: Path) -> PosedPhotographs:
         SceneError: the array is damaged, or there is not one photograph per row.
     """
     file = root / "poses_bounds.npy"
-    try:
+    with parsing(file, "N x 17 numbers; export it again"):
         # Memory-mapped, so that nothing is allocated for a header that announces terabytes.
         rows = np.array(np.load(file, allow_pickle=False, mmap_mode="r"))
-    except (ValueError, OSError, EOFError) as error:
-        raise SceneError(f"{file} is no complete array ({error}): expected N x 17 numbers; export it again") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} of shape {rows.shape}: expected N x 17 numbers; export it again")
     folder = next((root / name for name in _FOLDERS if (root / name).is_dir()), root / "images")

@@ -23,8 +23,8 @@ from __future__ import annotations
 import logging
 import posixpath
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -33,15 +33,7 @@ from jaxtyping import Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from tidefield.data.images import read_header
-from tidefield.data.readers.files import (
-    bounded_bytes,
-    bounded_lines,
-    inside,
-    keep_present,
-    number,
-    read_json,
-    read_json_value,
-)
+from tidefield.data.readers.files import inside, keep_present, number, opened, parsing, read_json
 from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.lenses import Lens
@@ -87,26 +79,24 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
     lenses = tuple(_lens(name, shots[name], cameras, path, file) for name, path in zip(names, paths, strict=True))
     T_world_camera = _poses([shots[name] for name in names], names, file)
     ids, xyz_world, rgb = _points(_objects(reconstruction, "points", file), file)
-    points = None
+    points = Observations(xyz_world, rgb=rgb) if len(ids) else None
     if (tracks_file := file.with_name("tracks.csv")).is_file():
-        points = _observations(_read_tracks(tracks_file, names, ids), lenses, T_world_camera, xyz_world, rgb)
-    only_cloud = points is None and len(ids) > 0
+        tracks = _read_tracks(tracks_file, names, ids, lenses)
+        points = _inliers(Observations(xyz_world, *tracks, rgb), lenses, T_world_camera) or points
     return PosedPhotographs(
         names=tuple(names),
         paths=tuple(paths),
         lenses=lenses,
         T_world_camera=T_world_camera,
         points=points,
-        cloud_world=xyz_world if only_cloud else None,
-        cloud_rgb=rgb if only_cloud else None,
         reference=_reference(file, reconstruction),
     )
 
 
 def _largest(file: Path) -> Object:
     """The reconstruction of the most photographs; a warning names the photographs of the others."""
-    reconstructions = read_json_value(file, _MEGABYTES)
-    if not isinstance(reconstructions, list) or not reconstructions or not all(map(_is_object, reconstructions)):
+    reconstructions = read_json(file, list, _MEGABYTES)
+    if not reconstructions or not all(isinstance(one, dict) for one in reconstructions):
         raise SceneError(f"{file} holds no list of reconstructions: expected the format of OpenSfM; run it again")
     largest, *others = sorted(reconstructions, key=lambda r: len(_objects(r, "shots", file)), reverse=True)
     left = [name for other in others for name in other["shots"]]
@@ -118,13 +108,9 @@ def _largest(file: Path) -> Object:
     return largest
 
 
-def _is_object(value: object) -> bool:
-    return isinstance(value, dict)
-
-
 def _objects(reconstruction: Mapping[str, Any], key: str, file: Path) -> dict[str, Object]:
     objects = reconstruction.get(key, {})
-    if not isinstance(objects, dict) or not all(map(_is_object, objects.values())):
+    if not isinstance(objects, dict) or not all(isinstance(one, dict) for one in objects.values()):
         raise SceneError(f"{file} has {key} that are no table of objects: expected the format of OpenSfM; run it again")
     return objects
 
@@ -145,10 +131,8 @@ def _photographs(root: Path, file: Path, names: Sequence[str]) -> list[Path]:
 
 def _listed(root: Path, image_list: Path) -> dict[str, str]:
     """Paths relative to `root` by photographs' names. Absolute ones belong to the machine that ran ODM: skipped."""
-    try:
-        lines = bounded_bytes(image_list, _LIST_MEGABYTES).decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{image_list} is not UTF-8 text ({error}): expected a path per line; correct it") from error
+    with opened(image_list, "a path per line, in UTF-8; correct it", _LIST_MEGABYTES) as file:
+        lines = file.read().decode().splitlines()
     here = image_list.parent.relative_to(root).as_posix()
     paths = [PurePosixPath(line.strip()) for line in lines if line.strip()]
     return {path.name: posixpath.join(here, path) for path in paths if not path.is_absolute()}
@@ -204,105 +188,68 @@ def _points(
     points: Mapping[str, Object], file: Path
 ) -> tuple[list[str], Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
     """Names, positions and colours of the points at finite positions."""
-    try:
+    with parsing(file, "points with coordinates and a color of three numbers each; run OpenSfM again"):
         xyz = np.array([point["coordinates"] for point in points.values()], dtype=np.float64).reshape(len(points), 3)
         grey = [128, 128, 128]
         rgb = np.array([point.get("color", grey) for point in points.values()], dtype=np.float64)
         rgb = rgb.reshape(len(points), 3)
         if not ((rgb >= 0) & (rgb <= 255)).all():
-            raise ValueError("colours outside of 0 to 255")
-    except (KeyError, TypeError, ValueError) as error:
-        raise SceneError(
-            f"{file} has invalid points ({error}): expected coordinates and a color of three numbers each; run OpenSfM "
-            "again"
-        ) from error
+            raise ValueError("it has colours outside of 0 to 255")
     names, finite = list(points), np.flatnonzero(np.isfinite(xyz).all(axis=1))
     return [names[i] for i in finite], xyz[finite], rgb[finite].astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _Tracks:
-    """Observations in OpenSfM's coordinates.
-
-    Attributes:
-        photograph_index: for each observation, the photograph.
-        point_index: for each observation, the point.
-        xy: for each observation, its position from the photograph's middle, in units of the longer side.
-    """
-
-    photograph_index: Int[np.ndarray, " O"]
-    point_index: Int[np.ndarray, " O"]
-    xy: Float64[np.ndarray, "O 2"]
-
-
-def _read_tracks(file: Path, names: Sequence[str], points: Sequence[str]) -> _Tracks:
-    """Read the observations of these points in these photographs; other tracks are skipped."""
-    photograph_of = {name: i for i, name in enumerate(names)}
-    point_of = {name: i for i, name in enumerate(points)}
+def _read_tracks(
+    file: Path, names: Sequence[str], points: Sequence[str], lenses: Sequence[Lens]
+) -> tuple[Int[np.ndarray, " O"], Int[np.ndarray, " O"], Float64[np.ndarray, "O 2"]]:
+    """Read the observations of these points in these photographs: point, photograph and pixel of each."""
+    photograph_of, point_of = ({name: i for i, name in enumerate(each)} for each in (names, points))
     photograph_index, point_index, xy = array("q"), array("q"), array("d")
-    try:
-        for photograph, point, _, x, y, *_ in _records(file):
-            if photograph in photograph_of and point in point_of:
-                photograph_index.append(photograph_of[photograph])
-                point_index.append(point_of[point])
-                xy.extend((float(x), float(y)))
-    except ValueError as error:
-        raise SceneError(
-            f"{file} is damaged after {len(point_index)} observations ({error}): expected complete lines of OpenSfM's "
-            "tracks; copy it again, or remove it to use no observations"
-        ) from error
-    return _Tracks(
-        np.array(photograph_index, dtype=np.int64),
-        np.array(point_index, dtype=np.int64),
-        np.array(xy, dtype=np.float64).reshape(-1, 2),
-    )
-
-
-def _records(file: Path) -> Iterator[list[str]]:
-    """The columns of each line; ValueError where their number does not fit the version."""
     columns = _TRACKS_COLUMNS["0"]
-    for row, line in enumerate(bounded_lines(file, _TRACKS_MEGABYTES)):
-        if row == 0 and line.startswith(_TRACKS_HEADER):
-            version = line.removeprefix(_TRACKS_HEADER).strip()
-            if version not in _TRACKS_COLUMNS:
-                raise SceneError(
-                    f"{file} has the version {version!r} of OpenSfM's tracks: expected {', '.join(_TRACKS_COLUMNS)}; "
-                    "remove the file to use no observations"
-                )
-            columns = _TRACKS_COLUMNS[version]
-            continue
-        record = line.rstrip("\r\n").split("\t")
-        if len(record) != columns:
-            raise ValueError(f"a line has {len(record)} columns, not {columns}")
-        yield record
+    expected = "complete lines of OpenSfM's tracks; copy it again, or remove it to use no observations"
+    with opened(file, expected, _TRACKS_MEGABYTES) as content:
+        try:
+            for row, encoded in enumerate(content):
+                line = encoded.decode()
+                if row == 0 and line.startswith(_TRACKS_HEADER):
+                    version = line.removeprefix(_TRACKS_HEADER).strip()
+                    if version not in _TRACKS_COLUMNS:
+                        raise SceneError(
+                            f"{file} has the version {version!r} of OpenSfM's tracks: expected "
+                            f"{', '.join(_TRACKS_COLUMNS)}; remove the file to use no observations"
+                        )
+                    columns = _TRACKS_COLUMNS[version]
+                    continue
+                record = line.rstrip("\r\n").split("\t")
+                if len(record) != columns:
+                    raise ValueError(f"a line has {len(record)} columns, not {columns}")
+                photograph, point, _, x, y, *_ = record
+                if photograph in photograph_of and point in point_of:
+                    photograph_index.append(photograph_of[photograph])
+                    point_index.append(point_of[point])
+                    xy.extend((float(x), float(y)))
+        except ValueError as error:
+            raise ValueError(f"{error}, after {len(xy) // 2} observations") from error
+    photograph = np.array(photograph_index, dtype=np.int64)
+    size = np.array([(lens.width, lens.height) for lens in lenses], dtype=np.float64).reshape(-1, 2)[photograph]
+    uv_px = np.array(xy, dtype=np.float64).reshape(-1, 2) * size.max(axis=1, keepdims=True, initial=0) + size / 2
+    return np.array(point_index, dtype=np.int64), photograph, uv_px
 
 
-def _observations(
-    tracks: _Tracks,
-    lenses: Sequence[Lens],
-    T_world_camera: Float64[np.ndarray, "V 3 4"],
-    xyz_world: Float64[np.ndarray, "P 3"],
-    rgb: UInt8[np.ndarray, "P 3"],
+def _inliers(
+    seen: Observations, lenses: Sequence[Lens], T_world_camera: Float64[np.ndarray, "V 3 4"]
 ) -> Observations | None:
     """The observations that OpenSfM accepted as inliers; None without any."""
-    sizes = np.array([(lens.width, lens.height) for lens in lenses], dtype=np.float64).reshape(-1, 2)
-    size = sizes[tracks.photograph_index]
-    uv_px = tracks.xy * size.max(axis=1, keepdims=True, initial=0) + size / 2
-    all_seen = Observations(xyz_world, tracks.point_index, tracks.photograph_index, uv_px, rgb)
-    good = np.zeros(len(uv_px), dtype=bool)
-    for lens, pose, mine in zip(lenses, T_world_camera, all_seen.by_photograph(len(lenses)), strict=True):
-        xyz_camera = (xyz_world[tracks.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
+    good = np.zeros(len(seen.uv_px), dtype=bool)
+    for lens, pose, mine in zip(lenses, T_world_camera, seen.by_photograph(len(lenses)), strict=True):
+        xyz_camera = (seen.xyz_world[seen.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
         with np.errstate(all="ignore"):  # points in the camera's plane, which are left out
-            off_px = np.linalg.norm(lens.project(xyz_camera) - uv_px[mine], axis=1)
+            off_px = np.linalg.norm(lens.project(xyz_camera) - seen.uv_px[mine], axis=1)
         good[mine] = (xyz_camera[:, 2] > 0) & (off_px <= _OUTLIER * max(lens.width, lens.height))
     if not good.any():
         return None
-    return replace(
-        all_seen,
-        point_index=tracks.point_index[good],
-        photograph_index=tracks.photograph_index[good],
-        uv_px=uv_px[good],
-    )
+    parts = {name: getattr(seen, name)[good] for name in ("point_index", "photograph_index", "uv_px")}
+    return replace(seen, **parts)
 
 
 def _reference(file: Path, reconstruction: Mapping[str, Any]) -> Reference | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,13 @@ from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
 
 
+def _no_indices() -> Int[np.ndarray, " O"]:
+    return np.zeros(0, dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class Observations:
-    """Sparse points and their observations, as on disk.
+    """Sparse points as on disk, and their observations; a cloud of points has none.
 
     Attributes:
         xyz_world: positions.
@@ -26,9 +30,9 @@ class Observations:
     """
 
     xyz_world: Float64[np.ndarray, "P 3"]
-    point_index: Int[np.ndarray, " O"]
-    photograph_index: Int[np.ndarray, " O"]
-    uv_px: Float64[np.ndarray, "O 2"]
+    point_index: Int[np.ndarray, " O"] = field(default_factory=_no_indices)
+    photograph_index: Int[np.ndarray, " O"] = field(default_factory=_no_indices)
+    uv_px: Float64[np.ndarray, "O 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     rgb: UInt8[np.ndarray, "P 3"] | None = None
 
     def by_photograph(self, photographs: int) -> list[Int[np.ndarray, " _"]]:
@@ -61,9 +65,7 @@ class PosedPhotographs:
         paths: the files; all exist.
         lenses: one per photograph. A photograph's file may have another size of the same aspect.
         T_world_camera: OpenCV axes (+x right, +y down, +z forward).
-        points: sparse points with observations, where the format has them.
-        cloud_world: points without observations, where the format has only those.
-        cloud_rgb: their colours, where the format has them.
+        points: sparse points, where the format has them; without observations, where it has only a cloud.
         near_far: z-depths, where the format states them.
         split: names of the training and the held-out photographs, where the format has a split.
         background_rgb: the background of photographs with alpha, where the format states it.
@@ -75,8 +77,6 @@ class PosedPhotographs:
     lenses: tuple[Lens, ...]
     T_world_camera: Float64[np.ndarray, "V 3 4"]
     points: Observations | None = None
-    cloud_world: Float64[np.ndarray, "P 3"] | None = None
-    cloud_rgb: UInt8[np.ndarray, "P 3"] | None = None
     near_far: Float64[np.ndarray, "V 2"] | None = None
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background_rgb: tuple[float, float, float] | None = None
@@ -92,25 +92,16 @@ def proper_rotations(
         SceneError: a pose is not finite, or not a rotation (R^T R = I within 1e-3, det R = +1).
     """
     rotation = T_world_camera[:, :, :3]
-    finite = np.isfinite(T_world_camera.reshape(-1, 12)).all(axis=1)
-    _refuse(np.flatnonzero(~finite), names, named_by, "the pose of {} has numbers that are not finite")
-    off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
-    _refuse(
-        np.flatnonzero((off > 1e-3) | (np.linalg.det(rotation) < 0)),
-        names,
-        named_by,
-        "the pose of {} is no rotation and position (its 3x3 part is scaled, skewed or mirrored)",
-    )
+    wrong, what = ~np.isfinite(T_world_camera).all(axis=(1, 2)), "has numbers that are not finite"
+    if not wrong.any():
+        off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
+        wrong = (off > 1e-3) | (np.linalg.det(rotation) < 0)
+        what = "is no rotation and position (its 3x3 part is scaled, skewed or mirrored)"
+    if wrong.any():
+        others = f" (and {wrong.sum() - 1} more)" if wrong.sum() > 1 else ""
+        raise SceneError(
+            f"{named_by}: the pose of {names[int(wrong.argmax())]}{others} {what}: expected a finite position and a "
+            "right-handed rotation, R^T R = I within 0.001; estimate the poses again, or remove the photograph"
+        )
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, T_world_camera[:, :, 3:]], axis=2).astype(np.float64)
-
-
-def _refuse(wrong: Int[np.ndarray, " W"], names: Sequence[str], named_by: Path, what: str) -> None:
-    if len(wrong) == 0:
-        return
-    first, count = names[int(wrong[0])], len(wrong)
-    others = f" (and {count - 1} more)" if count > 1 else ""
-    raise SceneError(
-        f"{named_by}: {what.format(first + others)}: expected a finite position and a right-handed rotation, "
-        "R^T R = I within 0.001; estimate the poses again, or remove the photograph"
-    )

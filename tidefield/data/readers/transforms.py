@@ -1,9 +1,9 @@
-"""Read `transforms.json` of nerfstudio and instant-ngp, and the Blender scenes of the original NeRF.
+"""Read and write `transforms.json` of nerfstudio and instant-ngp; read the Blender scenes of the original NeRF.
 
 Poses are camera-to-world with OpenGL's axes (+x right, +y up, -z forward). Calibration stands in a frame or, for all
-frames, at the top: fl_x, fl_y, cx, cy, w, h, k1, k2, k3, p1, p2, or camera_angle_x. nerfstudio's `applied_transform`
-has been applied to the poses and to the points of `ply_file_path` alike, so it is ignored here; instant-ngp's
-aabb_scale, scale and offset belong to its own grid.
+frames, at the top: fl_x, fl_y, cx, cy, w, h, k1, k2, k3, p1, p2, or camera_angle_x. The split is in `train_filenames`
+and the like. nerfstudio's `applied_transform` has been applied to the poses and to the points of `ply_file_path` alike,
+so it is ignored here; instant-ngp's aabb_scale, scale and offset belong to its own grid.
 (https://docs.nerf.studio/quickstart/data_conventions.html)
 
 Blender scenes have one file per part, `transforms_{train,val,test}.json`, and pictures of an object with alpha.
@@ -11,9 +11,11 @@ Blender scenes have one file per part, `transforms_{train,val,test}.json`, and p
 
 from __future__ import annotations
 
+import json
 import math
 import posixpath
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +23,20 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from tidefield.data.images import read_header
-from tidefield.data.ply import read_ply
-from tidefield.data.readers.files import inside, keep_present, number, read_json
-from tidefield.data.readers.posed import PosedPhotographs
+from tidefield.data.ply import read_ply, write_ply
+from tidefield.data.readers.files import inside, keep_present, number, parsing, read_json
+from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
+from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens
 
 # Blender cameras lie on a sphere around the object at the origin and point at it. The original NeRF samples from 2 to
 # 6 at a radius of 4.
 _BLENDER_NEAREST, _BLENDER_FARTHEST = 0.5, 1.5
 _WHITE = (1.0, 1.0, 1.0)
+_FILE, _CLOUD = "transforms.json", "sparse_pc.ply"
 _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
 
 def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
@@ -44,34 +49,17 @@ def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
         SceneError: the file is damaged, a lens is not a pinhole camera with Brown's distortion, or photographs are
             missing.
     """
-    file = root / "transforms.json"
+    file = root / _FILE
     top = read_json(file)
-    frames, paths = _frames(top, root, file)
     train, test = _listed(top, "train_filenames", file), _listed(top, "test_filenames", file)
     test = test or _listed(top, "val_filenames", file)
-    own_split = bool(train and test)
-    keys = [posixpath.normpath(frame["file_path"]) for frame in frames]
-    if own_split:
-        used = [i for i, key in enumerate(keys) if key in train or key in test]
-        frames, paths, keys = [frames[i] for i in used], [paths[i] for i in used], [keys[i] for i in used]
-    present = keep_present(paths, file, allow_missing)
-    frames, paths, keys = [frames[i] for i in present], [paths[i] for i in present], [keys[i] for i in present]
-    names = _names(root, paths)
-    cloud = _cloud(top, root, file, allow_missing)
-    return PosedPhotographs(
-        names=names,
-        paths=tuple(paths),
-        lenses=tuple(_lens({**top, **frame}, path, file) for frame, path in zip(frames, paths, strict=True)),
-        T_world_camera=_poses(frames, file),
-        cloud_world=None if cloud is None else cloud[0],
-        cloud_rgb=None if cloud is None else cloud[1],
-        split=(
-            frozenset(name for name, key in zip(names, keys, strict=True) if key in train),
-            frozenset(name for name, key in zip(names, keys, strict=True) if key in test and key not in train),
-        )
-        if own_split
-        else None,
-    )
+    split = (train, test - train) if train and test else None
+    keys, posed = _photographs(top, root, file, allow_missing, split and (split[0] | split[1]))
+    if split is not None:
+        named = dict(zip(keys, posed.names, strict=True))
+        train, test = (frozenset(named[key] for key in part if key in named) for part in split)
+        split = train, test
+    return replace(posed, points=_cloud(top, root, file, allow_missing), split=split)
 
 
 def read_blender(root: Path, allow_missing: bool) -> PosedPhotographs:
@@ -80,54 +68,52 @@ def read_blender(root: Path, allow_missing: bool) -> PosedPhotographs:
     Raises:
         SceneError: a file is damaged, or photographs are missing.
     """
-    parts = [root / "transforms_train.json"]
     held_out = [root / f"transforms_{part}.json" for part in ("test", "val")]
-    parts += [part for part in held_out if part.is_file()][:1]
-    names, paths, lenses, poses = [], [], [], []
-    for file in parts:
-        top = read_json(file)
-        frames, part_paths = _frames(top, root, file)
-        present = keep_present(part_paths, file, allow_missing)
-        frames, part_paths = [frames[i] for i in present], [part_paths[i] for i in present]
-        names.append(_names(root, part_paths))
-        paths += part_paths
-        lenses += [_lens({**top, **frame}, path, file) for frame, path in zip(frames, part_paths, strict=True)]
-        poses.append(_poses(frames, file))
-    T_world_camera = np.concatenate(poses)
+    files = [root / "transforms_train.json", *[file for file in held_out if file.is_file()][:1]]
+    parts = [_photographs(read_json(file), root, file, allow_missing)[1] for file in files]
+    T_world_camera = np.concatenate([part.T_world_camera for part in parts])
     distance = np.linalg.norm(T_world_camera[:, :, 3], axis=1)
+    train, *test = (frozenset(part.names) for part in parts)
     return PosedPhotographs(
-        names=sum(names, ()),
-        paths=tuple(paths),
-        lenses=tuple(lenses),
+        names=sum((part.names for part in parts), ()),
+        paths=sum((part.paths for part in parts), ()),
+        lenses=sum((part.lenses for part in parts), ()),
         T_world_camera=T_world_camera,
         near_far=np.stack([_BLENDER_NEAREST * distance, _BLENDER_FARTHEST * distance], axis=1),
-        split=(frozenset(names[0]), frozenset(names[1]) - frozenset(names[0])) if len(names) == 2 else None,
+        split=(train, test[0] - train) if test else None,
         background_rgb=_WHITE,
     )
 
 
-def _frames(top: Mapping[str, Any], root: Path, file: Path) -> tuple[list[dict[str, Any]], list[Path]]:
-    """The frames of a description, and their photographs' paths inside `root`; the suffix may be missing for PNG."""
+def _photographs(
+    top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool, wanted: frozenset[str] | None = None
+) -> tuple[list[str], PosedPhotographs]:
+    """The photographs of a description, or those wanted of them, and the normalised `file_path` of each."""
     frames = top.get("frames")
     if not isinstance(frames, list) or not all(
         isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
     ):
         raise SceneError(f"{file} has no list of frames with a file_path each: export it again")
-    paths = []
+    found = []
     for frame in frames:
-        path = inside(root, frame["file_path"], file)
-        as_png = inside(root, frame["file_path"] + ".png", file)
-        # r_0.5 may be a name without a suffix: the existing file decides.
-        paths.append(path if path.is_file() or (path.suffix and not as_png.is_file()) else as_png)
-    return frames, paths
-
-
-def _names(root: Path, paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names relative to root/images where all photographs lie there, else to root."""
+        path, as_png = (inside(root, frame["file_path"] + suffix, file) for suffix in ("", ".png"))
+        # The suffix may be missing for PNG. r_0.5 may be a name without a suffix: the existing file decides.
+        path = path if path.is_file() or (path.suffix and not as_png.is_file()) else as_png
+        key = posixpath.normpath(frame["file_path"])
+        if wanted is None or key in wanted:
+            found.append((key, path, frame))
+    found = [found[i] for i in keep_present([path for _, path, _ in found], file, allow_missing)]
+    paths = tuple(path for _, path, _ in found)
+    # Names are relative to root/images where all photographs lie there, else to root.
     base = root / "images"
     if not all(path.is_relative_to(base) for path in paths):
         base = root
-    return tuple(path.relative_to(base).as_posix() for path in paths)
+    return [key for key, _, _ in found], PosedPhotographs(
+        names=tuple(path.relative_to(base).as_posix() for path in paths),
+        paths=paths,
+        lenses=tuple(_lens({**top, **frame}, path, file) for _, path, frame in found),
+        T_world_camera=_poses([frame for _, _, frame in found], file),
+    )
 
 
 def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
@@ -154,7 +140,7 @@ def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
         fy=fx if fy is None else fy,
         cx=number(values, "cx", file, width / 2),
         cy=number(values, "cy", file, height / 2),
-        **{key: number(values, key, file, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")},
+        **{key: number(values, key, file, 0.0) for key in _DISTORTION},
     )
 
 
@@ -162,14 +148,17 @@ def _poses(frames: Sequence[Mapping[str, Any]], file: Path) -> Float64[np.ndarra
     """OpenCV camera-to-world poses of frames."""
     poses = np.zeros((len(frames), 3, 4))
     for i, frame in enumerate(frames):
-        try:
+        with parsing(file, f"a 4 x 4 transform_matrix of numbers for {frame['file_path']}; export it again"):
             matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-        except (TypeError, ValueError):
-            matrix = np.zeros(0)
-        if matrix.shape not in ((4, 4), (3, 4)):
-            raise SceneError(f"{file}: {frame['file_path']} has no 4 x 4 transform_matrix of numbers; export it again")
-        poses[i] = matrix[:3]
-    return poses * (1, -1, -1, 1)  # OpenGL's y and z axes point the other way
+            if matrix.shape not in ((4, 4), (3, 4)):
+                raise ValueError(f"it has an array of shape {matrix.shape}")
+            poses[i] = matrix[:3]
+    return _flip_axes(poses)
+
+
+def _flip_axes(T_world_camera: Float64[np.ndarray, "*V 3 4"]) -> Float64[np.ndarray, "*V 3 4"]:
+    """Convert poses between OpenCV's camera axes (+y down, +z forward) and OpenGL's (+y up, -z forward), either way."""
+    return T_world_camera * (1, -1, -1, 1)
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, file: Path) -> float | None:
@@ -190,15 +179,69 @@ def _listed(top: Mapping[str, Any], key: str, file: Path) -> frozenset[str]:
     return frozenset(map(posixpath.normpath, names))
 
 
-def _cloud(
-    top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None] | None:
+def _cloud(top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool) -> Observations | None:
     name = top.get("ply_file_path")
     if name is None:
         return None
     path = inside(root, str(name), file)
     if path.is_file():
-        return read_ply(path)
+        cloud = read_ply(path)
+        return cloud and Observations(cloud[0], rgb=cloud[1])
     if allow_missing:
         return None
     raise SceneError(f"{file} names the points {name}, which are missing: add them, or use --allow-missing")
+
+
+def write_transforms_file(
+    folder: Path,
+    files: Sequence[str],
+    lenses: Sequence[Lens],
+    T_world_camera: Float64[np.ndarray, "V 3 4"],
+    split: tuple[Sequence[int], Sequence[int]],
+    xyz_world: Float64[np.ndarray, "P 3"],
+    rgb: UInt8[np.ndarray, "P 3"],
+    *,
+    header: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write `transforms.json` and, if there are points, `sparse_pc.ply`.
+
+    A calibration that all photographs share is written once, at the top.
+
+    Args:
+        folder: the scene.
+        files: photographs, relative to the folder.
+        lenses: of each photograph.
+        T_world_camera: poses with OpenCV's axes.
+        split: indices of the training and of the held-out photographs.
+        xyz_world, rgb: the sparse points.
+        header: further entries at the top.
+        overwrite: replace existing files.
+
+    Raises:
+        RunError: a file exists already, or cannot be written.
+    """
+    calibrations = [_calibration(lens) for lens in lenses]
+    is_shared = len(set(lenses)) == 1
+    train, test = ([files[i] for i in part] for part in split)
+    top: dict[str, Any] = {"camera_model": "OPENCV", **(calibrations[0] if is_shared else {}), **(header or {})}
+    if len(xyz_world):
+        write_ply(folder / _CLOUD, xyz_world, rgb, overwrite)
+        top["ply_file_path"] = _CLOUD
+    top |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
+    top["frames"] = [
+        {
+            "file_path": file,
+            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            **({} if is_shared else calibration),
+        }
+        for file, pose, calibration in zip(files, _flip_axes(T_world_camera), calibrations, strict=True)
+    ]
+    with completed_file(folder / _FILE, overwrite=overwrite) as partial:
+        partial.write_text(json.dumps(top, indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _calibration(lens: Lens) -> dict[str, int | float]:
+    """The keys of a frame's lens."""
+    pinhole = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    return pinhole | {key: getattr(lens, key) for key in _DISTORTION}

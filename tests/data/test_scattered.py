@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
+from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.geometry.scattered import interpolate_on_pixels
 
 
 def around(width: int, height: int) -> np.ndarray:
@@ -41,11 +41,3 @@ def test_points_and_edges_on_the_centres_of_pixels() -> None:
             assert found[int(at[1]), int(at[0])] == pytest.approx(on[at], abs=1e-9)
         low, high = found.min(), found.max()
         assert values.min() - 1e-9 <= low <= high <= values.max() + 1e-9
-
-
-def test_a_plane_stays_a_plane() -> None:
-    random = np.random.default_rng(3)
-    uv = np.concatenate([around(50, 30), random.uniform(0, 1, (100, 2)) * [50, 30]])
-    pixels = pixel_grid(50, 30).double().numpy()
-    found = interpolate_on_pixels(uv, uv @ [0.3, -0.2] + 4, 50, 30)
-    np.testing.assert_allclose(found.ravel(), pixels @ [0.3, -0.2] + 4, atol=1e-9)
