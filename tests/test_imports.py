@@ -23,7 +23,7 @@ RANK = {
     "commands": 8,
     "cli": 9,
 }
-FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "parallel", "variants"}
+FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "parallel"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -10,8 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.compare import make_settings, print_lines, run_all
-from tidefield.config import PRESETS, Budget
-from tidefield.variants import vary
+from tidefield.config import PRESETS, Budget, vary
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -9,7 +9,7 @@ from typing import Any
 from tidefield.compare.results import Results
 from tidefield.compare.run import OTHER_SEED, WHOLE, Settings
 from tidefield.compare.tables import Table, shown, write_figures, write_tables
-from tidefield.variants import VARIANTS
+from tidefield.config import VARIANTS
 
 LEAST_DB = 0.05
 """A smaller difference counts as noise, even if two seeds happen to agree better."""

@@ -30,7 +30,7 @@ from tidefield.train.checkpoint import TrainingProgress
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
 KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
-"""What `tidefield.device.keep_large_allocations` does for us, as glibc takes it from the environment."""
+"""What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """A worker may take so long to end."""
 
