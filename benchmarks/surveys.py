@@ -135,7 +135,9 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
         found = [_run(folder, survey + suffix) for folder, suffix in columns.values()]
         for metric, title, style in MEASURED:
             rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])
-        rows.append([f"{survey}: steps of training", *(shown(result and result.steps, "{:,}") for result in found)])
+        rows.append(
+            [f"{survey}: steps of training", *(shown(result and result.trained("steps"), "{:,}") for result in found)]
+        )
     if not any(cell != NOTHING for row in rows for cell in row[1:]):
         return []
     text = (
