@@ -13,7 +13,7 @@ from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file
 from tidefield.methods import METHODS, names
-from tidefield.train.checkpoint import describe_weights, weights_sha256
+from tidefield.train.checkpoint import read_weights_file, weights_sha256
 from tidefield.train.stream import (
     EXPOSURE_ERROR,
     EXPOSURE_ERROR_SHARE,
@@ -53,7 +53,7 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
     """
-    preset = describe_weights(weights)["config"]["preset"]
+    preset = read_weights_file(weights)[0]["config"]["preset"]
     own = next(name for name in names("zero-shot") if METHODS[name].preset == preset)
     results = read_figures(comparison, SCENES, (own, *OTHERS))
     if not any(method == own for _, method in results.by):
@@ -67,7 +67,7 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
 
 def card(weights: Path, results: Results) -> str:
     """The whole card; the first of the results' methods is what the weights are called there."""
-    recorded = describe_weights(weights)
+    recorded, _ = read_weights_file(weights)
     unknown = [name for name in recorded["real"] if name not in LICENCES]
     if unknown:
         raise RunError(f"{weights} learned from {', '.join(unknown)}: expected scenes whose licences are known")
