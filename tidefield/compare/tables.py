@@ -11,7 +11,7 @@ from typing import Any
 
 from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
-from tidefield.evaluation.lpips import BACKBONES
+from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json, write_text
 from tidefield.machine import describe
@@ -132,7 +132,7 @@ def lpips_weights(results: Results) -> list[str]:
     }
     origin = {True: "the published file", False: "which is another file than the published one"}
     return [
-        f"LPIPS with {file}, {origin[sha256.startswith(file[-12:-4])]} (SHA-256 {sha256})."
+        f"LPIPS with {file}, {origin[sha256.startswith(hash_prefix(file))]} (SHA-256 {sha256})."
         for file, sha256 in sorted(found)
     ]
 

@@ -26,6 +26,7 @@ from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
+from tidefield.geometry.rays import intersect_axes
 from tidefield.render.nerfstudio_path import read_nerfstudio_path
 
 Vector = Float64[np.ndarray, "3"]
@@ -120,10 +121,7 @@ def make_trajectory(
     Args:
         path: `cameras`, `orbit`, `strip`, or a camera-path JSON as nerfstudio's viewer exports it.
         scene: its training cameras and sparse points determine the path.
-        frames: number of frames; a JSON has its own frames, size and speed, and these arguments are not used then.
-        width: of the frames, pixels.
-        height: likewise.
-        frames_per_second: of the video.
+        frames, width, height, frames_per_second: of the video, pixels; a JSON has its own instead.
 
     Raises:
         TidefieldError: the name is none of these, or the file cannot be read as a camera path.
@@ -256,11 +254,10 @@ def _distance(scene: Scene) -> float:
 
 def _focus(position: Positions, ahead: Positions) -> Vector | None:
     """Return the point nearest to all optical axes if these meet in front of the cameras (Blender, turntables)."""
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    if np.linalg.eigvalsh(across.mean(0))[0] < 0.02:
+    focus = intersect_axes(position, ahead)
+    if focus is None:
         return None
-    focus = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, position))
-    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, focus - position), axis=1)
+    missed = np.linalg.norm(np.cross(focus - position, ahead), axis=1)
     spread = np.linalg.norm(position - position.mean(0), axis=1)
     in_front = ((focus - position) * ahead).sum(1) > 0
     meets = np.median(missed) < 0.25 * np.median(spread) and in_front.mean() > 0.9
