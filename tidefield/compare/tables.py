@@ -102,15 +102,6 @@ def shown(value: float | int | None, style: str) -> str:
     return NOTHING if value is None else style.format(value)
 
 
-def all_tables(results: Results) -> list[Table]:
-    """The paper's tables where the scenes are among its, then every metric, then time and memory."""
-    papers = (
-        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
-        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
-    )
-    return [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
-
-
 def missing_metrics(results: Results) -> list[str]:
     """Why some metrics have no value, as sentences."""
     missing: dict[str, list[str]] = {}
@@ -236,7 +227,13 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     from tidefield.compare.figures import side_by_side, write_curves
     from tidefield.data.load import load_scene
 
-    files = write_tables("tables", "Comparison", all_tables(results), [], results, settings, out)
+    # The paper's tables where the scenes are among its, then every metric, then time and memory.
+    papers = (
+        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
+        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
+    )
+    tables = [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
+    files = write_tables("tables", "Comparison", tables, [], results, settings, out)
     files.append(write_figures("comparison", results, settings, out))
     for name, path in scenes.items():
         figure = side_by_side(results, name, load_scene(path, width=settings.width))

@@ -213,7 +213,7 @@ def orbit(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
             radius = abs(height) * np.clip(narrow / max(abs(height), 1e-9), 0.1, np.tan(STEEPEST))
         around = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
         position = layout.centre + radius * around + height * layout.up
-    return position, _look_along(layout.centre - position, layout.up)
+    return position, look_along(layout.centre - position, layout.up)
 
 
 def strip(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
@@ -232,7 +232,7 @@ def strip(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
             middle = ends * axis + np.median(layout.position @ side) * side
             middle = middle + (layout.position @ layout.up).mean() * layout.up
     position = middle + reach * np.linspace(-half, half, frames)[:, None] * axis
-    return position, _look_along(np.broadcast_to(ahead, position.shape), up)
+    return position, look_along(np.broadcast_to(ahead, position.shape), up)
 
 
 SHAPES: dict[str, Shape] = {"cameras": among_cameras, "orbit": orbit, "strip": strip}
@@ -312,7 +312,7 @@ def _flight(layout: Layout, frames: int, reach: float) -> Poses:
     position = at[:, None] * axis + aside[:, None] * side + (near @ height)[:, None] * layout.up
     heading = np.gradient(at)[:, None] * axis + np.gradient(aside)[:, None] * side
     heading = (heading / np.linalg.norm(heading, axis=1, keepdims=True))[1:-1]
-    return position[1:-1], _look_along(np.sin(AHEAD) * heading - np.cos(AHEAD) * layout.up, heading)
+    return position[1:-1], look_along(np.sin(AHEAD) * heading - np.cos(AHEAD) * layout.up, heading)
 
 
 def _spline(position: Positions, rotation: Rotations) -> Poses:
@@ -360,7 +360,7 @@ def _within_azimuths(
     return start + (2 * np.pi - gap[widest]) * (1 - np.cos(turn)) / 2
 
 
-def _look_along(forward: Positions, up: Vector | Positions) -> Rotations:
+def look_along(forward: Positions, up: Vector | Positions) -> Rotations:
     """Return camera-to-world rotations that look along `forward` with `up` upwards in the picture."""
     ahead = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(ahead, up)

@@ -59,12 +59,8 @@ RECOLOURED_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters of a procedural scene; equal recipes make equal scenes.
-
-    Attributes:
-        category, seed, views, width, flight: of the survey.
-        misposed: photographs with a wrong attitude, as structure from motion sometimes gives.
-    """
+    """Parameters of a procedural survey, and which of its photographs have a wrong attitude, as structure from motion
+    sometimes gives; equal recipes make equal scenes."""
 
     category: str
     seed: int
