@@ -16,7 +16,7 @@ from typing import Any, Literal
 import tyro
 
 from tidefield.errors import RunError, TidefieldError
-from tidefield.machine import spin_briefly
+from tidefield.machine import tune_process
 
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
@@ -47,17 +47,16 @@ def speed(
     """
     if quick and runs is not None:
         raise RunError("--quick was given with --runs: such figures are not worth storing; leave one of them out")
-    spin_briefly()
+    tune_process()
     from rich.console import Console
 
     from benchmarks.speed import QUICK, Effort, measure_speed
     from benchmarks.table import speed_tables
     from tidefield.config import PRESETS
-    from tidefield.device import choose_device, keep_large_allocations
+    from tidefield.device import choose_device
     from tidefield.files import write_json
     from tidefield.machine import describe
 
-    keep_large_allocations()
     where, console = choose_device(device), Console()
     effort = QUICK if quick else Effort()
     with tempfile.TemporaryDirectory() as folder:
@@ -106,12 +105,11 @@ def frames(
         weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
         device: auto, cpu, cuda, cuda:N or mps.
     """
-    spin_briefly()
+    tune_process()
     from benchmarks.frames import measure_frames
     from benchmarks.table import frame_tables
-    from tidefield.device import choose_device, keep_large_allocations
+    from tidefield.device import choose_device
 
-    keep_large_allocations()
     record = measure_frames(scene, runs, preset, weights, str(choose_device(device)))
     for table in frame_tables(record):
         print(table.markdown(), end="\n\n")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from benchmarks.table import SCENES, marked, notes
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.tables import Table, lpips_weights, shown
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
-from tidefield.files import completed_file
+from tidefield.files import write_text
 from tidefield.methods import METHODS, names
-from tidefield.train.checkpoint import describe_weights, weights_sha256
+from tidefield.train.checkpoint import read_weights_file, weights_sha256
 from tidefield.train.stream import (
     EXPOSURE_ERROR,
     EXPOSURE_ERROR_SHARE,
@@ -53,21 +52,20 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
     """
-    preset = describe_weights(weights)["config"]["preset"]
+    preset = read_weights_file(weights)[0]["config"]["preset"]
     own = next(name for name in names("zero-shot") if METHODS[name].preset == preset)
     results = read_figures(comparison, SCENES, (own, *OTHERS))
     if not any(method == own for _, method in results.by):
         files = ", ".join(map(str, comparison))
         raise RunError(f"{files} hold no {own} results: expected some; run `tidefield compare` with them")
     out = weights.with_suffix(".md")
-    with completed_file(out, overwrite=True) as partial:
-        partial.write_text(card(weights, results), encoding="utf-8")
+    write_text(out, card(weights, results))
     return out
 
 
 def card(weights: Path, results: Results) -> str:
     """The whole card; the first of the results' methods is what the weights are called there."""
-    recorded = describe_weights(weights)
+    recorded, _ = read_weights_file(weights)
     unknown = [name for name in recorded["real"] if name not in LICENCES]
     if unknown:
         raise RunError(f"{weights} learned from {', '.join(unknown)}: expected scenes whose licences are known")
@@ -76,6 +74,9 @@ def card(weights: Path, results: Results) -> str:
     named = f" --real {' '.join(recorded['real'])}" if recorded["real"] else ""
     count = recorded["processes"]
     launch = "tidefield" if count == 1 else f"torchrun --nproc-per-node {count} -m tidefield.cli"
+    points = recorded["validation"]
+    kinds = list(points[0]["psnr"]) if points else []
+    curve = [(f"{point['step']:,}", *(f"{point['psnr'][kind]:.2f}" for kind in kinds)) for point in points]
     parts = [
         f"# Weights of the preset {preset}",
         f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, "
@@ -99,7 +100,7 @@ def card(weights: Path, results: Results) -> str:
         f"    {launch} pretrain OUT{named} --preset {preset} --steps {recorded['steps']} --seed {recorded['seed']}",
         "PSNR in dB on scenes that nothing is learned from (of the real ones, their held-out photographs), two small "
         "views of each:",
-        _curve(recorded["validation"]).markdown(),
+        Table("", ["step", *kinds], curve).markdown(),
         "## What they achieve",
         "Zero-shot, means over the held-out photographs; `docs/results.md` says how the others were trained.",
         *notes(results),
@@ -109,12 +110,6 @@ def card(weights: Path, results: Results) -> str:
         "Apache-2.0, as Tidefield itself.",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _curve(points: list[Mapping[str, Any]]) -> Table:
-    kinds = list(points[0]["psnr"]) if points else []
-    rows = [(f"{point['step']:,}", *(f"{point['psnr'][kind]:.2f}" for kind in kinds)) for point in points]
-    return Table("", ["step", *kinds], rows)
 
 
 def _quality(results: Results) -> list[Table]:

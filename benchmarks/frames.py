@@ -10,6 +10,7 @@ What is measured:
 
 from __future__ import annotations
 
+import math
 import statistics
 import tempfile
 import time
@@ -51,15 +52,9 @@ def measure_frames(
     device: str,
     run: Runner = run_measured,
 ) -> dict[str, Any]:
-    """Measure all of it, store it as RUNS/frames.json and return it.
+    """Measure all of it for the scene in a folder, store it as RUNS/frames.json and return it.
 
-    Args:
-        folder: of the scene.
-        runs: where the result goes.
-        preset: which network.
-        given: its weights; those that came with Tidefield if None.
-        device: where to render.
-        run: runs a command.
+    `given` are the network's weights; those that came with Tidefield if None. `run` runs a command.
     """
     scene, weights = load_scene(folder), given_or_shipped(given, preset)
     name = scene.names[(scene.test or scene.train)[0]]
@@ -121,9 +116,7 @@ def among_copies(scene: Scene, count: int) -> Scene:
     """The scene's survey in a grid of copies of itself, side by side, that has `count` photographs."""
     own, points = len(scene.names), scene.points
     copies = -(-count // own)
-    side = 1
-    while side * side < copies:
-        side += 1
+    side = math.isqrt(copies - 1) + 1
     spread = scene.cameras.position_world - scene.cameras.position_world.mean(0)
     across = torch.linalg.svd(spread, full_matrices=False).Vh[:2]  # the plane that was flown in
     steps = torch.tensor([[k % side, k // side] for k in range(copies)]).float()

@@ -7,7 +7,6 @@ by the measured process, as on a machine that sees the scene for the first time.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from multiprocessing import get_context
@@ -29,34 +28,20 @@ def measure_memory(
     photographs: int,
     device: str,
     run: Runner = run_measured,
-    prepare: Callable[[Path, str, int, int], str] | None = None,
 ) -> dict[str, Any]:
     """Render in a process of its own, store its time and memory as RUNS/memory.json and return them.
 
-    Args:
-        runs: where the result goes; the scene lies there as long as it is needed.
-        preset: of the fresh network.
-        width: of photographs and frame; the height is three quarters of it.
-        photographs: of the scene.
-        device: where to render.
-        run: runs the command.
-        prepare: makes the run that is rendered, and names a held-out photograph.
+    The scene lies in `runs` as long as it is needed. The height of photographs and frame is three quarters of their
+    width. `run` runs the command.
     """
     runs.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=runs, prefix=".memory-") as folder:
         work = Path(folder)
-        name = (prepare or _in_another_process)(work, preset, width, photographs)
-        command = [
-            "render",
-            str(work / "run"),
-            str(work / "frame.png"),
-            "--camera",
-            name,
-            "--device",
-            device,
-            "--quiet",
-        ]
-        usage = run(tidefield(*command), {"XDG_CACHE_HOME": str(work / "cache")})
+        # In another process, whose memory the measured one is not charged with.
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            name = pool.submit(make_run, work, preset, width, photographs).result()
+        command = tidefield("render", work / "run", work / "frame.png", "--camera", name, "--device", device, "--quiet")
+        usage = run(command, {"XDG_CACHE_HOME": str(work / "cache")})
     record = {
         "preset": preset,
         "size_px": [width, width * 3 // 4],
@@ -99,9 +84,3 @@ def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
     SceneTrainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
     write_run(work / "run", Run(folder.resolve(), None, 0, PRESETS[preset]))
     return scene.names[scene.test[-1]]
-
-
-def _in_another_process(work: Path, preset: str, width: int, photographs: int) -> str:
-    """`make_run`, without its memory in this process, which the measured one would be charged with."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(make_run, work, preset, width, photographs).result()

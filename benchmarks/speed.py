@@ -18,7 +18,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
@@ -64,34 +64,6 @@ class Effort:
 QUICK = Effort(seconds=0.1, least=1, rays=1024)
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How fast one kind of work goes.
-
-    Attributes:
-        rays_per_second: median of the runs.
-        runs: how many.
-        rays: of each run.
-        flops_per_ray: counted arithmetic.
-        seconds_per_ray: by stage.
-    """
-
-    rays_per_second: float
-    runs: int
-    rays: int
-    flops_per_ray: float
-    seconds_per_ray: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Speed:
-    """Of one preset; encoding is that of a whole photograph, for rendering."""
-
-    training: Pace
-    rendering: Pace
-    encoding_seconds: float
-
-
 def measure_speed(
     scene: Scene, configs: Mapping[str, Config], device: torch.device, effort: Effort, say: Callable[[str], object]
 ) -> dict[str, Any]:
@@ -99,36 +71,46 @@ def measure_speed(
 
     Args:
         scene: to train on and to render.
-        configs: by preset; `paper` and `swift` are compared if both are there.
+        configs: of `paper` and `swift`.
         device: where to compute.
         effort: spent on each figure.
         say: reports progress.
     """
     say("peak arithmetic of this machine ...")
-    ceilings = measure_ceilings(device, effort.seconds / 8)
-    speeds = {}
+    ceilings = {
+        f"{name}_flops": product_rate(dtype, device, effort.seconds / 8)
+        for name, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16))
+    }
+    presets: dict[str, dict[str, Any]] = {}
     for preset, config in configs.items():
         trainer = SceneTrainer(config, scene, 0, device)
         say(f"{preset}: training ...")
         training = measure_training(trainer, effort)
         say(f"{preset}: rendering ...")
-        speeds[preset] = Speed(training, *measure_rendering(trainer, effort))
-    ratios = {}
-    if {"paper", "swift"} <= speeds.keys():
-        for kind in ("training", "rendering"):
-            paper, swift = (getattr(speeds[preset], kind).rays_per_second for preset in ("paper", "swift"))
-            ratios[kind] = swift / paper
+        rendering, encoding_seconds = measure_rendering(trainer, effort)
+        presets[preset] = {"training": training, "rendering": rendering, "encoding_seconds": encoding_seconds}
+        presets[preset]["shares"] = {
+            kind: {
+                number: pace["rays_per_second"] * pace["flops_per_ray"] / ceilings[f"{number}_flops"]
+                for number in ("float32", "bfloat16")
+            }
+            for kind, pace in (("training", training), ("rendering", rendering))
+        }
+    ratios = {
+        kind: presets["swift"][kind]["rays_per_second"] / presets["paper"][kind]["rays_per_second"]
+        for kind in ("training", "rendering")
+    }
     return {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
         "threads": torch.get_num_threads(),
         "photographs": {"count": len(scene.names), "width": int(scene.cameras.size_px[:, 0].max())},
         "ceilings": ceilings,
-        "presets": {preset: asdict(speed) | _shares(speed, ceilings) for preset, speed in speeds.items()},
+        "presets": presets,
         "ratios": ratios,
     }
 
 
-def measure_training(trainer: SceneTrainer, effort: Effort) -> Pace:
+def measure_training(trainer: SceneTrainer, effort: Effort) -> dict[str, Any]:
     """Steps of training, batches included."""
     device, rays = trainer.device, trainer.rays_per_step
     for index in trainer.scene.train:
@@ -138,16 +120,10 @@ def measure_training(trainer: SceneTrainer, effort: Effort) -> Pace:
     with stage_clock(trainer.network, device, trainer.optimizer) as clock:
         for _ in range(effort.least):
             trainer.step(BUDGET)
-    return Pace(
-        rays_per_second=rays / statistics.median(times),
-        runs=len(times),
-        rays=rays,
-        flops_per_ray=flops_of(lambda: trainer.step(BUDGET)) / rays,
-        seconds_per_ray={stage: seconds / (rays * effort.least) for stage, seconds in clock.seconds.items()},
-    )
+    return _pace(times, rays, flops_of(lambda: trainer.step(BUDGET)) / rays, clock, rays * effort.least)
 
 
-def measure_rendering(trainer: SceneTrainer, effort: Effort) -> tuple[Pace, float]:
+def measure_rendering(trainer: SceneTrainer, effort: Effort) -> tuple[dict[str, Any], float]:
     """A part of a photograph's camera, and the seconds that encoding one photograph takes."""
     device, scene, network = trainer.device, trainer.scene, trainer.network.eval()
     renderer = Renderer(network, scene, trainer.config, device)
@@ -163,14 +139,19 @@ def measure_rendering(trainer: SceneTrainer, effort: Effort) -> tuple[Pace, floa
         fresh(view)
     encoding = clock.seconds.pop(ENCODING, 0.0)
     small = window(camera, SQUARE_PX**2)
-    pace = Pace(
-        rays_per_second=rays / statistics.median(times),
-        runs=len(times),
-        rays=rays,
-        flops_per_ray=flops_of(lambda: renderer(small)) / (small.width * small.height),
-        seconds_per_ray={stage: seconds / rays for stage, seconds in clock.seconds.items()},
-    )
-    return pace, encoding / max(clock.photographs, 1)
+    flops_per_ray = flops_of(lambda: renderer(small)) / (small.width * small.height)
+    return _pace(times, rays, flops_per_ray, clock, rays), encoding / max(clock.photographs, 1)
+
+
+def _pace(times: list[float], rays: int, flops_per_ray: float, clock: Clock, clocked_rays: int) -> dict[str, Any]:
+    """How fast runs of so many rays were, of which the clock had others."""
+    return {
+        "rays_per_second": rays / statistics.median(times),
+        "runs": len(times),
+        "rays": rays,
+        "flops_per_ray": flops_per_ray,
+        "seconds_per_ray": {stage: seconds / clocked_rays for stage, seconds in clock.seconds.items()},
+    }
 
 
 def window(camera: Cameras, rays: int) -> Cameras:
@@ -189,15 +170,6 @@ def _repeated(action: Callable[[], object], device: torch.device, effort: Effort
     while len(times) < effort.least or (sum(times) < effort.seconds and len(times) < effort.most):
         times.append(timed(action, device))
     return times
-
-
-def _shares(speed: Speed, ceilings: Mapping[str, float]) -> dict[str, dict[str, dict[str, float]]]:
-    """The share of the machine's peak arithmetic that is reached, by kind of work and of number."""
-    shares = {}
-    for kind, pace in (("training", speed.training), ("rendering", speed.rendering)):
-        flops = pace.rays_per_second * pace.flops_per_ray
-        shares[kind] = {number: flops / ceilings[f"{number}_flops"] for number in ("float32", "bfloat16")}
-    return {"shares": shares}
 
 
 class Clock:
@@ -278,32 +250,22 @@ def flops_of(action: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def measure_ceilings(device: torch.device, seconds: float) -> dict[str, float]:
-    """Measure the arithmetic per second in products of large matrices; spends about `seconds` on each kind."""
-    kinds = {"float32_flops": torch.float32, "bfloat16_flops": torch.bfloat16}
-    return {name: _product_rate(dtype, device, seconds) for name, dtype in kinds.items()}
+def product_rate(dtype: torch.dtype, device: torch.device, seconds: float) -> float:
+    """Measure the arithmetic per second in products of matrices as large as the time, about `seconds`, allows."""
 
+    def best(side: int, seconds: float) -> float:
+        """The shortest of as many runs as the time allows, at least one, after a warm-up."""
+        matrix = torch.rand(side, side, device=device).to(dtype)
+        timed(lambda: matrix @ matrix, device)
+        times = [timed(lambda: matrix @ matrix, device)]
+        while sum(times) < seconds:
+            times.append(timed(lambda: matrix @ matrix, device))
+        return min(times)
 
-def _product_rate(dtype: torch.dtype, device: torch.device, seconds: float) -> float:
-    """Of square matrices as large as the time allows."""
     side = 256
-    while side < LARGEST_SIDE and _best(_product(side, dtype, device), device, 0.0) < seconds / 16:
+    while side < LARGEST_SIDE and best(side, 0.0) < seconds / 16:
         side *= 2
-    return 2 * side**3 / _best(_product(side, dtype, device), device, seconds)
-
-
-def _product(side: int, dtype: torch.dtype, device: torch.device) -> Callable[[], Tensor]:
-    matrix = torch.rand(side, side, device=device).to(dtype)
-    return lambda: matrix @ matrix
-
-
-def _best(action: Callable[[], object], device: torch.device, seconds: float) -> float:
-    """The shortest of as many runs as the time allows, at least one, after a warm-up."""
-    timed(action, device)
-    times = [timed(action, device)]
-    while sum(times) < seconds:
-        times.append(timed(action, device))
-    return min(times)
+    return 2 * side**3 / best(side, seconds)
 
 
 def synchronise(device: torch.device) -> None:

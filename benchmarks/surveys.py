@@ -19,7 +19,7 @@ from tidefield.compare.results import Result, read_results
 from tidefield.compare.run import WHOLE, Runner, tidefield
 from tidefield.compare.tables import NOTHING, Table, shown
 from tidefield.errors import SurveyError
-from tidefield.files import completed_file, read_json, write_json
+from tidefield.files import read_json, write_json, write_text
 from tidefield.machine import describe
 
 UNCORRECTED = "_uneven"
@@ -106,8 +106,7 @@ def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready:
         '`make bench ARGS="surveys --photographs PHOTOS --runs RUNS --prepared COMPARISON --ready COMPARISON"` '
         "wrote this page; nothing is typed by hand.",
     ]
-    with completed_file(out, overwrite=True) as partial:
-        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    write_text(out, "\n\n".join(parts) + "\n")
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -135,7 +134,9 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
         found = [_run(folder, survey + suffix) for folder, suffix in columns.values()]
         for metric, title, style in MEASURED:
             rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])
-        rows.append([f"{survey}: steps of training", *(shown(result and result.steps, "{:,}") for result in found)])
+        rows.append(
+            [f"{survey}: steps of training", *(shown(result and result.trained("steps"), "{:,}") for result in found)]
+        )
     if not any(cell != NOTHING for row in rows for cell in row[1:]):
         return []
     text = (
@@ -191,48 +192,37 @@ def _colour(record: dict[str, Any], when: str) -> str | None:
 
 
 def _time(records: dict[str, dict[str, Any]]) -> Table:
-    columns = ["", *records]
-    rows: list[list[str]] = []
     from tidefield.survey.prepare import STAGES
 
+    rows: list[list[str]] = []
     reports = [record["report"] for record in records.values()]
     times = [{} if report is None else report["processing_statistics"]["steps_times"] for report in reports]
     for stage in STAGES:
         cells = [f"{of[stage]:.0f}" if stage in of else NOTHING for of in times]
         rows.append([f"prepare: {stage}, s", *cells])
-    rows.append(["prepare: all, s", *(_seconds(r["usage"]) for r in records.values())])
-    rows.append(["prepare: peak memory, GB", *(_memory(r["usage"]) for r in records.values())])
+    usages = [record["usage"] for record in records.values()]
+    rows.append(["prepare: all, s", *(shown(of and of["seconds"], "{:.0f}") for of in usages)])
+    memory = [shown(of and of["peak_memory_bytes"] / 1e9, "{:.1f}") for of in usages]
+    rows.append(["prepare: peak memory, GB", *memory])
     others = [record["exhaustive"] for record in records.values()]
 
-    def other(title: str, value: Callable[[dict[str, Any]], str]) -> None:
+    def row(title: str, value: Callable[[dict[str, Any]], str]) -> None:
         rows.append([f"exhaustive: {title}", *(NOTHING if o is None else value(o) for o in others)])
 
-    other("pairs matched", lambda o: f"{o['pairs']:,}")
+    row("pairs matched", lambda o: f"{o['pairs']:,}")
     for stage in ("features", "matches", "poses"):
-        other(f"{stage}, s", lambda o, stage=stage: f"{o['seconds'][stage]:.0f}" if stage in o["seconds"] else NOTHING)
-    other("all of these, s", lambda o: f"{_whole(o):.0f}")
-    other("photographs placed", lambda o: f"{o['registered']} of {o['photographs']}" if "registered" in o else NOTHING)
-    other("focal length, px", lambda o: ", ".join(f"{f:.0f}" for f in o.get("focal_px", ())) or NOTHING)
-    ratios = [
-        NOTHING
-        if r["usage"] is None or r["exhaustive"] is None
-        else f"{_whole(r['exhaustive']) / r['usage']['seconds']:.1f}"
-        for r in records.values()
-    ]
+        row(f"{stage}, s", lambda o, stage=stage: f"{o['seconds'][stage]:.0f}" if stage in o["seconds"] else NOTHING)
+    row("all of these, s", lambda o: f"{_whole(o):.0f}")
+    row("photographs placed", lambda o: f"{o['registered']} of {o['photographs']}" if "registered" in o else NOTHING)
+    row("focal length, px", lambda o: ", ".join(f"{f:.0f}" for f in o.get("focal_px", ())) or NOTHING)
+    pairs = zip(usages, others, strict=True)
+    ratios = [shown(usage and other and _whole(other) / usage["seconds"], "{:.1f}") for usage, other in pairs]
     rows.append(["exhaustive / prepare", *ratios])
-    return Table("Time", columns, rows)
+    return Table("Time", ["", *records], rows)
 
 
 def _whole(exhaustive: dict[str, Any]) -> float:
     return sum(exhaustive["seconds"].values())
-
-
-def _seconds(usage: dict[str, Any] | None) -> str:
-    return NOTHING if usage is None else f"{usage['seconds']:.0f}"
-
-
-def _memory(usage: dict[str, Any] | None) -> str:
-    return NOTHING if usage is None else f"{usage['peak_memory_bytes'] / 1e9:.1f}"
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from tidefield.compare.ablation import ablation_tables, summarise, variants
 from tidefield.compare.results import Result, Results, read_figures
 from tidefield.compare.run import WHOLE
 from tidefield.compare.tables import (
+    NOTHING,
     REGIONS,
     TABLE_3,
     Table,
@@ -26,7 +27,7 @@ from tidefield.compare.tables import (
 )
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
-from tidefield.files import completed_file, read_json
+from tidefield.files import read_json, write_text
 from tidefield.machine import describe
 from tidefield.methods import names
 
@@ -84,14 +85,7 @@ class Stored:
 def write_page(
     comparison: Sequence[Path], ablation: Sequence[Path], lengths: Sequence[Path], runs: Path, out: Path
 ) -> None:
-    """Read the stored measurements and write the page as Markdown.
-
-    Args:
-        comparison: files of `tidefield compare`.
-        ablation: files of `tidefield ablate`.
-        lengths: files of `tidefield compare` with other lengths of training, and from scratch.
-        runs: folder of the benchmarks.
-        out: the page.
+    """Read the stored measurements and write the page as Markdown; `lengths` are comparisons with other trainings.
 
     Raises:
         RunError: when there is no measurement at all.
@@ -105,8 +99,7 @@ def write_page(
             f"{files} hold no results: expected files of `tidefield compare`, `tidefield ablate` and the benchmarks; "
             "run them"
         )
-    with completed_file(out, overwrite=True) as partial:
-        partial.write_text(page(compared, ablated, others, stored), encoding="utf-8")
+    write_text(out, page(compared, ablated, others, stored))
 
 
 def page(compared: Results, ablated: Results, others: Sequence[Results], stored: Stored) -> str:
@@ -309,17 +302,13 @@ def _stage_table(presets: Mapping[str, Any]) -> Table:
     kinds = [(preset, kind) for kind in ("training", "rendering") for preset in ("paper", "swift")]
     columns = [presets[preset][kind]["seconds_per_ray"] for preset, kind in kinds]
     stages = dict.fromkeys(stage for column in columns for stage in column)
-    rows = [(stage, *(shown(_micro(c.get(stage)), "{:.1f}") for c in columns)) for stage in stages]
+    rows = [(stage, *(f"{1e6 * c[stage]:.1f}" if stage in c else NOTHING for c in columns)) for stage in stages]
     rows.append(("sum", *(f"{sum(column.values()) * 1e6:.1f}" for column in columns)))
     return Table(
         "Where the time goes, microseconds per ray, with all cores on one task after another",
         ["stage", *map(" ".join, kinds)],
         rows,
     )
-
-
-def _micro(seconds: float | None) -> float | None:
-    return None if seconds is None else seconds * 1e6
 
 
 def frame_tables(frames: Mapping[str, Any]) -> list[Table]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tidefield import methods
-from tidefield.config import PRESETS, AnyConfig
+from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device
@@ -72,7 +72,8 @@ class OpenRun:
         self.close()
 
     def __repr__(self) -> str:
-        return f"OpenRun({self.folder.name!r}, {_name(self.config)}, {self.steps:,} steps)"
+        name = getattr(self.config, "preset", self.config.method)
+        return f"OpenRun({self.folder.name!r}, {name}, {self.steps:,} steps)"
 
 
 def open_run(folder: str | Path, device: str = "auto") -> OpenRun:
@@ -88,7 +89,3 @@ def open_run(folder: str | Path, device: str = "auto") -> OpenRun:
         DeviceError: the device is not on this machine.
     """
     return OpenRun(Path(folder), device)
-
-
-def _name(config: AnyConfig) -> str:
-    return getattr(config, "preset", config.method)

@@ -16,7 +16,7 @@ import tyro
 from tidefield import __version__
 from tidefield.commands import ablate, baselines, compare, demo, evaluate, import_, prepare, pretrain, render, train
 from tidefield.errors import TidefieldError
-from tidefield.machine import spin_briefly
+from tidefield.machine import tune_process
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -93,11 +93,9 @@ def _require_command(words: list[str]) -> None:
 
 def _set_up(verbosity: Verbosity) -> Console:
     """Set up messages; returns the console that commands print to."""
-    spin_briefly()
+    tune_process()
     from rich.console import Console
     from rich.logging import RichHandler
-
-    from tidefield.device import keep_large_allocations
 
     console = Console(quiet=verbosity.quiet)
     level = logging.ERROR if verbosity.quiet else logging.DEBUG if verbosity.verbose else logging.INFO
@@ -107,7 +105,6 @@ def _set_up(verbosity: Verbosity) -> Console:
         handler, form = RichHandler(console=terminal, show_path=False, show_level=False), "%(message)s"
     logging.basicConfig(level=logging.WARNING, format=form, datefmt="%H:%M:%S", handlers=[handler], force=True)
     logging.getLogger("tidefield").setLevel(level)
-    keep_large_allocations()
     return console
 
 

@@ -1,4 +1,4 @@
-"""Presets and what they are made of: plain values, no behaviour, no heavy imports.
+"""Presets, what they are made of, and their variants: plain values, no heavy imports.
 
 A run stores its `Config` as JSON next to its weights; `config_from_json` reads it back.
 """
@@ -8,7 +8,9 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from tidefield.errors import RunError
@@ -168,9 +170,6 @@ SWIFT = Config(
 PRESETS = {"paper": PAPER, "swift": SWIFT}
 
 
-DEFAULT_MINUTES = 10.0
-
-
 @dataclass(frozen=True)
 class Budget:
     """How long to train: minutes or steps."""
@@ -181,14 +180,14 @@ class Budget:
     """Steps of training, instead of minutes."""
 
     def checked(self) -> Budget:
-        """This budget, or the default of ten minutes where nothing is given.
+        """This budget, or ten minutes where nothing is given.
 
         Raises:
             RunError: both minutes and steps are given.
         """
         if self.minutes is not None and self.steps is not None:
             raise RunError("both --minutes and --steps are given: expected one of them; leave one out")
-        return Budget(minutes=DEFAULT_MINUTES) if self.minutes is None and self.steps is None else self
+        return Budget(minutes=10.0) if self.minutes is None and self.steps is None else self
 
     def share(self, step: int, seconds: float) -> float:
         """Share of the budget that is used, 0 to 1."""
@@ -206,6 +205,44 @@ def warm_start(config: Config) -> Config:
     """
     train = dataclasses.replace(config.train, warm_up=4 * config.train.warm_up)
     return dataclasses.replace(config, train=train)
+
+
+def vary(config: Config, name: str) -> AnyConfig:
+    """The variant of that name: one part changed or left out, for the ablation.
+
+    Raises:
+        RunError: there is none.
+    """
+    if name not in VARIANTS:
+        raise RunError(f"there is no variant {name}: expected one of {', '.join(VARIANTS)}")
+    return VARIANTS[name](config)
+
+
+def _network(config: Config, **changes: Any) -> Config:
+    return dataclasses.replace(config, network=dataclasses.replace(config.network, **changes))
+
+
+def _without(config: Config, part: Part) -> Config:
+    return _network(config, without=(*config.network.without, part))
+
+
+def _samples(config: Config, share: float) -> Config:
+    """Another number of samples along the ray, as a share of the preset's, in all passes."""
+    passes = (dataclasses.replace(one, samples=max(2, round(share * one.samples))) for one in config.network.passes)
+    return _network(config, passes=tuple(passes))
+
+
+VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
+    "no-neighbours": lambda _: NerfConfig(),
+    "no-direction-weights": partial(_without, part="direction weights"),
+    "no-ray-transformer": partial(_without, part="ray transformer"),
+    "no-target-colour": partial(_without, part="target colour"),
+    **{f"degree-{degree}": partial(_network, harmonics_degree=degree) for degree in (0, 1, 2, 3, 4)},
+    **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
+    "samples-half": partial(_samples, share=0.5),
+    "samples-double": partial(_samples, share=2.0),
+}
+"""Without neighbouring views what is left is classical NeRF. The direction weights are the paper's eq. 6."""
 
 
 def config_to_json(config: AnyConfig) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-import sys
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from threading import Lock
@@ -70,19 +68,3 @@ def _cpu_gains_by_bfloat16() -> bool:
                 if number:
                     least[dtype] = min(least[dtype], perf_counter() - began)
     return least[torch.bfloat16] < least[torch.float32]
-
-
-def keep_large_allocations() -> None:
-    """Have glibc keep freed memory for the next step instead of returning it to the system.
-
-    By default blocks of over 32 MB go back at once and come again as fresh, zeroed pages: half the time of a step.
-    """
-    if sys.platform != "linux":
-        return
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except AttributeError:  # another C library than glibc, such as musl
-        return
-    trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
-    mallopt(trim_threshold, 1 << 30)
-    mallopt(mmap_threshold, 1 << 30)

@@ -98,14 +98,19 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Replace a JSON file, whole or not at all.
+def write_text(path: Path, text: str) -> None:
+    """Replace a text file, whole or not at all.
 
     Raises:
         RunError: its folder cannot be written to.
     """
     with completed_file(path, overwrite=True) as partial:
-        partial.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Replace a JSON file, likewise."""
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:

@@ -32,28 +32,24 @@ class Method:
     Attributes:
         kind: a preset of ours trained on the scene, one with trained weights as they are, classical NeRF, a method of
             nerfstudio, or a baseline that needs no training.
-        summary: what it is, for `--help` and documents.
         preset: of ours; None for the others.
     """
 
     kind: Kind
-    summary: str
     preset: str | None = None
 
 
 METHODS = {
-    "tidefield": Method("preset", "the preset swift, trained on the scene from the shipped weights", "swift"),
-    "zero-shot": Method(
-        "zero-shot", "the preset swift with trained weights, without any training on the scene", "swift"
-    ),
-    "paper": Method("preset", "the paper's network, trained on the scene from trained weights", "paper"),
-    "paper-zero-shot": Method("zero-shot", "the paper's network, without any training on the scene", "paper"),
-    "nerf": Method("nerf", "classical NeRF"),
-    "nerfacto": Method("nerfstudio", "nerfstudio's Nerfacto"),
-    "splatfacto": Method("nerfstudio", "nerfstudio's Splatfacto; needs CUDA"),
-    "plane-sweep": Method("untrained", "photographs blended at the depth where they match best"),
-    "sparse-depth": Method("untrained", "photographs blended on the surface through the sparse points"),
-    "nearest": Method("untrained", "the nearest photograph, projected onto that surface"),
+    "tidefield": Method("preset", "swift"),
+    "zero-shot": Method("zero-shot", "swift"),
+    "paper": Method("preset", "paper"),
+    "paper-zero-shot": Method("zero-shot", "paper"),
+    "nerf": Method("nerf"),
+    "nerfacto": Method("nerfstudio"),
+    "splatfacto": Method("nerfstudio"),
+    "plane-sweep": Method("untrained"),
+    "sparse-depth": Method("untrained"),
+    "nearest": Method("untrained"),
 }
 
 

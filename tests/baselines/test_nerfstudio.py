@@ -14,7 +14,6 @@ import torch
 from rich.console import Console
 
 from tidefield.baselines.nerfstudio import driver, environment, worker
-from tidefield.baselines.nerfstudio.export import export
 from tidefield.config import Budget
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
@@ -71,7 +70,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_exported_scene_is_the_same_scene(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    factor = export(scene, tmp_path / "data")
+    factor = driver.export(scene, tmp_path / "data")
     again = load_scene(tmp_path / "data")
     assert (again.train, again.test) == (scene.train, scene.test)
     shift = again.origin_world.float()

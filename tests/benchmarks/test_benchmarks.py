@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +121,7 @@ def test_the_measuring_process_stays_small() -> None:
 def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(memory, "SURVEY_WIDTH", 32)
+    monkeypatch.setattr(memory, "ProcessPoolExecutor", lambda workers, mp_context: ThreadPoolExecutor(workers))
     monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
     asked = []
 
@@ -134,7 +136,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents
         return Usage(1.0, 5_000_000_000)
 
-    memory.measure_memory(tmp_path, "swift", 96, 4, "cpu", run, memory.make_run)
+    memory.measure_memory(tmp_path, "swift", 96, 4, "cpu", run)
     assert len(asked) == 1
     assert json.loads((tmp_path / "memory.json").read_text())["size_px"] == [96, 72]
     assert {path.name for path in tmp_path.iterdir()} == {"cache", "memory.json"}

@@ -12,11 +12,10 @@ from tidefield.commands.ablate import Ablate
 from tidefield.compare.ablation import ablation_tables, summarise, variants, write_ablation
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
-from tidefield.config import PAPER, SWIFT, EncoderConfig, NerfConfig, config_from_json, config_to_json
+from tidefield.config import PAPER, SWIFT, VARIANTS, EncoderConfig, NerfConfig, config_from_json, config_to_json, vary
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.model.network import make_network
-from tidefield.variants import VARIANTS, vary
 
 SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, preset="paper")
 

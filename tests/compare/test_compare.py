@@ -17,10 +17,9 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 from tidefield import cli
 from tidefield.commands.compare import Compare, make_settings
 from tidefield.commands.compare import compare as compare_command
-from tidefield.compare.figures import most_different, side_by_side, write_curves
-from tidefield.compare.protocols import MIPNERF360, mipnerf360, named, tidal_flats
+from tidefield.compare.figures import most_different, side_by_side
 from tidefield.compare.results import figures_of, read_figures, read_results
-from tidefield.compare.run import Settings, commands, compare
+from tidefield.compare.run import MIPNERF360, Settings, commands, compare, mipnerf360, named, tidal_flats
 from tidefield.compare.tables import (
     TABLE_2,
     TABLE_3,
@@ -212,7 +211,6 @@ def test_crops_show_where_methods_differ_and_do_not_overlap():
 
 def test_nothing_is_drawn_of_nothing(tmp_path: Path):
     results = read_results(tmp_path, ["a"], ["tidefield"])
-    assert not write_curves(results, tmp_path / "curves.png")
     assert side_by_side(results, "a", wall.scene(wall.cameras(3), test=(1,))) is None
 
 
@@ -250,11 +248,10 @@ def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: py
     made = []
 
     def write(survey: object, folder: Path) -> None:
-        folder.mkdir(parents=True)
         made.append(folder)
 
-    monkeypatch.setattr("tidefield.compare.protocols.make_survey", lambda *_, **__: None)
-    monkeypatch.setattr("tidefield.compare.protocols.write_survey", write)
+    monkeypatch.setattr("tidefield.synthetic.make_survey", lambda *_, **__: None)
+    monkeypatch.setattr("tidefield.synthetic.write_survey", write)
     scenes = tidal_flats(tmp_path / "scenes", 100, [disk])
     assert set(scenes) == set(TABLE_3) | {"flats"}
     assert len(made) == 5

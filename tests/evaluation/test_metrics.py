@@ -16,7 +16,6 @@ from tidefield.evaluation.metrics import (
     score,
     ssim_map,
 )
-from tidefield.model.rendering import to_8_bit
 
 NO_LPIPS = dict.fromkeys(BACKBONES, "no weights here")
 
@@ -41,10 +40,6 @@ def test_psnr_of_a_known_offset():
     assert psnr(truth + 10, truth, full(truth)) == pytest.approx(20 * math.log10(255 / 10))
 
 
-def test_psnr_of_identical_images_is_the_documented_limit():
-    assert psnr(noise(), noise(), full(noise())) == PSNR_LIMIT_DB
-
-
 def test_psnr_of_an_mse_is_limited_and_keeps_nan():
     assert psnr_from_mse(0.01) == pytest.approx(20)
     assert psnr_from_mse(1.0) == 0
@@ -59,11 +54,6 @@ def test_a_masked_psnr_counts_the_masked_pixels_only():
     image[:, 6:] += 90
     assert psnr(image, truth, left_half(truth)) == pytest.approx(20 * math.log10(255 / 10))
     assert psnr(image, truth) == psnr(image, truth, full(truth)) == pytest.approx(10 * math.log10(255**2 / 4100))
-
-
-def test_colours_are_clipped_and_rounded_to_8_bits():
-    colour = torch.tensor([-0.1, 0.4 / 255, 0.6 / 255, 254.4 / 255, 1.7, 0.5]).expand(3, 6).T.reshape(2, 3, 3)
-    assert to_8_bit(colour)[..., 0].flatten().tolist() == [0, 0, 1, 254, 255, 128]
 
 
 def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -88,11 +78,6 @@ def test_ssim_is_the_formula_with_an_11_by_11_gaussian():
     image = (image // 2 + truth // 2).to(torch.uint8)
     expected = [brute_force_ssim(image[..., c].numpy() / 255, truth[..., c].numpy() / 255) for c in range(3)]
     np.testing.assert_allclose(ssim_map(image, truth).numpy(), np.mean(expected, axis=0), atol=1e-6)
-
-
-def test_identical_images_have_ssim_1_and_flip_0():
-    assert ssim_map(noise(), noise()).min() == pytest.approx(1)
-    assert flip_map(noise(), noise()).max() == pytest.approx(0, abs=1e-6)
 
 
 def test_flip_is_largest_where_the_images_differ():

@@ -9,9 +9,7 @@ from captures import SCENES, TILT, UP, angle, object_scene, oblique, scene_of, s
 from torch import Tensor
 
 from tidefield.data.scene import Scene
-from tidefield.render.camera_paths import AHEAD, GENTLE, Shape, among_cameras, layout_of, orbit, strip
-
-SHAPES = {"cameras": among_cameras, "orbit": orbit, "strip": strip}
+from tidefield.render.camera_paths import AHEAD, GENTLE, SHAPES, Shape, among_cameras, layout_of, orbit, strip
 
 
 def poses(shape: Shape, scene: Scene, frames: int, reach: float = 1.0) -> tuple[Tensor, Tensor]:

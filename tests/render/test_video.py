@@ -14,7 +14,7 @@ from PIL import Image
 
 from tidefield.errors import RunError
 from tidefield.model.rendering import Rendering
-from tidefield.render.stills import colour_picture, depth_picture, write_still
+from tidefield.render.stills import colour_picture, depth_picture, depth_range, write_still
 from tidefield.render.video import write_video
 
 COLOURS = [(200, 30, 40), (30, 180, 60), (40, 60, 210), (128, 128, 128), (250, 240, 230)]
@@ -143,12 +143,12 @@ def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
 
 
 def test_depth_goes_from_red_to_blue_and_empty_pixels_are_black():
-    picture = depth_picture(rendering()).astype(int)
+    picture = depth_picture(rendering(), *depth_range(rendering())).astype(int)
     assert picture[0, 0, 0] > picture[0, 0, 2]
     assert picture[0, -6, 2] > picture[0, -6, 0]
     assert (picture[:, -4:] == 0).all()
     empty = Rendering(torch.zeros(2, 2, 3), torch.zeros(2, 2), torch.zeros(2, 2))
-    assert (depth_picture(empty) == 0).all()
+    assert (depth_picture(empty, *depth_range(empty)) == 0).all()
 
 
 def test_existing_stills_are_only_overwritten_on_request(tmp_path: Path):

@@ -34,7 +34,7 @@ CPU = torch.device("cpu")
 QUIET = Console(quiet=True)
 
 
-class Walls:
+class Walls(Stream):
     """Stands in for the stream: a textured wall that others see differently."""
 
     def __init__(self, rank: int = 0) -> None:

@@ -24,7 +24,7 @@ from tidefield.commands import train as train_command
 from tidefield.commands.train import Train
 from tidefield.config import PAPER, PRESETS, SWIFT, Budget, Config, EncoderConfig, config_from_json, config_to_json
 from tidefield.data.scene import Scene
-from tidefield.errors import DeviceError, RunError
+from tidefield.errors import RunError
 from tidefield.model.network import make_network
 from tidefield.train import checkpoint
 from tidefield.train.checkpoint import (
@@ -154,14 +154,6 @@ def test_a_checkpoint_of_another_network_is_refused(scene: Scene, tmp_path: Path
     other = replace(SMALL, network=replace(SMALL.network, encoder=EncoderConfig((8, 8, 16, 8), (1, 1, 1), False)))
     with pytest.raises(RunError, match="does not fit"):
         load_network(tmp_path, SceneTrainer(other, scene, seed=0, device=CPU).network)
-
-
-def test_a_device_that_is_not_there_is_named() -> None:
-    from tidefield.device import choose_device
-
-    with pytest.raises(DeviceError, match="cuda:99"):
-        choose_device("cuda:99")
-    assert choose_device("cpu") == CPU
 
 
 def test_the_learning_rate_rises_in_a_line_and_falls_along_half_a_cosine(scene: Scene) -> None:

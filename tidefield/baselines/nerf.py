@@ -68,13 +68,7 @@ class Mlp(nn.Module):
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with the z-depths between which they may meet the scene.
-
-    Attributes:
-        origin_world: where they begin.
-        direction_world: scaled so that one unit is one unit of z-depth.
-        near_far: z-depths.
-    """
+    """Rays with the z-depths between which they may meet the scene; one unit of a direction is one of z-depth."""
 
     origin_world: Float[Tensor, "R 3"]
     direction_world: Float[Tensor, "R 3"]
@@ -124,7 +118,6 @@ class Nerf(nn.Module):
         """What the coarse and the fine pass see.
 
         Args:
-            rays: of any cameras.
             opaque: whether the last sample stops all light: real scenes have no holes.
             generator: jitters samples and densities, for training.
         """

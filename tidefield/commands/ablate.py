@@ -10,8 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.compare import make_settings, print_lines, run_all
-from tidefield.config import PRESETS, Budget
-from tidefield.variants import vary
+from tidefield.config import PRESETS, Budget, vary
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,13 +40,12 @@ class Ablate:
 
 def ablate(options: Ablate, console: Console) -> None:
     """Run `tidefield ablate`."""
-    from tidefield.compare import protocols
     from tidefield.compare.ablation import variants, write_ablation
+    from tidefield.compare.run import named
 
     for name in options.variants:
         vary(PRESETS[options.preset], name)  # before anything is trained
     # From scratch, all of them: trained weights would belong to one of the variants only.
     settings = make_settings(options.budget, options.width, options.device, options.seed, True, options.preset)
-    scenes = protocols.named(options.scenes)
-    results = run_all(scenes, variants(options.variants), settings, options.out, console)
+    results = run_all(named(options.scenes), variants(options.variants), settings, options.out, console)
     print_lines(console, write_ablation(results, settings, options.out))

@@ -96,14 +96,14 @@ def print_lines(console: Console, lines: Iterable[object]) -> None:
 
 def _scenes(options: Compare) -> dict[str, Path]:
     """Folders of the scenes by name."""
-    from tidefield.compare import protocols
+    from tidefield.compare.run import mipnerf360, named, tidal_flats
 
     if options.protocol == "mipnerf360":
         if len(options.scenes) != 1:
             raise RunError("--protocol mipnerf360 compares on one data set: expected its folder; name it alone")
-        return protocols.mipnerf360(options.scenes[0], options.out / "scenes")
+        return mipnerf360(options.scenes[0], options.out / "scenes")
     if options.protocol == "tidalflats":
-        return protocols.tidal_flats(options.out / "scenes", options.width or SYNTHETIC_WIDTH, options.scenes)
+        return tidal_flats(options.out / "scenes", options.width or SYNTHETIC_WIDTH, options.scenes)
     if not options.scenes:
         raise RunError("nothing to compare on: expected scenes, or --protocol; name some")
-    return protocols.named(options.scenes)
+    return named(options.scenes)

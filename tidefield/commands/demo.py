@@ -92,20 +92,18 @@ def demo(options: Demo, console: Console) -> None:
 def creek_flight() -> dict[str, Any]:
     """An oblique flight up the creek of the built-in scene, as a camera path of nerfstudio's viewer."""
     import numpy as np
+    from scipy.interpolate import BarycentricInterpolator
+
+    from tidefield.render.camera_paths import look_along
 
     # A parabola through the three points, from rest to rest.
     time = np.linspace(0, 1, FRAMES)
-    time = (time**2 * (3 - 2 * time))[:, None]
-    through = [2 * (time - 0.5) * (time - 1), 4 * time * (1 - time), 2 * time * (time - 0.5)]
-    eyes, targets = (np.concatenate(through, axis=1) @ np.array(points) for points in (EYES, TARGETS))
-    frames = []
-    for eye, target in zip(eyes, targets, strict=True):
-        backward = (eye - target) / np.linalg.norm(eye - target)
-        right = np.cross((0.0, 0.0, 1.0), backward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.column_stack([right, np.cross(backward, right), backward, eye])
-        frames.append({"camera_to_world": pose.flatten().tolist(), "fov": FIELD_OF_VIEW_DEG})
+    time = time**2 * (3 - 2 * time)
+    eyes, targets = (BarycentricInterpolator([0, 0.5, 1], points)(time) for points in (EYES, TARGETS))
+    pose = np.tile(np.eye(4), (FRAMES, 1, 1))
+    pose[:, :3, :3] = look_along(targets - eyes, np.array([0.0, 0.0, 1.0])) * (1, -1, -1)  # OpenGL's y and z
+    pose[:, :3, 3] = eyes
+    frames = [{"camera_to_world": matrix.flatten().tolist(), "fov": FIELD_OF_VIEW_DEG} for matrix in pose]
     width, height = FLIGHT_SIZE
     return {
         "camera_type": "perspective",

@@ -10,17 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import AnyConfig, Budget, Config, NerfstudioConfig, warm_start
+from tidefield.config import Budget, Config, NerfstudioConfig, vary, warm_start
 from tidefield.errors import RunError, SceneError
 from tidefield.methods import configuration, make_trainer
-from tidefield.variants import vary
 
 if TYPE_CHECKING:
-    import torch
     from rich.console import Console
 
-    from tidefield.data.scene import Scene
-    from tidefield.evaluation.curves import QualityCurve
     from tidefield.train.checkpoint import Run, TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -69,26 +65,41 @@ def train(options: Train, console: Console) -> None:
     """Run `tidefield train`."""
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
-    from tidefield.train.checkpoint import write_run
+    from tidefield.progress import ProgressBar
+    from tidefield.train.checkpoint import read_run, write_run
     from tidefield.train.loop import train as run_training
 
-    budget, folder = options.budget.checked(), options.run
+    budget, folder, weights = options.budget.checked(), options.run, None
     device = choose_device(options.device)
-    run = _resumed_run(options) if options.resume else _new_run(options)
+    if options.resume:
+        run = read_run(folder)  # its other options were settled when it was started
+        if run.scene != options.scene.resolve():
+            raise RunError(
+                f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
+            )
+    else:
+        run, weights = _new_run(options)
     scene = load(run.scene, run.width, options.allow_missing, console)
     if not scene.train:
         raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
     if options.curve and not scene.test:
         raise SceneError(f"{options.scene} holds no photograph out: expected one for --curve; leave --curve out")
     curve = make_curve(scene) if options.curve else None
-    weights = None if options.resume else _initial_weights(options)
     start = f", starting from {weights}" if weights else ""
     log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
     if isinstance(run.config, NerfstudioConfig):
+        from tidefield.baselines.nerfstudio import driver
+
         if options.resume:
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
         write_run(folder, run)
-        progress, finished = _train_nerfstudio(run, scene, folder, budget, device, curve, console), True
+        with ProgressBar(console, "Training") as bar:
+
+            def show(step: int, seconds: float) -> None:
+                bar(budget.share(step, seconds), 1, f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
+
+            progress = driver.train(run.config.method, scene, folder, budget, run.seed, device, curve, show)
+        finished = True
     else:
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
@@ -109,86 +120,40 @@ def report_end(progress: TrainingProgress, finished: bool, folder: Path, console
         raise KeyboardInterrupt
 
 
-def _train_nerfstudio(
-    run: Run,
-    scene: Scene,
-    folder: Path,
-    budget: Budget,
-    device: torch.device,
-    curve: QualityCurve | None,
-    console: Console,
-) -> TrainingProgress:
-    """Train one of nerfstudio's methods, with progress."""
-    from tidefield.baselines.nerfstudio import driver
-    from tidefield.progress import ProgressBar
-
-    config = run.config
-    assert isinstance(config, NerfstudioConfig), "the others train in this process"
-    with ProgressBar(console, "Training") as bar:
-
-        def progress(step: int, seconds: float) -> None:
-            bar(budget.share(step, seconds), 1, f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
-
-        return driver.train(config.method, scene, folder, budget, run.seed, device, curve, progress)
-
-
-def _new_run(options: Train) -> Run:
-    from tidefield.train.checkpoint import Run, weights_sha256
+def _new_run(options: Train) -> tuple[Run, Path | None]:
+    """A new run, and the weights it starts from: the named ones, else the installed ones of the unchanged preset."""
+    from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
-    weights = _initial_weights(options)
-    config, digest = _configuration(options), None
-    if weights is not None:
-        assert isinstance(config, Config), "only our networks start from weights"
-        config, digest = warm_start(config), weights_sha256(weights)
-    return Run(options.scene.resolve(), options.width, options.seed, config, digest)
-
-
-def _initial_weights(options: Train) -> Path | None:
-    """Weights to start from: the named ones, else the installed ones of the unchanged preset."""
-    from tidefield.train.checkpoint import shipped_weights
-
-    if options.weights is not None and (options.from_scratch or options.method != "tidefield"):
+    weights, from_random = options.weights, options.from_scratch or options.method != "tidefield"
+    if weights is not None and from_random:
         raise RunError(
             "--weights is given for a training that starts without: expected one or the other; leave one out"
         )
-    if options.from_scratch or options.method != "tidefield":
-        return None
-    return options.weights or (shipped_weights(options.preset) if options.variant is None else None)
-
-
-def _configuration(options: Train) -> AnyConfig:
     config = configuration(options.method, options.preset)
-    if options.variant is None:
-        return config
-    if not isinstance(config, Config):
-        raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
-    return vary(config, options.variant)
-
-
-def _resumed_run(options: Train) -> Run:
-    """The run in the folder; its other options were settled when it was started."""
-    from tidefield.train.checkpoint import read_run
-
-    run = read_run(options.run)
-    if run.scene != options.scene.resolve():
-        raise RunError(
-            f"{options.run} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
-        )
-    return run
+    if options.variant is not None:
+        if not isinstance(config, Config):
+            raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
+        config = vary(config, options.variant)
+    elif weights is None and not from_random:
+        weights = shipped_weights(options.preset)
+    digest = None
+    if weights is not None:
+        assert isinstance(config, Config), "only our networks start from weights"
+        config, digest = warm_start(config), weights_sha256(weights)
+    return Run(options.scene.resolve(), options.width, options.seed, config, digest), weights
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:
     """Raises: RunError when a folder holds a run, or is something else that a run would be mixed into."""
     from tidefield.train.checkpoint import RUN_FILE
 
-    if not folder.exists():
-        return
-    if not folder.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     if (folder / RUN_FILE).exists():
-        if overwrite:
-            return
-        raise RunError(f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite")
-    if any(folder.iterdir()):
+        if not overwrite:
+            raise RunError(
+                f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite"
+            )
+    elif folder.exists() and any(folder.iterdir()):
         raise RunError(f"{folder} holds other files: expected a new or empty folder; choose a new name")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from tidefield.compare.results import Results
 from tidefield.compare.run import OTHER_SEED, WHOLE, Settings
 from tidefield.compare.tables import Table, shown, write_figures, write_tables
-from tidefield.variants import VARIANTS
+from tidefield.config import VARIANTS
 
 LEAST_DB = 0.05
 """A smaller difference counts as noise, even if two seeds happen to agree better."""
@@ -82,27 +81,14 @@ def _table(results: Results, scene: str) -> Table:
     """A line for each variant; metrics that no variant has are left out."""
     found = {method: results.by[scene, method] for method in results.methods if (scene, method) in results.by}
     metrics = [of for of in _METRICS if any(result.metric(of[0]) is not None for result in found.values())]
-    rows = [
-        [
-            method,
-            *(shown(result.metric(metric), style) for metric, _, style in metrics),
-            f"{result.evaluation['rays_per_second']:,.0f}",
-            _shown_difference(results, scene, method),
-        ]
-        for method, result in found.items()
-    ]
-    budgets = {_budget(result.process.get("settings", {})) for result in found.values()}
+    rows, budgets = [], set()
+    for method, result in found.items():
+        within = method != OTHER_SEED and _effect(results, scene, method) == WITHIN
+        difference = shown(_difference(results, scene, method), "{:+.2f}") + (f", {WITHIN}" if within else "")
+        values = (shown(result.metric(metric), style) for metric, _, style in metrics)
+        rows.append([method, *values, f"{result.evaluation['rays_per_second']:,.0f}", difference])
+        settings = result.process.get("settings", {})
+        minutes, start = settings.get("minutes"), " from random weights" if settings.get("from_scratch") else ""
+        budgets.add((f"{minutes:g} min" if minutes is not None else f"{settings.get('steps')} steps") + start)
     title = f"{scene}, {' or '.join(sorted(budgets))}, pixels that two training photographs or more see"
     return Table(title, ["variant", *(title for _, title, _ in metrics), "rays/s", "difference, dB"], rows)
-
-
-def _budget(settings: Mapping[str, Any]) -> str:
-    """How a variant was trained."""
-    steps, minutes = settings.get("steps"), settings.get("minutes")
-    start = " from random weights" if settings.get("from_scratch") else ""
-    return (f"{minutes:g} min" if minutes is not None else f"{steps} steps") + start
-
-
-def _shown_difference(results: Results, scene: str, method: str) -> str:
-    within = _effect(results, scene, method) == WITHIN and method != OTHER_SEED
-    return shown(_difference(results, scene, method), "{:+.2f}") + (f", {WITHIN}" if within else "")

@@ -20,7 +20,6 @@ PANEL_PX = 320
 CROPS, SHARE = 2, 5
 """How many crops of each picture, and which part of its width they show: a fifth."""
 _COLOURS = ((214, 39, 40), (31, 119, 180))
-_HARMLESS = 1e-6
 
 
 def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | None:
@@ -37,28 +36,24 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     chosen = ranked[len(ranked) // 2]
     index = scene.index(chosen)
     truth, seen = scene.photographs[index].numpy(), doubly_seen(scene, scene.cameras[index]).numpy()
-    files = dict(
-        zip((scene.names[i] for i in scene.test), picture_names([scene.names[i] for i in scene.test]), strict=True)
-    )
+    held_out = [scene.names[i] for i in scene.test]
+    file = picture_names(held_out)[held_out.index(chosen)]
     pictures = {"ground truth": truth}
     for method in methods:
         folder = results.by[name, method].folder
         assert folder is not None, "figures are made where the pictures are"
-        with Image.open(folder / "renderings" / files[chosen]) as picture:
+        with Image.open(folder / "renderings" / file) as picture:
             pictures[method] = np.asarray(picture.convert("RGB"))
     corners = most_different(truth, [pictures[method] for method in methods], seen, truth.shape[1] // SHARE)
     columns = []
     for title, picture in pictures.items():
-        psnr = "" if title == "ground truth" else f"  {photographs_psnr(results, name, title, chosen):.2f} dB"
-        columns.append(_column(f"{title}{psnr}", picture, corners, truth.shape[1] // SHARE))
+        if title in methods:
+            title += f"  {results.by[name, title].evaluation['per_photograph'][chosen]['psnr']:.2f} dB"
+        columns.append(_column(title, picture, corners, truth.shape[1] // SHARE))
     whole = Image.new("RGB", (sum(c.width + GAP_PX for c in columns) - GAP_PX, columns[0].height), PAPER)
     for k, column in enumerate(columns):
         whole.paste(column, (k * (column.width + GAP_PX), 0))
     return whole
-
-
-def photographs_psnr(results: Results, scene: str, method: str, photograph: str) -> float:
-    return results.by[scene, method].evaluation["per_photograph"][photograph]["psnr"]
 
 
 def most_different(
@@ -70,7 +65,9 @@ def most_different(
     """Upper left corners (u, v) of the squares in which the methods' errors at the counted pixels differ most, or of
     one method are largest; squares do not overlap."""
     errors = [uniform_filter(((r.astype(np.float64) - truth) ** 2).mean(2) * counted, side) for r in renderings]
-    spread: Float[np.ndarray, "H W"] = (np.std(errors, axis=0) if len(errors) > 1 else errors[0]) + _HARMLESS
+    spread: Float[np.ndarray, "H W"] = (
+        np.std(errors, axis=0) if len(errors) > 1 else errors[0]
+    ) + 1e-6  # so that what is set to zero below is never chosen
     half, corners = side // 2, []
     height, width = spread.shape
     spread[:half], spread[height - half :], spread[:, :half], spread[:, width - half :] = 0, 0, 0, 0
@@ -100,20 +97,14 @@ def _column(title: str, picture: np.ndarray, corners: list[tuple[int, int]], sid
     return whole
 
 
-def write_curves(results: Results, path: Path) -> bool:
-    """PSNR against seconds of training, a panel for each scene; returns whether there was anything to draw.
-
-    Needs matplotlib (`pip install 'tidefield[compare]'`).
-    """
+def write_curves(results: Results, path: Path) -> None:
+    """Draw PSNR against seconds of training, a panel for each scene that has a curve; at least one has."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-    scenes = [
-        s for s in results.scenes if any((s, m) in results.by and results.by[s, m].curve for m in results.methods)
-    ]
-    if not scenes:
-        return False
+    with_curves = {scene for (scene, _), result in results.by.items() if result.curve}
+    scenes = [scene for scene in results.scenes if scene in with_curves]
     columns = min(3, len(scenes))
     rows = -(-len(scenes) // columns)
     figure = Figure(figsize=(4.2 * columns, 3.2 * rows), layout="constrained")
@@ -122,9 +113,7 @@ def write_curves(results: Results, path: Path) -> bool:
     for axis, scene in zip(axes, scenes, strict=False):
         for k, method in enumerate(results.methods):
             result = results.by.get((scene, method))
-            if result is None:
-                continue
-            if result.curve:
+            if result is not None and result.curve:
                 seconds, psnr = zip(*result.curve, strict=True)
                 axis.plot(seconds, psnr, marker="o", markersize=3, color=f"C{k}", label=method)
         axis.set_xscale("log")
@@ -140,4 +129,3 @@ def write_curves(results: Results, path: Path) -> bool:
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(labels)))
     figure.savefig(path, dpi=150)
-    return True

@@ -32,20 +32,9 @@ class Result:
         """A mean over the held-out photographs; None where it was not measured."""
         return self.evaluation["mean"].get(name)
 
-    @property
-    def trained_minutes(self) -> float | None:
-        """None for what needs no training."""
-        trained = self.evaluation["configuration"].get("trained")
-        return trained["seconds"] / 60 if trained else None
-
-    @property
-    def steps(self) -> int | None:
-        trained = self.evaluation["configuration"].get("trained")
-        return trained["steps"] if trained else None
-
-    def peak_bytes(self, step: str) -> int | None:
-        """Of "train" or "evaluate"."""
-        return self.process.get(step, {}).get("peak_memory_bytes")
+    def trained(self, name: str) -> float | int | None:
+        """The "steps" or "seconds" of its training; None for what needs none."""
+        return (self.evaluation["configuration"].get("trained") or {}).get(name)
 
 
 @dataclass(frozen=True)
@@ -92,15 +81,12 @@ def figures_of(results: Results) -> list[dict[str, Any]]:
             "scene": scene,
             "method": method,
             "evaluation": {key: value for key, value in result.evaluation.items() if key != "per_photograph"},
-            "process": result.process | {"settings": _portable(result.process.get("settings", {}))},
+            "process": result.process
+            | {"settings": {k: v for k, v in result.process.get("settings", {}).items() if k != "scene"}},
             "curve": result.curve,
         }
         for (scene, method), result in results.by.items()
     ]
-
-
-def _portable(settings: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key != "scene"}
 
 
 def read_figures(files: Sequence[Path], scenes: Sequence[str], methods: Sequence[str]) -> Results:

@@ -1,4 +1,4 @@
-"""Run every method on every scene, each in a process of its own, one after another, and measure its time and memory.
+"""Scenes to compare on; and every method on every scene, run in a process of its own, one after another, measured.
 
 OUT/runs/SCENE/METHOD/ holds what `tidefield train` and `tidefield evaluate` write there, and process.json: the time and
 memory that they used. What has an evaluation.json is not repeated; an interrupted training is started again, so that
@@ -19,14 +19,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tidefield.errors import RunError
-from tidefield.files import read_json, write_json
+from tidefield.errors import RunError, SceneError
+from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import METHODS
 
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and the same with another seed, for the noise of an ablation."""
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
+MIPNERF360 = {
+    "bicycle": "images_4",
+    "bonsai": "images_2",
+    "counter": "images_2",
+    "garden": "images_4",
+    "kitchen": "images_2",
+    "room": "images_2",
+    "stump": "images_4",
+}
+"""The seven public scenes of mip-NeRF 360, and which of their folders of photographs is used: as in that paper, a
+quarter of the size outdoors and half of it indoors."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,59 @@ class Settings:
     seed: int
     preset: str = "swift"
     from_scratch: bool = False
+
+
+def mipnerf360(folder: Path, out: Path) -> dict[str, Path]:
+    """The scenes in a folder as it is published, by name.
+
+    Args:
+        folder: the data set's.
+        out: for a folder of each scene, of links to its poses and to the photographs of the size that is used.
+
+    Raises:
+        SceneError: none of them is there, or one has no photographs of that size.
+    """
+    there = [name for name in MIPNERF360 if (folder / name / "sparse").is_dir()]
+    if not there:
+        raise SceneError(
+            f"{folder} has none of {', '.join(MIPNERF360)}: expected the folder that the data set of mip-NeRF 360 "
+            "unpacks to; name it"
+        )
+    for name in there:
+        photographs = folder / name / MIPNERF360[name]
+        if not photographs.is_dir():
+            raise SceneError(f"{photographs} is not there: expected the photographs as published; unpack them all")
+        (out / name).mkdir(parents=True, exist_ok=True)
+        for link, target in (("images", photographs), ("sparse", folder / name / "sparse")):
+            if not (out / name / link).is_symlink():
+                (out / name / link).symlink_to(target.resolve(), target_is_directory=True)
+    return {name: out / name for name in there}
+
+
+def tidal_flats(folder: Path, width: int, real: Sequence[Path]) -> dict[str, Path]:
+    """The five synthetic categories, made in `folder` unless they are there, and real surveys, by name."""
+    from tidefield.synthetic import CATEGORIES, make_survey, write_survey
+
+    scenes = {}
+    for category in CATEGORIES:
+        scenes[category] = scene = folder / f"{category}-{width}"
+        if not scene.exists():
+            with completed_folder(scene) as partial:
+                write_survey(make_survey(category, seed=11, views=40, width=width), partial)
+    return scenes | named(real)
+
+
+def named(scenes: Sequence[Path]) -> dict[str, Path]:
+    """Scenes by the names of their folders.
+
+    Raises:
+        SceneError: two have the same.
+    """
+    names = [Path(os.path.abspath(scene)).name for scene in scenes]  # a link has a name of its own
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise SceneError(f"two scenes are named {twice}: expected different names of folders; rename or link one")
+    return dict(zip(names, scenes, strict=True))
 
 
 def tidefield(*words: object) -> list[str]:
@@ -143,18 +207,28 @@ def compare(
     Raises:
         RunError: a command failed, or the folder holds results of other settings.
     """
-    jobs = [(name, scene, method) for name, scene in scenes.items() for method in methods]
-    for name, scene, method in jobs:
-        _refuse_other_settings(out / RUNS / name / method, scene, method, settings)
-    for number, (name, scene, method) in enumerate(jobs, start=1):
-        folder, title = out / RUNS / name / method, f"{name}, {method} ({number} of {len(jobs)})"
+    jobs = [(out / RUNS / name / method, name, scene, method) for name, scene in scenes.items() for method in methods]
+    for folder, _, scene, method in jobs:
+        wanted, found = _record(scene, method, settings), (read_json(folder / PROCESS_FILE) or {}).get("settings")
+        if found not in (None, wanted):
+            was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
+            asked = {key: wanted[key] for key in was}
+            raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
+    for number, (folder, name, scene, method) in enumerate(jobs, start=1):
+        title = f"{name}, {method} ({number} of {len(jobs)})"
         if (folder / EVALUATION_FILE).exists():
             say(f"{title}: done before")
             continue
+        portable = commands(Path("SCENE"), Path("RUN"), method, settings)
         for step, words in commands(scene, folder, method, settings).items():
             say(f"{title}: {step}")
-            recorded = commands(Path("SCENE"), Path("RUN"), method, settings)[step]
-            _step(folder, step, words, recorded, _record(scene, method, settings), run)
+            record = read_json(folder / PROCESS_FILE) or {"settings": _record(scene, method, settings)}
+            if step == "train" and step in record:
+                continue
+            again = ["--overwrite"] if step == "train" and (folder / RUN_FILE).exists() else []
+            usage = run(tidefield(*words, *again), {})
+            command = shlex.join(["tidefield", *portable[step]])
+            write_json(folder / PROCESS_FILE, {**record, step: {"command": command, **asdict(usage), **describe()}})
 
 
 def _kind(method: str) -> str:
@@ -170,24 +244,3 @@ def _record(scene: Path, method: str, settings: Settings) -> dict[str, object]:
     if _kind(method) not in ("preset", "variant"):
         del kept["from_scratch"]
     return {**kept, "scene": str(scene.resolve())}
-
-
-def _refuse_other_settings(folder: Path, scene: Path, method: str, settings: Settings) -> None:
-    wanted, found = _record(scene, method, settings), (read_json(folder / PROCESS_FILE) or {}).get("settings")
-    if found not in (None, wanted):
-        was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
-        asked = {key: wanted[key] for key in was}
-        raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
-
-
-def _step(
-    folder: Path, name: str, words: list[str], recorded: list[str], settings: dict[str, object], run: Runner
-) -> None:
-    """Run one command, unless it is a training that has ended, and store its usage with the command as `recorded`."""
-    record = read_json(folder / PROCESS_FILE) or {"settings": settings}
-    if name == "train" and name in record:
-        return
-    again = ["--overwrite"] if name == "train" and (folder / RUN_FILE).exists() else []
-    usage = run(tidefield(*words, *again), {})
-    record[name] = {"command": shlex.join(["tidefield", *recorded]), **asdict(usage), **describe()}
-    write_json(folder / PROCESS_FILE, record)

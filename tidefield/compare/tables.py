@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.results import Result, Results, figures_of
+from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
-from tidefield.evaluation.lpips import BACKBONES
+from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
-from tidefield.files import completed_file, write_json
+from tidefield.files import completed_file, write_json, write_text
 from tidefield.machine import describe
 
 NOTHING, MEAN = "-", "mean"
@@ -24,7 +24,6 @@ REGIONS = {
     "_seen_cc": "pixels that two training photographs or more see, after the colour fit",
 }
 """Suffixes of metrics, and over what they are taken."""
-PUBLISHED_METRICS = ("psnr", "ssim", "lpips")
 TABLE_2 = {
     "bicycle": {"tidefield": (22.74, 0.649, 0.384), "nerfacto": (19.62, 0.497, 0.385)},
     "bonsai": {"tidefield": (27.33, 0.872, 0.252), "nerfacto": (21.40, 0.693, 0.302)},
@@ -103,15 +102,6 @@ def shown(value: float | int | None, style: str) -> str:
     return NOTHING if value is None else style.format(value)
 
 
-def all_tables(results: Results) -> list[Table]:
-    """The paper's tables where the scenes are among its, then every metric, then time and memory."""
-    papers = (
-        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
-        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
-    )
-    return [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
-
-
 def missing_metrics(results: Results) -> list[str]:
     """Why some metrics have no value, as sentences."""
     missing: dict[str, list[str]] = {}
@@ -133,7 +123,7 @@ def lpips_weights(results: Results) -> list[str]:
     }
     origin = {True: "the published file", False: "which is another file than the published one"}
     return [
-        f"LPIPS with {file}, {origin[sha256.startswith(file[-12:-4])]} (SHA-256 {sha256})."
+        f"LPIPS with {file}, {origin[sha256.startswith(hash_prefix(file))]} (SHA-256 {sha256})."
         for file, sha256 in sorted(found)
     ]
 
@@ -172,8 +162,8 @@ def paper_table(
         return None
     measured = [method for method in ("tidefield", "nerfacto") if method in results.methods]
     columns, rows = ["scene"], [[scene] for scene in (*scenes, MEAN)]
-    for k, (metric, style) in enumerate((("psnr", "{:.2f}"), ("ssim", "{:.3f}"), ("lpips_vgg", "{:.3f}"))):
-        name = PUBLISHED_METRICS[k].upper()
+    published = (("psnr", "PSNR", "{:.2f}"), ("ssim", "SSIM", "{:.3f}"), ("lpips_vgg", "LPIPS", "{:.3f}"))
+    for k, (metric, name, style) in enumerate(published):
         if not any(results.metric(scene, method, metric) is not None for scene in scenes for method in measured):
             continue
         for method in measured:
@@ -192,25 +182,31 @@ def paper_table(
 def cost_table(results: Results) -> Table:
     """Time, speed and memory of each method."""
     columns = ["scene, method", "training, min", "steps", "s per frame", "rays/s", "memory, GB (train, evaluate)"]
-    rows = [
-        [f"{scene}, {method}", *_cost(results.by[scene, method])]
-        for scene in results.scenes
-        for method in results.methods
-        if (scene, method) in results.by
-    ]
-    return Table(
-        "Time and memory (of an evaluation, the networks of LPIPS included where they were used)", columns, rows
-    )
+    rows = []
+    for scene, method in ((scene, method) for scene in results.scenes for method in results.methods):
+        if (result := results.by.get((scene, method))) is None:
+            continue
+        seconds = result.trained("seconds")
+        peaks = [result.process.get(step, {}).get("peak_memory_bytes") for step in ("train", "evaluate")]
+        rows.append(
+            [
+                f"{scene}, {method}",
+                shown(seconds and seconds / 60, "{:.1f}"),
+                shown(result.trained("steps"), "{:,}"),
+                f"{result.evaluation['seconds_per_frame']:.2f}",
+                f"{result.evaluation['rays_per_second']:,.0f}",
+                ", ".join(shown(peak and peak / 1e9, "{:.2f}") for peak in peaks),
+            ]
+        )
+    title = "Time and memory (of an evaluation, the networks of LPIPS included where they were used)"
+    return Table(title, columns, rows)
 
 
 def nerfacto_limits(results: Results) -> list[str]:
     """How Nerfacto was run, as a sentence, where it has results: on CPUs it is far from its defaults."""
-    steps = [result.steps for (_, method), result in results.by.items() if method == "nerfacto" and result.steps]
-    devices = {
-        result.process.get("settings", {}).get("device")
-        for (_, method), result in results.by.items()
-        if method == "nerfacto"
-    }
+    found = [result for (_, method), result in results.by.items() if method == "nerfacto"]
+    steps = [count for result in found if (count := result.trained("steps"))]
+    devices = {result.process.get("settings", {}).get("device") for result in found}
     if not steps or devices != {"cpu"}:
         return []
     least, most = min(steps) / NERFACTO_STEPS, max(steps) / NERFACTO_STEPS
@@ -219,17 +215,6 @@ def nerfacto_limits(results: Results) -> list[str]:
         f"within the budget it made {min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default "
         f"of {NERFACTO_STEPS:,}. Its figures are those of a method at the start of its training, and they are "
         "no evidence about Nerfacto trained to its end on a GPU."
-    ]
-
-
-def _cost(result: Result) -> Sequence[str]:
-    memory = (result.peak_bytes(step) for step in ("train", "evaluate"))
-    return [
-        shown(result.trained_minutes, "{:.1f}"),
-        shown(result.steps, "{:,}"),
-        f"{result.evaluation['seconds_per_frame']:.2f}",
-        f"{result.evaluation['rays_per_second']:,.0f}",
-        ", ".join(NOTHING if value is None else f"{value / 1e9:.2f}" for value in memory),
     ]
 
 
@@ -242,7 +227,13 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     from tidefield.compare.figures import side_by_side, write_curves
     from tidefield.data.load import load_scene
 
-    files = write_tables("tables", "Comparison", all_tables(results), [], results, settings, out)
+    # The paper's tables where the scenes are among its, then every metric, then time and memory.
+    papers = (
+        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
+        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
+    )
+    tables = [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
+    files = write_tables("tables", "Comparison", tables, [], results, settings, out)
     files.append(write_figures("comparison", results, settings, out))
     for name, path in scenes.items():
         figure = side_by_side(results, name, load_scene(path, width=settings.width))
@@ -265,20 +256,30 @@ def write_tables(
     stem: str, title: str, tables: list[Table], remarks: list[str], results: Results, settings: Settings, out: Path
 ) -> list[Path]:
     """Write tables with their circumstances as STEM.md, STEM.tex and STEM.csv; returns the files."""
+    made: dict[str, Any] = describe()
+    machine = made["machine"]
+    budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
+    page = [
+        f"# {title}",
+        "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
+        f"and {budget} of training, one after another.",
+        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
+        f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
+        f"{machine['torch']}; {made['date']}.",
+        *nerfacto_limits(results),
+        *remarks,
+        *lpips_weights(results),
+        *missing_metrics(results),
+        *(table.markdown() for table in tables),
+    ]
     texts = {
-        ".md": _page(
-            title,
-            tables,
-            [*nerfacto_limits(results), *remarks, *lpips_weights(results), *missing_metrics(results)],
-            settings,
-        ),
+        ".md": "\n\n".join(page) + "\n",
         ".tex": "\n\n".join(table.latex() for table in tables) + "\n",
         ".csv": "\n".join(f"{table.title}\n{table.csv()}" for table in tables),
     }
     files = [out / f"{stem}{suffix}" for suffix in texts]
     for file, text in zip(files, texts.values(), strict=True):
-        with completed_file(file, overwrite=True) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_text(file, text)
     return files
 
 
@@ -287,20 +288,3 @@ def write_figures(stem: str, results: Results, settings: Settings, out: Path) ->
     path = out / f"{stem}.json"
     write_json(path, {"settings": asdict(settings), **describe(), "results": figures_of(results)})
     return path
-
-
-def _page(title: str, tables: list[Table], remarks: list[str], settings: Settings) -> str:
-    made: dict[str, Any] = describe()
-    machine = made["machine"]
-    budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
-    lines = [
-        f"# {title}",
-        "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
-        f"and {budget} of training, one after another.",
-        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
-        f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
-        f"{machine['torch']}; {made['date']}.",
-        *remarks,
-        *(table.markdown() for table in tables),
-    ]
-    return "\n\n".join(lines) + "\n"

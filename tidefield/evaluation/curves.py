@@ -37,17 +37,14 @@ class TrainerLike(Protocol):
 
 @dataclass
 class QualityCurve:
-    """Views to render while a method trains, and their PSNR so far.
-
-    Attributes:
-        cameras: of the first held-out photograph and of the middle one, at a smaller size.
-        truths: the photographs, as means over the pixels' areas.
-        points: (seconds of training, mean PSNR in dB).
-    """
+    """Views to render while a method trains, and their PSNR so far."""
 
     cameras: tuple[Cameras, ...]
+    """Of the first held-out photograph and of the middle one, at a smaller size."""
     truths: tuple[UInt8[Tensor, "H W 3"], ...]
+    """The photographs, as means over the pixels' areas."""
     points: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of training, mean PSNR in dB)."""
 
     def add(self, seconds: float, renderings: Sequence[Rendering]) -> None:
         """Add the point of one round of renderings."""
@@ -57,9 +54,7 @@ class QualityCurve:
     def watch(self, folder: Path, used: float) -> Callable[[TrainerLike, float], None]:
         """Return a callback of (trainer, share of the budget) that adds and writes a point at each of `SHARES`.
 
-        Args:
-            folder: of the run.
-            used: share of the budget that an earlier part of the training has used; its points are not repeated.
+        `used` is the share that an earlier part of the training has used; its points are not repeated.
         """
         due = [share for share in SHARES if share > used]
 

@@ -35,12 +35,7 @@ _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of an evaluation.
-
-    Attributes:
-        path: the evaluation.json.
-        report: its content.
-    """
+    """Result of an evaluation: the path of its evaluation.json, and what that holds."""
 
     path: Path
     report: dict[str, Any]
@@ -143,7 +138,7 @@ def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
 
 
 def _peak_memory() -> dict[str, int | None]:
-    """Return this process's peak memory so far, in main memory and on a GPU."""
+    """This process's peak memory so far, in main memory and on a GPU."""
     peak = None
     if sys.platform != "win32":
         import resource

@@ -33,11 +33,7 @@ SMALLEST_PX = 32  # AlexNet's poolings leave nothing of a smaller image
 
 
 class Lpips:
-    """LPIPS with one backbone, on CPU.
-
-    Attributes:
-        sha256: of the file of its weights.
-    """
+    """LPIPS with one backbone, on CPU; `sha256` is that of the file of its weights."""
 
     def __init__(self, backbone: Literal["alex", "vgg"], weights: Path, sha256: str) -> None:
         from torchmetrics.functional.image.lpips import _LPIPS
@@ -66,18 +62,18 @@ class Lpips:
             self._truth, self._truth_features = truth, self._features(truth)
         layers = zip(self._network.lins, self._features(image), self._truth_features, strict=True)
         maps = [lin((found - expected).square())[0, 0] for lin, found, expected in layers]
-        return [sum(_weighted_mean(layer, mask) for layer in maps) for mask in masks]
+
+        def weighted_mean(layer: Float[Tensor, "h w"], mask: Bool[Tensor, "H W"]) -> float:
+            share = F.adaptive_avg_pool2d(mask[None].float(), (layer.shape[0], layer.shape[1]))[0]
+            return float((layer * share).sum() / share.sum())
+
+        return [sum(weighted_mean(layer, mask) for layer in maps) for mask in masks]
 
     def _features(self, image: UInt8[Tensor, "H W 3"]) -> list[Tensor]:
         """Return each layer's features, of unit length in every cell."""
         batch = image.permute(2, 0, 1)[None] / 255
         scaled = self._network.scaling_layer(2 * batch - 1)
         return [x / torch.sqrt(1e-8 + x.square().sum(1, keepdim=True)) for x in self._network.net(scaled)]
-
-
-def _weighted_mean(layer: Float[Tensor, "h w"], mask: Bool[Tensor, "H W"]) -> float:
-    share = F.adaptive_avg_pool2d(mask[None].float(), (layer.shape[0], layer.shape[1]))[0]
-    return float((layer * share).sum() / share.sum())
 
 
 def load_lpips() -> dict[str, Lpips | str]:
@@ -102,7 +98,7 @@ def _load(backbone: Literal["alex", "vgg"], path: Path) -> Lpips | str:
         sha256 = file_sha256(path)
     except OSError as error:
         return f"{path.name} cannot be read ({error.strerror}); {how_to_get}"
-    if not _is_published(path.name, sha256):
+    if not sha256.startswith(hash_prefix(path.name)):
         return f"{path.name} is not the published file (its SHA-256 starts with {sha256[:8]}); {how_to_get}"
     return Lpips(backbone, path, sha256)
 
@@ -120,11 +116,11 @@ def download_lpips_weights() -> list[Path]:
     """
     paths = [weights_folder() / file for _, file in BACKBONES.values()]
     for path in paths:
-        if path.is_file() and _is_published(path.name, file_sha256(path)):
+        if path.is_file() and file_sha256(path).startswith(hash_prefix(path.name)):
             continue
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.hub.download_url_to_file(WEIGHTS_URL + path.name, str(path), _hash_prefix(path.name))
+            torch.hub.download_url_to_file(WEIGHTS_URL + path.name, str(path), hash_prefix(path.name))
         except (OSError, URLError, RuntimeError) as error:
             raise RunError(
                 f"{WEIGHTS_URL}{path.name} could not be downloaded ({error}): expected a connection and room in "
@@ -133,13 +129,9 @@ def download_lpips_weights() -> list[Path]:
     return paths
 
 
-def _hash_prefix(file: str) -> str:
-    """Return the start of a published file's SHA-256, which PyTorch puts into its name: NAME-HASH.pth."""
+def hash_prefix(file: str) -> str:
+    """The start of a published file's SHA-256, which PyTorch puts into its name: NAME-HASH.pth."""
     return Path(file).stem.rsplit("-", 1)[1]
-
-
-def _is_published(file: str, sha256: str) -> bool:
-    return sha256.startswith(_hash_prefix(file))
 
 
 def prepare_torchvision() -> str | None:

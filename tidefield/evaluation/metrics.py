@@ -58,16 +58,8 @@ class Scores:
 
 
 def score(rendering: Image8, truth: Image8, seen: Bool[Tensor, "H W"], networks: Mapping[str, Lpips | str]) -> Scores:
-    """Measure all metrics with all suffixes.
-
-    Args:
-        rendering: 8-bit colours.
-        truth: the photograph.
-        seen: the doubly seen pixels.
-        networks: the result of `load_lpips`.
-    """
-    everywhere = torch.ones_like(seen)
-    scores = Scores()
+    """Measure all metrics with all suffixes; `seen` are the doubly seen pixels, `networks` is from `load_lpips`."""
+    everywhere, scores = torch.ones_like(seen), Scores()
     _score_image(scores, rendering, truth, {"": everywhere, "_seen": seen}, networks)
     for suffix, mask in {"_cc": everywhere, "_seen_cc": seen}.items():
         _score_image(scores, fit_colours(rendering, truth, mask), truth, {suffix: mask}, networks)

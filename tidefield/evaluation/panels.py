@@ -22,19 +22,11 @@ COLOUR_MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "magma": cv2.COLORMAP_MAGMA}
 
 @dataclass(frozen=True)
 class Scale:
-    """Meaning of a panel's colours.
-
-    Attributes:
-        colour_map: one of `COLOUR_MAPS`.
-        low: value at the start of the map.
-        high: value at its end.
-        unit: written after the values.
-    """
+    """Meaning of a panel's colours: one of `COLOUR_MAPS`, and the values at its ends."""
 
     colour_map: str
     low: float
     high: float
-    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,10 +46,10 @@ def colours(values: Float[Tensor, "H W"], scale: Scale) -> UInt8[Tensor, "H W 3"
     return torch.from_numpy(cv2.applyColorMap(grey, COLOUR_MAPS[scale.colour_map])[..., ::-1].copy())
 
 
-def depth_panel(label: str, depth: Float[Tensor, "H W"], unit: str = "") -> Panel:
+def depth_panel(label: str, depth: Float[Tensor, "H W"]) -> Panel:
     """Return depths as a panel, coloured from their 1st to their 99th percentile."""
     low, high = np.percentile(depth.cpu().numpy(), [1, 99]).tolist()
-    scale = Scale("viridis", low, high, unit)
+    scale = Scale("viridis", low, high)
     return Panel(label, colours(depth, scale), scale)
 
 
@@ -91,7 +83,7 @@ def strip(width: int, left: str, right: str = "") -> Image.Image:
 
 def _scale_bar(width: int, scale: Scale) -> Image.Image:
     """Draw the colour map between its two values."""
-    low, high = (f"{value:.3g}{scale.unit}" for value in (scale.low, scale.high))
+    low, high = (f"{value:.3g}" for value in (scale.low, scale.high))
     band = strip(width, low, high)
     text = max(int(ImageFont.load_default(14).getlength(word)) for word in (low, high)) + 14
     length = width - 2 * text

@@ -25,7 +25,7 @@ from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, intersect_axes
 from tidefield.geometry.lenses import Lens
 from tidefield.render.nerfstudio_path import read_nerfstudio_path
 
@@ -121,10 +121,7 @@ def make_trajectory(
     Args:
         path: `cameras`, `orbit`, `strip`, or a camera-path JSON as nerfstudio's viewer exports it.
         scene: its training cameras and sparse points determine the path.
-        frames: number of frames; a JSON has its own frames, size and speed, and these arguments are not used then.
-        width: of the frames, pixels.
-        height: likewise.
-        frames_per_second: of the video.
+        frames, width, height, frames_per_second: of the video, pixels; a JSON has its own instead.
 
     Raises:
         TidefieldError: the name is none of these, or the file cannot be read as a camera path.
@@ -216,7 +213,7 @@ def orbit(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
             radius = abs(height) * np.clip(narrow / max(abs(height), 1e-9), 0.1, np.tan(STEEPEST))
         around = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
         position = layout.centre + radius * around + height * layout.up
-    return position, _look_along(layout.centre - position, layout.up)
+    return position, look_along(layout.centre - position, layout.up)
 
 
 def strip(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
@@ -235,7 +232,7 @@ def strip(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
             middle = ends * axis + np.median(layout.position @ side) * side
             middle = middle + (layout.position @ layout.up).mean() * layout.up
     position = middle + reach * np.linspace(-half, half, frames)[:, None] * axis
-    return position, _look_along(np.broadcast_to(ahead, position.shape), up)
+    return position, look_along(np.broadcast_to(ahead, position.shape), up)
 
 
 SHAPES: dict[str, Shape] = {"cameras": among_cameras, "orbit": orbit, "strip": strip}
@@ -257,11 +254,10 @@ def _distance(scene: Scene) -> float:
 
 def _focus(position: Positions, ahead: Positions) -> Vector | None:
     """Return the point nearest to all optical axes if these meet in front of the cameras (Blender, turntables)."""
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    if np.linalg.eigvalsh(across.mean(0))[0] < 0.02:
+    focus = intersect_axes(position, ahead)
+    if focus is None:
         return None
-    focus = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, position))
-    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, focus - position), axis=1)
+    missed = np.linalg.norm(np.cross(focus - position, ahead), axis=1)
     spread = np.linalg.norm(position - position.mean(0), axis=1)
     in_front = ((focus - position) * ahead).sum(1) > 0
     meets = np.median(missed) < 0.25 * np.median(spread) and in_front.mean() > 0.9
@@ -316,7 +312,7 @@ def _flight(layout: Layout, frames: int, reach: float) -> Poses:
     position = at[:, None] * axis + aside[:, None] * side + (near @ height)[:, None] * layout.up
     heading = np.gradient(at)[:, None] * axis + np.gradient(aside)[:, None] * side
     heading = (heading / np.linalg.norm(heading, axis=1, keepdims=True))[1:-1]
-    return position[1:-1], _look_along(np.sin(AHEAD) * heading - np.cos(AHEAD) * layout.up, heading)
+    return position[1:-1], look_along(np.sin(AHEAD) * heading - np.cos(AHEAD) * layout.up, heading)
 
 
 def _spline(position: Positions, rotation: Rotations) -> Poses:
@@ -364,7 +360,7 @@ def _within_azimuths(
     return start + (2 * np.pi - gap[widest]) * (1 - np.cos(turn)) / 2
 
 
-def _look_along(forward: Positions, up: Vector | Positions) -> Rotations:
+def look_along(forward: Positions, up: Vector | Positions) -> Rotations:
     """Return camera-to-world rotations that look along `forward` with `up` upwards in the picture."""
     ahead = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(ahead, up)

@@ -28,22 +28,17 @@ LARGEST_SIDE = 16384  # the largest that x264 encodes
 
 @dataclass(frozen=True)
 class NerfstudioPath:
-    """Frames of a video in a scene's coordinates as they are on disk (its origin is not subtracted yet).
-
-    Attributes:
-        position: camera centres.
-        rotation: camera-to-world with OpenCV's axes (columns: right, down, forward).
-        focal_px: per frame, for square pixels.
-        width: of the video; height likewise.
-        frames_per_second: None if the file does not state it.
-    """
+    """Frames of a video in a scene's coordinates as they are on disk (its origin is not subtracted yet)."""
 
     position: Float64[np.ndarray, "F 3"]
     rotation: Float64[np.ndarray, "F 3 3"]
+    """Camera-to-world with OpenCV's axes (columns: right, down, forward)."""
     focal_px: Float64[np.ndarray, " F"]
+    """For square pixels."""
     width: int
     height: int
     frames_per_second: float | None
+    """None if the file does not state it."""
 
 
 def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
@@ -68,12 +63,9 @@ def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
         _number(top, key, str(file), lambda x: x == round(x) and 1 <= x <= LARGEST_SIDE, f"1 to {LARGEST_SIDE} pixels")
         for key in ("render_width", "render_height")
     )
-    places = [f"{file}, frame {i}" for i in range(len(frames))]
-    degrees = [
-        _number(frame, "fov", place, lambda x: 0 < x < 180, "0 to 180 degrees")
-        for frame, place in zip(frames, places, strict=True)
-    ]
-    pose = np.stack([_pose(frame, place) for frame, place in zip(frames, places, strict=True)])
+    placed = [(frame, f"{file}, frame {i}") for i, frame in enumerate(frames)]
+    degrees = [_number(frame, "fov", place, lambda x: 0 < x < 180, "0 to 180 degrees") for frame, place in placed]
+    pose = np.stack([_pose(frame, place) for frame, place in placed])
     pose = _undo_normalisation(pose, file.with_name(NORMALISATION_FILE), scene_root)
     speed = None
     for key, to_speed in (("fps", lambda x: x), ("seconds", lambda x: len(frames) / x)):

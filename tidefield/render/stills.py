@@ -33,14 +33,8 @@ def depth_range(rendering: Rendering) -> tuple[float, float]:
     return low, max(high, 1.001 * low)
 
 
-def depth_picture(rendering: Rendering, near_far: tuple[float, float] | None = None) -> UInt8[np.ndarray, "H W 3"]:
-    """Return depths as colours of OpenCV's turbo, linear in disparity: red is near, blue far, black shows nothing.
-
-    Args:
-        rendering: its depth and opacity are used.
-        near_far: depths of the two ends; None takes the picture's own. Frames of a video should share them.
-    """
-    near, far = near_far or depth_range(rendering)
+def depth_picture(rendering: Rendering, near: float, far: float) -> UInt8[np.ndarray, "H W 3"]:
+    """Return depths as colours of OpenCV's turbo, linear in disparity: red is near, blue far, black shows nothing."""
     depth = rendering.depth.detach().float().cpu().numpy()
     nearness = (1 / np.maximum(depth, 1e-9) - 1 / far) / (1 / near - 1 / far)
     level = np.round(255 * np.clip(nearness, 0, 1)).astype(np.uint8)
@@ -75,7 +69,7 @@ def write_still(rendering: Rendering, path: Path, *, overwrite: bool = False) ->
     with completed_file(numbers, overwrite=overwrite) as partial:
         np.save(partial, depth.cpu().numpy())
     with completed_file(picture, overwrite=overwrite) as partial:
-        Image.fromarray(depth_picture(rendering, (near, far))).save(partial, pnginfo=text)
+        Image.fromarray(depth_picture(rendering, near, far)).save(partial, pnginfo=text)
     with completed_file(path, overwrite=overwrite) as partial:
         Image.fromarray(colour_picture(rendering)).save(partial)
     return path, numbers, picture

@@ -128,17 +128,14 @@ def load_network(folder: Path, network: nn.Module) -> TrainingProgress:
     Raises:
         RunError: there is no checkpoint, it is damaged, or it belongs to another network.
     """
-    tensors, progress = _read_checkpoint(folder)
-    _load_state(folder, network, tensors)
-    return progress
+    return _load_network(folder, network)[0]
 
 
 def load_training(
     folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, generator: torch.Generator
 ) -> TrainingProgress:
     """Read all of a run's checkpoint, so that training continues as if it had not stopped."""
-    tensors, progress = _read_checkpoint(folder)
-    _load_state(folder, network, tensors)
+    progress, tensors = _load_network(folder, network)
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimizer."):
@@ -149,19 +146,29 @@ def load_training(
     return progress
 
 
-def _read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], TrainingProgress]:
+def _load_network(folder: Path, network: nn.Module) -> tuple[TrainingProgress, dict[str, Tensor]]:
+    """Read a checkpoint's weights into a network; returns its progress and all of its tensors."""
     path = folder / CHECKPOINT_FILE
     if not path.is_file():
         raise RunError(f"{folder} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
     try:
         header, tensors = _read_tensors(path)
         losses = [float(x) for x in header["losses"]]
-        return tensors, TrainingProgress(int(header["step"]), float(header["seconds"]), losses)
+        progress = TrainingProgress(int(header["step"]), float(header["seconds"]), losses)
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise RunError(
             f"{path} is damaged or of another program ({error}): expected a checkpoint that `tidefield train` wrote; "
             "train again into a new folder"
         ) from error
+    try:
+        network.load_state_dict(
+            {name.removeprefix("network."): v for name, v in tensors.items() if name.startswith("network.")}
+        )
+    except RuntimeError as error:
+        raise RunError(
+            f"{path} does not fit {folder / RUN_FILE}: expected two files of one run; restore the right one"
+        ) from error
+    return progress, tensors
 
 
 def _read_tensors(path: Path) -> tuple[Any, dict[str, Tensor]]:
@@ -169,17 +176,6 @@ def _read_tensors(path: Path) -> tuple[Any, dict[str, Tensor]]:
     with safe_open(path, framework="pt") as file:
         header = json.loads((file.metadata() or {})["tidefield"])
         return header, convert_names_0_1({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
-
-
-def _load_state(folder: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
-    weights = {name.removeprefix("network."): v for name, v in tensors.items() if name.startswith("network.")}
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError as error:
-        raise RunError(
-            f"{folder / CHECKPOINT_FILE} does not fit {folder / RUN_FILE}: expected two files of one run; restore the "
-            "right one"
-        ) from error
 
 
 _NAMES_0_1 = (
@@ -242,19 +238,17 @@ def given_or_shipped(given: Path | None, preset: str) -> Path:
 
 
 def write_weights(path: Path, network: Network, config: Config, description: dict[str, Any]) -> None:
-    """Write a network's weights in half precision, over older ones.
-
-    Args:
-        path: the file.
-        network: whose weights.
-        config: of the network.
-        description: what else to keep with them, for JSON.
-    """
+    """Write a network's weights in half precision, over older ones; `description` is kept with them as JSON."""
     state = network.state_dict()
     tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in state.items()}
     header = {"config": config_to_json(config), "version": __version__, **description}
     with completed_file(path, overwrite=True) as partial:
         save_file(tensors, partial, metadata={"tidefield": json.dumps(header)})
+
+
+def _require_weights(path: Path) -> None:
+    if not path.is_file() or path.stat().st_size > _LARGEST_WEIGHTS_FILE:
+        raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
 
 
 def weights_sha256(path: Path) -> str:
@@ -267,13 +261,21 @@ def weights_sha256(path: Path) -> str:
     return file_sha256(path)
 
 
-def describe_weights(path: Path) -> dict[str, Any]:
-    """The description in a weights file.
+def read_weights_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The description in a weights file, and its tensors.
 
     Raises:
         RunError: there is no such file, or it is damaged.
     """
-    return _read_weights(path)[0]
+    _require_weights(path)
+    try:
+        header, tensors = _read_tensors(path)
+        header["config"]["network"].keys()
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise RunError(
+            f"{path} is damaged or of another program ({error}): expected what `tidefield pretrain` wrote; name another"
+        ) from error
+    return header, tensors
 
 
 def read_weights(path: Path, network: Network) -> None:
@@ -282,7 +284,7 @@ def read_weights(path: Path, network: Network) -> None:
     Raises:
         RunError: there is no such file, it is damaged, or it belongs to another network.
     """
-    header, tensors = _read_weights(path)
+    header, tensors = read_weights_file(path)
     config = config_from_json(header["config"])
     assert isinstance(config, Config), "other methods have no weights files"
     own, theirs = _comparable(asdict(network.config)), _comparable(asdict(config.network))
@@ -293,23 +295,6 @@ def read_weights(path: Path, network: Network) -> None:
         for name, value in network.state_dict().items():
             if name in tensors:
                 value.copy_(tensors[name])
-
-
-def _require_weights(path: Path) -> None:
-    if not path.is_file() or path.stat().st_size > _LARGEST_WEIGHTS_FILE:
-        raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
-
-
-def _read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    _require_weights(path)
-    try:
-        header, tensors = _read_tensors(path)
-        header["config"]["network"].keys()
-    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise RunError(
-            f"{path} is damaged or of another program ({error}): expected what `tidefield pretrain` wrote; name another"
-        ) from error
-    return header, tensors
 
 
 def _comparable(network: dict[str, Any]) -> dict[str, Any]:

@@ -47,15 +47,7 @@ class Trainer(ABC):
     """A network, its optimiser and its position in the sequence of random batches.
 
     The same seed, scene and budget in steps give the same weights bit for bit on a CPU, however often training is
-    stopped and resumed.
-
-    Args:
-        network: on `device`.
-        learning_rate: its peak.
-        scene: to learn from.
-        seed: of the batches.
-        device: where to compute.
-        adam: further options of the optimiser.
+    stopped and resumed. `learning_rate` is the peak; `adam` are further options of the optimiser.
     """
 
     def __init__(
@@ -73,10 +65,8 @@ class Trainer(ABC):
         self.progress = TrainingProgress()
         self.cameras = scene.cameras.to(device)
 
-    @property
-    def is_main_process(self) -> bool:
-        """Whether this process writes what is learned: one of several that train together does."""
-        return True
+    is_main_process = True
+    """Whether this process writes what is learned: one of several that train together does."""
 
     @property
     @abstractmethod
@@ -108,6 +98,7 @@ class Trainer(ABC):
         return asked
 
     def resume(self, folder: Path) -> None:
+        """Continue with a run's checkpoint."""
         self.progress = load_training(folder, self.network, self.optimizer, self.generator)
 
     def save(self, folder: Path) -> None:
@@ -134,12 +125,7 @@ class Trainer(ABC):
 class SceneTrainer(Trainer):
     """Trains a network over neighbouring views on tiles of one scene's photographs.
 
-    Args:
-        config: network and training.
-        scene: to learn from.
-        seed: of weights and batches.
-        device: where to compute.
-        weights: a weights file to start from; random weights if None.
+    `seed` is that of weights and batches; `weights` is a file to start from, None for random ones.
     """
 
     network: Network
@@ -155,14 +141,16 @@ class SceneTrainer(Trainer):
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
         self.config = config
         self.priors = DepthPriors(scene)
-        self.batch_loss = BatchLoss(network, config.train)
+        self.batch_loss: nn.Module = BatchLoss(network, config.train)
 
     @property
     def rays_per_step(self) -> int:
         return self.config.train.tiles * self.config.train.tile_px**2
 
     def rate(self, share: float) -> float:
-        return cosine_rate(self.progress.step, share, self.config.train.warm_up)
+        """Up in a line, down half a cosine."""
+        warm = min(1.0, (self.progress.step + 1) / self.config.train.warm_up)
+        return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self.batch_loss(self.scene, self.priors, self.cameras, self.config.network.views, self.generator)
@@ -171,21 +159,10 @@ class SceneTrainer(Trainer):
         return Renderer(self.network, self.scene, self.config, self.device)
 
 
-def cosine_rate(step: int, share: float, warm_up: int) -> float:
-    """Learning rate as a share of its peak: up in a line, down half a cosine."""
-    warm = min(1.0, (step + 1) / warm_up)
-    return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
-
-
 def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, callback: Callback | None = None) -> bool:
     """Train until the budget is used; save every minute, at the end, and on Ctrl-C or SIGTERM.
 
-    Args:
-        trainer: what to train.
-        folder: the run's.
-        budget: steps or minutes.
-        console: where progress is shown.
-        callback: called after every step; its time does not count.
+    `callback` is called after every step; its time does not count.
 
     Returns:
         Whether the budget was used up; False after an interruption, from which `resume` continues.
@@ -205,9 +182,10 @@ def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, call
                     f"the loss is {error} at step {progress.step}; this is a defect of the program"
                 )
             mean = sum(progress.losses) / len(progress.losses)
-            bar(used(), 1, _state(trainer, mean))
+            rays, psnr = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9), psnr_from_mse(mean)
+            bar(used(), 1, f"step {progress.step}  loss {mean:.5f}  PSNR {psnr:.2f} dB  {rays:,.0f} rays/s")
             if progress.step % 20 == 0:
-                writer.add_scalar("train/psnr", psnr_from_mse(mean), progress.step)
+                writer.add_scalar("train/psnr", psnr, progress.step)
                 writer.add_scalar("train/mean_square_error", error, progress.step)
             if callback is not None:
                 callback(trainer, used())
@@ -222,17 +200,9 @@ def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, call
                 pictured = time.monotonic()
         if trainer.is_main_process:
             trainer.save(folder)
-        if trainer.is_main_process and not stop_requested():
-            _write_picture(trainer, writer)
+            if not stop_requested():
+                _write_picture(trainer, writer)
     return used() >= 1
-
-
-def _state(trainer: Trainer, mean_square: float) -> str:
-    """Step, loss, PSNR and rays per second."""
-    progress = trainer.progress
-    rays = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9)
-    psnr = psnr_from_mse(mean_square)
-    return f"step {progress.step}  loss {mean_square:.5f}  PSNR {psnr:.2f} dB  {rays:,.0f} rays/s"
 
 
 def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:

@@ -20,14 +20,11 @@ from tidefield.config import Config
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.evaluation.curves import make_curve
-from tidefield.files import completed_file
-from tidefield.model.network import Network, make_network
+from tidefield.files import read_json, write_text
 from tidefield.model.renderer import Renderer
-from tidefield.model.rendering import Render
 from tidefield.synthetic import CATEGORIES, Flight
-from tidefield.train.loop import ADAM, Trainer, cosine_rate
-from tidefield.train.losses import BatchLoss
-from tidefield.train.stream import Recipe, Source, make
+from tidefield.train.loop import SceneTrainer, Trainer
+from tidefield.train.stream import Recipe, Stream, make
 
 VIEWS = {4: 0.2, 5: 0.35, 6: 0.2, 8: 0.15, 10: 0.06, 12: 0.04}
 """Numbers of neighbouring views of a step, and how often: what users may set, the cheap ones more often."""
@@ -86,7 +83,7 @@ def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> d
     return scenes | {path.resolve().name: load_scene(path, width=VALIDATION_WIDTH) for path in real}
 
 
-class Pretrainer(Trainer):
+class Pretrainer(SceneTrainer):
     """Trains a network on one scene after the other.
 
     Args:
@@ -97,28 +94,17 @@ class Pretrainer(Trainer):
         device: where to compute.
     """
 
-    network: Network
-
-    def __init__(self, config: Config, stream: Source, shown: Scene, seed: int, device: torch.device) -> None:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = make_network(config.network).to(device)
-        self.config, self.stream, self.seed = config, stream, process_seed(seed)
-        super().__init__(network, config.train.learning_rate, shown, self.seed, device, ADAM)
-        loss = BatchLoss(network, config.train)
-        # What acts between views only (eq. 6) has no gradient where a single view sees.
-        self.batch_loss = DistributedDataParallel(loss, find_unused_parameters=True) if is_distributed() else loss
-
-    @property
-    def is_main_process(self) -> bool:
-        return is_main_process()
+    def __init__(self, config: Config, stream: Stream, shown: Scene, seed: int, device: torch.device) -> None:
+        super().__init__(config, shown, seed, device)
+        self.stream, self.seed, self.is_main_process = stream, process_seed(seed), is_main_process()
+        self.generator.manual_seed(self.seed)
+        if is_distributed():
+            # What acts between views only (eq. 6) has no gradient where a single view sees.
+            self.batch_loss = DistributedDataParallel(self.batch_loss, find_unused_parameters=True)
 
     @property
     def rays_per_step(self) -> int:
-        return world_size() * self.config.train.tiles * self.config.train.tile_px**2
-
-    def rate(self, share: float) -> float:
-        return cosine_rate(self.progress.step, share, self.config.train.warm_up)
+        return world_size() * super().rays_per_step
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
         drawn = self.stream.draw(self.progress.step, self.generator)
@@ -128,9 +114,6 @@ class Pretrainer(Trainer):
         # All scenes count alike: the gradient is that of decibels. Otherwise the least predictable scenes (trees,
         # brighton_beach) would have a hundred times the weight of bare mud, and nothing would be learned from it.
         return loss / (error.detach() + LEAST_ERROR), error
-
-    def renderer(self) -> Render:
-        return Renderer(self.network, self.scene, self.config, self.device)
 
     def should_stop(self, asked: bool) -> bool:
         if not is_distributed():
@@ -157,7 +140,7 @@ class Validation:
     def __init__(self, scenes: Mapping[str, Scene], folder: Path) -> None:
         self.scenes, self.file = scenes, folder / VALIDATION_FILE
         self.curves = {name: make_curve(scene, smaller=1) for name, scene in scenes.items()}
-        self.points: list[dict] = json.loads(self.file.read_text(encoding="utf-8")) if self.file.is_file() else []
+        self.points: list[dict] = read_json(self.file) or []
 
     def __call__(self, trainer: Trainer, share: float) -> None:
         step = trainer.progress.step
@@ -173,5 +156,4 @@ class Validation:
         trainer.network.train()
         self.points = [point for point in self.points if point["step"] < step]
         self.points.append({"step": step, "seconds": trainer.progress.seconds, "psnr": psnr})
-        with completed_file(self.file, overwrite=True) as partial:
-            partial.write_text(json.dumps(self.points), encoding="utf-8")
+        write_text(self.file, json.dumps(self.points))

@@ -16,7 +16,6 @@ from functools import cache
 from multiprocessing import get_context
 from multiprocessing.pool import AsyncResult
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -60,12 +59,8 @@ RECOLOURED_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters of a procedural scene; equal recipes make equal scenes.
-
-    Attributes:
-        category, seed, views, width, flight: of the survey.
-        misposed: photographs with a wrong attitude, as structure from motion sometimes gives.
-    """
+    """Parameters of a procedural survey, and which of its photographs have a wrong attitude, as structure from motion
+    sometimes gives; equal recipes make equal scenes."""
 
     category: str
     seed: int
@@ -170,20 +165,6 @@ def misposed(survey: Survey, given: Recipe) -> Survey:
     return replace(survey, cameras=replace(survey.cameras, T_world_camera=pose))
 
 
-def _end_quietly() -> None:
-    """End on SIGTERM without a message; imported libraries would print a traceback."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-@runtime_checkable
-class Source(Protocol):
-    """A source of scenes to learn from."""
-
-    def draw(self, step: int, generator: torch.Generator) -> Drawn:
-        """A scene for a step; the same for the same step and state of the generator."""
-        ...
-
-
 def rotate(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
     """Rotate the world axes of a scene for the network; the quaternion need not be of unit length."""
     turn = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
@@ -207,7 +188,8 @@ class Stream:
         self.pool: dict[int, Drawn] = {}
         self.pending: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
-        self.maker = get_context("spawn").Pool(1, _end_quietly)
+        # By default SIGTERM ends it without a message; imported libraries would print a traceback.
+        self.maker = get_context("spawn").Pool(1, signal.signal, (signal.SIGTERM, signal.SIG_DFL))
         folder.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Stream:

@@ -1,4 +1,4 @@
-"""Train and render with nerfstudio's methods: the other end of `worker.py`'s lines.
+"""Train and render with nerfstudio's methods: write it a scene, and be the other end of `worker.py`'s lines.
 
 RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio writes, RUN/job.json its job.
 """
@@ -15,22 +15,25 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
-from tidefield.baselines.nerfstudio.export import camera_to_json, export
 from tidefield.config import Budget
+from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, QualityCurve
 from tidefield.files import read_json, write_json
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
 from tidefield.train.checkpoint import TrainingProgress
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
 KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
-"""What `tidefield.device.keep_large_allocations` does for us, as glibc takes it from the environment."""
+"""What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """A worker may take so long to end."""
 
@@ -52,10 +55,7 @@ def train(
     Args:
         method: by nerfstudio's name.
         scene: exported into the run's folder.
-        folder: the run's.
-        budget: steps or minutes.
-        seed: of weights and batches.
-        device: where nerfstudio computes.
+        folder, budget, seed, device: of the run.
         curve: what to render and judge meanwhile, if the budget is one of minutes; training's clock stands still then.
         progress: called with steps done and seconds of training.
 
@@ -198,8 +198,58 @@ def _failed(folder: Path) -> RunError:
 
 
 def _read_job(folder: Path) -> dict[str, Any]:
-    path = folder / JOB_FILE
-    job = read_json(path) or {}
+    job = read_json(folder / JOB_FILE) or {}
     if "trained" not in job:
         raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
     return job
+
+
+def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
+    """Write photographs (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
+
+    Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
+
+    Returns:
+        The factor: renderings divided by it are at the common exposure.
+    """
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    cameras, files = scene.cameras, [f"images/{index:05d}.png" for index in range(len(scene.names))]
+    factor = cameras.gain.amin(0).clamp(max=1.0) if scene.background_rgb is None else torch.ones(3)
+    for index, file in enumerate(files):
+        colour = scene.photographs[index].float() / cameras.gain[index] * factor
+        Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+    columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
+    lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
+    points = scene.points
+    write_transforms_file(
+        folder,
+        files,
+        lenses,
+        cameras.T_world_camera[:, :3].double().numpy(),
+        (scene.train, scene.test),
+        np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
+        _point_colours(scene),
+        overwrite=True,
+    )
+    return factor
+
+
+def camera_to_json(camera: Cameras) -> dict[str, Any]:
+    """Describe one camera for the worker."""
+    names = ("T_world_camera", "focal_px", "principal_px", "size_px")
+    return {name: getattr(camera, name)[0].tolist() for name in names}
+
+
+def _point_colours(scene: Scene) -> UInt8[np.ndarray, "P 3"]:
+    """Sample each sparse point's colour in the first training photograph that shows it; grey where none does."""
+    points = scene.points
+    if points is None:
+        return np.zeros((0, 3), dtype=np.uint8)
+    rgb = np.full((len(points.xyz_world), 3), 128, dtype=np.uint8)
+    for index in reversed(scene.train):
+        mine = points.camera_index == index
+        photograph = scene.photographs[index]
+        u, v = points.uv_px[mine].floor().long().unbind(-1)
+        inside = (u >= 0) & (v >= 0) & (u < photograph.shape[1]) & (v < photograph.shape[0])
+        rgb[points.point_index[mine][inside].numpy()] = photograph[v[inside], u[inside]].numpy()
+    return rgb
