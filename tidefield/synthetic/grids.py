@@ -163,15 +163,11 @@ class Noise:
         """Evaluate one octave; each `octave` number turns and shifts the lattice so that no two line up."""
         angle = octave * _GOLDEN_ANGLE
         cos, sin = math.cos(angle) / wavelength_m, math.sin(angle) / wavelength_m
-        x, y = xy[0] * cos - xy[1] * sin + 37.3 * octave, xy[0] * sin + xy[1] * cos + 91.7 * octave
-        at = torch.stack([x, y], dim=-1)
-        at = at - _LATTICE_CELLS * torch.floor(at / _LATTICE_CELLS)
-        cell = torch.floor(at)
-        f = at - cell
-        # Where linear interpolation gives the cubic fade.
-        grid = (cell + f * f * (3 - 2 * f)) * (2 / _LATTICE_CELLS) - 1
+        x = _lattice_coordinate(xy[0] * cos - xy[1] * sin + 37.3 * octave)
+        y = _lattice_coordinate(xy[0] * sin + xy[1] * cos + 91.7 * octave)
+        grid = torch.stack([x, y], dim=-1)[None, None]
         # Corners aligned: this is a lattice of nodes, not an image of pixels.
-        return F.grid_sample(self.table, grid[None, None], padding_mode="border", align_corners=True)[0, :, 0]
+        return F.grid_sample(self.table, grid, padding_mode="border", align_corners=True)[0, :, 0]
 
     def fractal(
         self, xy: Float[Tensor, "2 P"], wavelength_m: float, octaves: int, gain: float = 0.5
@@ -181,3 +177,11 @@ class Noise:
         for k in range(1, octaves):
             total = total + gain**k * self.octave(xy, wavelength_m / 2**k, k)
         return total * (1 - gain) / (1 - gain**octaves) * 1.6
+
+
+def _lattice_coordinate(x: Tensor) -> Tensor:
+    """Return the coordinate in [-1, 1] at which linear interpolation gives the cubic fade."""
+    x = x - _LATTICE_CELLS * torch.floor(x / _LATTICE_CELLS)
+    cell = torch.floor(x)
+    f = x - cell
+    return (cell + f * f * (3 - 2 * f)) * (2 / _LATTICE_CELLS) - 1
