@@ -217,6 +217,14 @@ def exif_of(**tags: object) -> bytes:
     return table.tobytes()
 
 
+def test_a_fraction_of_a_second_in_other_digits_is_none(tmp_path: Path):
+    from PIL import Image
+
+    exif = exif_of(DateTimeOriginal="2024:05:06 07:08:09", SubsecTimeOriginal="\u00b2".encode("latin-1"))
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_exposures([tmp_path / "a.jpg"]).time_s[0] == 1714979289.0
+
+
 def test_a_factor_that_one_photograph_lacks_is_left_out_for_all(tmp_path: Path):
     from PIL import Image
 

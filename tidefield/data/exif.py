@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image, PngImagePlugin
 
-from tidefield.data.readers.files import open_picture
+from tidefield.data.readers.files import open_picture, quiet_pillow
 
 EXPOSURE_POWERS = {
     ExifTags.Base.ExposureTime: 1,
@@ -111,6 +111,7 @@ def read_exif(image: Image.Image) -> Exif:
     return Exif(tags, gps)
 
 
+@quiet_pillow()
 def read_exposures(paths: Sequence[Path]) -> Exposures:
     """Read exposures and capture times from the EXIF of photographs, without decoding pixels.
 

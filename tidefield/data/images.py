@@ -25,7 +25,7 @@ from jaxtyping import UInt8
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from tidefield.data.readers.files import open_picture
+from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens, rectify
@@ -90,6 +90,7 @@ class PhotographFile:
         return self.width * self.height * (4 if self.has_alpha else 3)
 
 
+@quiet_pillow()
 def read_header(path: Path) -> tuple[int, int, bool]:
     """Read the width, the height and the presence of alpha without decoding; EXIF orientation is not applied.
 
@@ -102,6 +103,7 @@ def read_header(path: Path) -> tuple[int, int, bool]:
         return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
 
 
+@quiet_pillow()
 def open_photographs(
     files: Sequence[PhotographFile],
     background_rgb: tuple[float, float, float],
