@@ -217,6 +217,14 @@ def exif_of(**tags: object) -> bytes:
     return table.tobytes()
 
 
+def test_exif_of_megabytes_counts_as_damaged(tmp_path: Path):
+    from PIL import Image
+
+    exif = exif_of(ExposureTime=1 / 100, MakerNote=bytes(1_000_000))
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png", exif=exif)
+    assert np.isnan(read_exposures([tmp_path / "a.png"]).log_exposure).all()
+
+
 def test_a_fraction_of_a_second_in_other_digits_is_none(tmp_path: Path):
     from PIL import Image
 
