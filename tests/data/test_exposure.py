@@ -10,6 +10,7 @@ import torch
 from shared_data import SHARED
 from torch import Tensor
 
+from tidefield.data import exposure
 from tidefield.data.exif import Exposures, read_exposures
 from tidefield.data.exposure import disagreement, estimate_gains
 from tidefield.data.images import Photographs
@@ -168,6 +169,25 @@ def test_exposures_that_the_photographs_contradict_are_ignored():
     metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
     found = estimate_gains(photographs, cameras, points, TRAIN, metadata)
     assert found.log().abs().max() < 0.02
+
+
+def test_where_many_photographs_share_points_the_gains_are_the_same_without_a_normal_matrix(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    random = np.random.default_rng(0)
+    photographs, points, sharing = 90, 120, 80
+    photograph = np.concatenate([random.choice(photographs, sharing, replace=False) for _ in range(points)])
+    point = np.repeat(np.arange(points), sharing)
+    gain, colour = random.normal(0, 0.2, (photographs, 3)), random.normal(4, 0.5, (points, 3))
+    value = gain[photograph] + colour[point] + 0.05 * random.standard_t(3, (len(point), 3))
+    seen = exposure.Seen(value, point, photograph, np.arange(len(point)))
+    monkeypatch.setattr(exposure, "MOST_SHARED", sharing)
+    direct, noise = exposure.robust_gains(seen, np.zeros(photographs))
+    monkeypatch.setattr(exposure, "MOST_SHARED", sharing - 1)
+    monkeypatch.delattr(exposure, "spsolve")
+    gains, again = exposure.robust_gains(seen, np.zeros(photographs))
+    np.testing.assert_allclose(gains, direct, atol=1e-6)
+    assert again == pytest.approx(noise, abs=1e-9)
 
 
 def test_without_sparse_points_gains_follow_exif_or_are_one():
