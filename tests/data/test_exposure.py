@@ -10,6 +10,7 @@ import torch
 from shared_data import SHARED
 from torch import Tensor
 
+from tidefield.data import exposure
 from tidefield.data.exif import Exposures, read_exposures
 from tidefield.data.exposure import disagreement, estimate_gains
 from tidefield.data.images import Photographs
@@ -170,6 +171,25 @@ def test_exposures_that_the_photographs_contradict_are_ignored():
     assert found.log().abs().max() < 0.02
 
 
+def test_where_many_photographs_share_points_the_gains_are_the_same_without_a_normal_matrix(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    random = np.random.default_rng(0)
+    photographs, points, sharing = 90, 120, 80
+    photograph = np.concatenate([random.choice(photographs, sharing, replace=False) for _ in range(points)])
+    point = np.repeat(np.arange(points), sharing)
+    gain, colour = random.normal(0, 0.2, (photographs, 3)), random.normal(4, 0.5, (points, 3))
+    value = gain[photograph] + colour[point] + 0.05 * random.standard_t(3, (len(point), 3))
+    seen = exposure.Seen(value, point, photograph, np.arange(len(point)))
+    monkeypatch.setattr(exposure, "MOST_SHARED", sharing)
+    direct, noise = exposure.robust_gains(seen, np.zeros(photographs))
+    monkeypatch.setattr(exposure, "MOST_SHARED", sharing - 1)
+    monkeypatch.delattr(exposure, "spsolve")
+    gains, again = exposure.robust_gains(seen, np.zeros(photographs))
+    np.testing.assert_allclose(gains, direct, atol=1e-6)
+    assert again == pytest.approx(noise, abs=1e-9)
+
+
 def test_without_sparse_points_gains_follow_exif_or_are_one():
     photographs, cameras, _ = survey(planted())
     log_exposure = torch.linspace(0, 1, COUNT, dtype=torch.float64)
@@ -215,6 +235,22 @@ def exif_of(**tags: object) -> bytes:
     table = Image.Exif()
     table[ExifTags.IFD.Exif] = {ExifTags.Base[name]: value for name, value in tags.items()}
     return table.tobytes()
+
+
+def test_exif_of_megabytes_counts_as_damaged(tmp_path: Path):
+    from PIL import Image
+
+    exif = exif_of(ExposureTime=1 / 100, MakerNote=bytes(1_000_000))
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png", exif=exif)
+    assert np.isnan(read_exposures([tmp_path / "a.png"]).log_exposure).all()
+
+
+def test_a_fraction_of_a_second_in_other_digits_is_none(tmp_path: Path):
+    from PIL import Image
+
+    exif = exif_of(DateTimeOriginal="2024:05:06 07:08:09", SubsecTimeOriginal="\u00b2".encode("latin-1"))
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_exposures([tmp_path / "a.jpg"]).time_s[0] == 1714979289.0
 
 
 def test_a_factor_that_one_photograph_lacks_is_left_out_for_all(tmp_path: Path):

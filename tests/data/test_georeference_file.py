@@ -63,6 +63,9 @@ def test_a_scene_without_the_file_has_no_georeference(tmp_path):
     [
         lambda text: text[: len(text) // 2],
         lambda text: "[]",
+        lambda text: "[" * 100_000,
+        lambda text: text.replace('"scale": ', '"scale": 1' + 400 * "0"),
+        lambda text: text.replace('"translation": [', '"translation": [1' + 400 * "0" + ", "),
         lambda text: text.replace('"version": 1', '"version": 2'),
         lambda text: text.replace('"ground control"', '"hearsay"'),
         lambda text: text.replace("EPSG:27700", "EPSG:1"),
@@ -73,5 +76,5 @@ def test_a_damaged_file_is_an_error(tmp_path, change):
     FOUND.write(tmp_path)
     path = tmp_path / FILE_NAME
     path.write_text(change(path.read_text()))
-    with pytest.raises(SceneError, match="is damaged"):
+    with pytest.raises(SceneError, match=r"is damaged|holds a list|has \w+ = "):
         read_georeference(tmp_path)

@@ -163,8 +163,21 @@ def test_without_a_writable_cache_photographs_are_held_in_memory(
     cache.rename(cache.with_name("elsewhere"))
     cache.write_text("a file where the folder should be")
     held = open_photographs(files, WHITE)
-    assert "cannot be written" in caplog.text
+    assert "cannot be used" in caplog.text
     assert all(torch.equal(held[i], kept[i]) for i in range(5))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other systems have no such permissions")
+def test_pixels_of_a_cache_that_others_can_write_to_are_not_used(
+    cache: Path, files: tuple[PhotographFile, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = [picture.clone() for picture in open_photographs(files, WHITE).colours]
+    assert cache.stat().st_mode & 0o077 == 0
+    (store,) = cache.iterdir()
+    store.write_bytes(bytes(store.stat().st_size))
+    cache.chmod(0o777)
+    assert all(torch.equal(held, own) for held, own in zip(open_photographs(files, WHITE).colours, kept, strict=True))
+    assert "others own it or can write to it" in caplog.text
 
 
 def test_unused_stores_are_deleted(cache: Path, files: tuple[PhotographFile, ...]) -> None:

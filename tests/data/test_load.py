@@ -1,4 +1,5 @@
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from scenes_on_disk import (
 )
 from shared_data import SHARED
 
+from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import SceneError
@@ -199,6 +201,103 @@ def test_missing_photographs_are_named_and_can_be_left_out(tmp_path: Path) -> No
     assert reprojection_px(scene).max() < 1e-3
     assert scene.points is not None
     assert int(scene.points.camera_index.max()) == 6
+
+
+def test_a_photograph_that_a_model_names_twice_is_refused(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, survey(BARREL), text=True)
+    lines = [line for line in (folder / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    (folder / "images.txt").write_text("\n".join([*lines, lines[0], ""]) + "\n")
+    with pytest.raises(SceneError, match=r"two poses for one photograph \((.*\.png) and \1\): .*each photograph once"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to])
+def test_two_names_of_one_photograph_are_refused(tmp_path: Path, link: object) -> None:
+    truth = survey(PINHOLE)
+    write_transforms(tmp_path, truth)
+    copy = tmp_path / "images" / truth.names[4]
+    copy.unlink()
+    assert callable(link)
+    link(copy, tmp_path / "images" / truth.names[0])
+    with pytest.raises(SceneError, match=r"two poses for one photograph \(strip_0/photo_8\.png and strip_1/photo_4"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+@pytest.mark.parametrize(
+    ("closed", "named"),
+    [
+        (".", "sparse/0/cameras.bin"),
+        ("sparse/0", "sparse/0/cameras.bin"),
+        ("sparse/0/images.bin", "sparse/0/images.bin"),
+        ("images", "images/strip_0/photo_8.png"),
+        ("images/strip_0/photo_8.png", "images/strip_0/photo_8.png"),
+        ("georeference.json", "georeference.json"),
+    ],
+)
+def test_what_may_not_be_read_is_named(tmp_path: Path, closed: str, named: str) -> None:
+    write_colmap(tmp_path, survey(BARREL))
+    (tmp_path / "georeference.json").write_text("{}")
+    mode = (tmp_path / closed).stat().st_mode
+    (tmp_path / closed).chmod(0)
+    read = read_georeference if closed == "georeference.json" else load_scene
+    try:
+        with pytest.raises(SceneError, match=rf"{named} cannot be read.*Permission denied"):
+            read(tmp_path)
+    finally:
+        (tmp_path / closed).chmod(mode)
+
+
+@pytest.mark.parametrize("position", [1e16, 1e300])
+@pytest.mark.parametrize("layout", ["colmap", "transforms", "llff", "blender"])
+def test_positions_that_float32_cannot_hold_are_refused(tmp_path: Path, layout: str, position: float) -> None:
+    truth = survey(PINHOLE)
+    truth.T_world_camera[4, 0, 3] = position
+    if layout == "colmap":
+        write_colmap(tmp_path, truth)
+    elif layout == "llff":
+        write_llff(tmp_path, truth)
+    elif layout == "transforms":
+        write_transforms(tmp_path, truth)
+    else:
+        write_blender(tmp_path, {"train": 5})
+        top = json.loads((tmp_path / "transforms_train.json").read_text())
+        top["frames"][1]["transform_matrix"][0][3] = position
+        (tmp_path / "transforms_train.json").write_text(json.dumps(top))
+    with pytest.raises(SceneError, match=r"the pose of .*(photo_4|r_1)\.png has numbers that are not finite, or over"):
+        load_scene(tmp_path)
+
+
+def test_points_that_float32_cannot_hold_are_left_out(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, survey(BARREL), text=True)
+    before = load_scene(tmp_path).points
+    text = (folder / "points3D.txt").read_text()
+    first = next(line for line in text.splitlines() if not line.startswith("#"))
+    number, _, *rest = first.split()
+    (folder / "points3D.txt").write_text(text.replace(first, " ".join([number, "1e300", *rest])))
+    after = load_scene(tmp_path).points
+    assert before is not None
+    assert after is not None
+    assert len(after.xyz_world) == len(before.xyz_world) - 1
+
+
+def test_a_lens_that_folds_everywhere_is_refused_with_its_photograph(tmp_path: Path) -> None:
+    for number, k1 in enumerate((1e11, -1e11)):
+        write_transforms(tmp_path / f"{number}", survey(replace(PINHOLE, k1=k1)))
+        with pytest.raises(SceneError, match=r"photo_\d\.png: .*leaves nothing of its photographs"):
+            load_scene(tmp_path / f"{number}")
+
+
+def test_large_photographs_and_damaged_exif_are_read_without_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = survey(PINHOLE)
+    write_transforms(tmp_path, truth)
+    exif = Image.Exif()
+    exif[0x010F] = "a camera of a long name"
+    Image.fromarray(truth.pictures[0]).save(tmp_path / "images" / truth.names[0], exif=exif.tobytes()[:-30])
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 64 * 48 - 1)  # from here Pillow warns, from its double it refuses
+    assert len(load_scene(tmp_path).names) == 9  # warnings are errors here
 
 
 def test_fewer_than_three_photographs_are_refused(tmp_path: Path) -> None:

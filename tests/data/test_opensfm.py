@@ -19,7 +19,7 @@ from opensfm_projects import (
     write_tracks,
 )
 
-from tidefield.data.load import load_scene
+from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import PosedPhotographs, Reference
 from tidefield.errors import SceneError
@@ -116,6 +116,14 @@ def test_a_project_loads_as_an_undistorted_scene(tmp_path: Path) -> None:
         scene.cameras.position_world.double() + scene.origin_world, torch.tensor(positions, dtype=torch.float64),
         atol=1e-5, rtol=0,
     )  # fmt: skip
+
+
+def test_a_project_without_any_of_its_photographs_has_none(tmp_path: Path) -> None:
+    top = reconstruction()
+    write_opensfm(tmp_path, top, photographs=False)
+    write_tracks(tmp_path / "tracks.csv", tracks_of(top))
+    with pytest.raises(SceneError, match="0 posed photographs: expected at least 3"):
+        read_posed(tmp_path, True)
 
 
 def test_points_without_tracks_give_near_and_far(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import pycolmap
 import pytest
 from scenes_on_disk import BARREL, PINHOLE, survey, write_blender, write_colmap, write_llff, write_transforms
 
+from tidefield.data.images import read_header
 from tidefield.data.ply import read_ply
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.files import inside, opened
@@ -59,6 +61,32 @@ def test_models_of_random_bytes_are_refused(tmp_path: Path, file: str) -> None:
     (folder / file).write_bytes(np.random.default_rng(0).bytes(5000))
     with pytest.raises(SceneError, match="damaged"):
         read_colmap(tmp_path, folder, False)
+
+
+def test_a_text_model_whose_pose_lacks_a_number_is_refused(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, survey(BARREL), text=True)
+    lines = (folder / "images.txt").read_text().splitlines()
+    (folder / "images.txt").write_text("\n".join([*lines, "77 1 0 0 0 1 2 1 short.png", ""]) + "\n")
+    with pytest.raises(SceneError, match=r"images\.txt is damaged"):
+        read_colmap(tmp_path, folder, False)
+
+
+@pytest.mark.parametrize("special", ["pipe", "device", "folder"])
+def test_only_regular_files_are_opened(tmp_path: Path, special: str) -> None:
+    folder = write_colmap(tmp_path, survey(BARREL))
+    places = [folder / "images.bin", tmp_path / "images" / survey(BARREL).names[0]]
+    for place in places:
+        place.unlink()
+        {"pipe": os.mkfifo, "folder": os.mkdir, "device": lambda path: path.symlink_to("/dev/zero")}[special](place)
+    with pytest.raises(SceneError, match=r"images\.bin is a folder, a pipe or a device"):
+        read_colmap(tmp_path, folder, False)
+    with pytest.raises(SceneError, match=r"photo_8\.png is a folder, a pipe or a device"):
+        read_header(places[1])
+
+
+def test_a_file_that_states_no_size_counts_as_empty() -> None:
+    with opened(Path("/proc/self/environ"), "nothing", 1) as file:
+        assert file.read() == b""
 
 
 @pytest.mark.parametrize(
@@ -146,7 +174,13 @@ def test_values_missing_in_frames_come_from_the_top_or_the_photograph(tmp_path: 
         ({"k4": 0.1}, "the term k4"),
         ({"fl_x": "wide"}, "fl_x = 'wide'"),
         ({"fl_x": float("nan")}, "fl_x = nan"),
-        ({"fl_x": 0.0}, "unusable calibration"),
+        ({"fl_x": 0.0}, r"transforms\.json, photo_8\.png: a camera has the unusable calibration"),
+        ({"fl_x": 10**400}, r"fl_x = 1000.*\.\.\.: expected a number"),
+        ({"w": 10**24}, "w = 1000"),
+        ({"cx": -5000.0}, "unusable calibration"),
+        ({"k1": 1e300}, "k1 = "),
+        ({"fl_x": 1e38}, "fl_x = 1e"),
+        ({"fl_y": 1e-30}, "unusable calibration"),
         ({"transform_matrix": [[1, 2], [3, 4]]}, "4 x 4 transform_matrix"),
         ({"transform_matrix": "identity"}, "4 x 4 transform_matrix"),
         ({"file_path": 7}, "file_path"),
@@ -158,9 +192,7 @@ def test_unusable_frames_are_refused(tmp_path: Path, values: dict[str, object], 
         read_transforms(tmp_path, False)
 
 
-@pytest.mark.parametrize(
-    "name", ["../outside.png", "/etc/hostname", "images/../../outside.png", "", "a\0b", "a" * 5000]
-)
+@pytest.mark.parametrize("name", ["../outside.png", "/etc/hostname", "images/../../outside.png", "", "a\0b"])
 def test_paths_that_leave_the_scene_are_refused(tmp_path: Path, name: str) -> None:
     root = tmp_path / "scene"
     file = write_transforms(root, survey(PINHOLE))
@@ -168,6 +200,23 @@ def test_paths_that_leave_the_scene_are_refused(tmp_path: Path, name: str) -> No
     change(file, file_path=name)
     with pytest.raises(SceneError, match="outside of the scene's folder"):
         read_transforms(root, False)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 5000, r"cannot be read \(File name too long\)"),
+        ("loop/a.png", r"cannot be read \(Too many levels of symbolic links\)"),
+        ("\ud800.png", r"transforms\.json is damaged \(.*surrogates"),
+    ],
+)
+def test_names_that_the_system_refuses_are_said_to_be_no_more_than_that(
+    tmp_path: Path, name: str, message: str
+) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    change(write_transforms(tmp_path, survey(PINHOLE)), file_path=name)
+    with pytest.raises(SceneError, match=message):
+        read_transforms(tmp_path, False)
 
 
 def test_links_may_lead_out_only_as_a_whole_folder(tmp_path: Path) -> None:
@@ -227,6 +276,10 @@ def test_point_clouds_are_read_completely_or_refused(tmp_path: Path, write: obje
     (tmp_path / "a.ply").write_bytes(write(xyz)[:-30])
     with pytest.raises(SceneError, match=r"damaged .*complete PLY"):
         read_ply(tmp_path / "a.ply")
+    for count in (2**63, 10**30, -1):
+        (tmp_path / "a.ply").write_bytes(write(xyz).replace(b"vertex 20", b"vertex %d" % count))
+        with pytest.raises(SceneError, match=r"damaged .*complete PLY"):
+            read_ply(tmp_path / "a.ply")
 
 
 def test_the_cloud_of_a_transforms_json_is_read(tmp_path: Path) -> None:
@@ -267,6 +320,14 @@ def test_invalid_llff_arrays_are_refused(tmp_path: Path) -> None:
             read_llff(tmp_path)
     np.save(file, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(SceneError, match=r"damaged .*N x 17 numbers"):
+        read_llff(tmp_path)
+    header = content[:10] + content[10:128].replace(b"(9, 17)", b"(-1,17)")
+    for damaged in (content[:10] + b"{'a': ''" + b"'" + content[19:], header + content[128:], bytes(64_000_001)):
+        file.write_bytes(damaged)
+        with pytest.raises(SceneError, match=r"damaged .*N x 17 numbers|at most 64 MB"):
+            read_llff(tmp_path)
+    file.write_bytes(content[:10] + content[10:128].replace(b"(9, 17)", b"(True,17)")[:118] + content[128:])
+    with pytest.raises(SceneError, match=r"damaged|9 photographs, but"):
         read_llff(tmp_path)
     np.save(file, rows[:, :12])
     with pytest.raises(SceneError, match=r"shape \(9, 12\)"):

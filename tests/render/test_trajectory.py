@@ -191,14 +191,19 @@ def mirrored(content: dict) -> None:
         (lambda c: c.pop("camera_path"), "no list camera_path"),
         (lambda c: c.update(camera_path=[]), "no list camera_path"),
         (lambda c: c.update(camera_type="fisheye"), "'fisheye': expected perspective"),
-        (lambda c: c.update(render_width=-5), "render_width is -5"),
-        (lambda c: c.update(render_height="tall"), "render_height is missing or malformed"),
-        (lambda c: c.update(fps=0), "fps is 0"),
-        (lambda c: c["camera_path"][2].pop("camera_to_world"), "frame 2: camera_to_world is missing"),
-        (lambda c: c["camera_path"][2].update(camera_to_world=[1.0] * 15), "frame 2: camera_to_world .* 16 finite"),
-        (lambda c: c["camera_path"][2].update(camera_to_world=[math.nan] * 16), "frame 2: camera_to_world"),
-        (lambda c: c["camera_path"][3].update(fov=180), "frame 3: fov is 180"),
-        (lambda c: c["camera_path"][3].pop("fov"), "frame 3: fov is missing"),
+        (lambda c: c.update(render_width=-5), "render_width = -5"),
+        (lambda c: c.update(render_height="tall"), "render_height = 'tall': expected a number from 1 to 16384"),
+        (lambda c: c.update(fps=0), "fps = 0"),
+        (lambda c: c["camera_path"][2].pop("camera_to_world"), "frame 2 has camera_to_world = None"),
+        (lambda c: c["camera_path"][2].update(camera_to_world=[1.0] * 15), "frame 2 has camera_to_world .* 16 numbers"),
+        (lambda c: c["camera_path"][2].update(camera_to_world=[math.nan] * 16), "frame 2 has camera_to_world = nan"),
+        (lambda c: c["camera_path"][3].update(fov=180), "frame 3 has fov = 180"),
+        (lambda c: c["camera_path"][3].pop("fov"), "frame 3 has fov = None"),
+        (lambda c: c["camera_path"][2]["camera_to_world"].__setitem__(3, 1e299), "frame 2 has .* = 1e\\+299"),
+        (lambda c: c["camera_path"][2]["camera_to_world"].__setitem__(3, 10**400), "frame 2 has .* = 1000"),
+        (lambda c: c["camera_path"][2].update(camera_to_world=[[1.0, 2.0], [3.0]]), "frame 2 has .* 16 numbers"),
+        (lambda c: c["camera_path"][3].update(fov=1e-300), "frame 3 has fov = 1e-300"),
+        (lambda c: c.update(fps=None, seconds=1e-300), "seconds = 1e-300"),
         (broken_rotation, "frame 2: camera_to_world is no rotation"),
         (mirrored, "frame 2: camera_to_world is no rotation"),
     ],
@@ -220,8 +225,15 @@ def test_invalid_json_and_missing_files_are_one_clear_error(tmp_path: Path):
 def test_a_malformed_normalisation_is_one_clear_error(tmp_path: Path, poses: np.ndarray):
     mapping = tmp_path / "dataparser_transforms.json"
     mapping.write_text(json.dumps({"transform": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "scale": 1.0}))
-    with pytest.raises(TidefieldError, match="transform is missing or malformed: expected 3 x 4"):
+    with pytest.raises(TidefieldError, match=r"transform = .* expected 3 x 4"):
         load(tmp_path, exported(poses))
     mapping.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": -1.0}))
-    with pytest.raises(TidefieldError, match=r"scale -1\.0"):
+    with pytest.raises(TidefieldError, match=r"scale = -1\.0"):
         load(tmp_path, exported(poses))
+    mapping.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 10**400}))
+    with pytest.raises(TidefieldError, match="scale = 1000"):
+        load(tmp_path, exported(poses))
+    (tmp_path / "transforms.json").write_text(json.dumps({"applied_transform": np.zeros((3, 4)).tolist()}))
+    mapping.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 1.0}))
+    with pytest.raises(TidefieldError, match=r"transforms\.json is damaged .*Singular"):
+        load(tmp_path, exported(poses), replace(survey(), root=tmp_path))

@@ -184,7 +184,7 @@ def test_backslashes_in_names_become_folders(tmp_path: Path) -> None:
 def test_a_photograph_listed_twice_is_refused(tmp_path: Path) -> None:
     truth = survey(PINHOLE)
     write_transforms(tmp_path / "theirs", replace(truth, names=(*truth.names[:8], truth.names[0])))
-    with pytest.raises(SceneError, match=r"strip_0/photo_8\.png twice"):
+    with pytest.raises(SceneError, match=r"two poses for one photograph \(strip_0/photo_8\.png"):
         import_project(tmp_path / "theirs", tmp_path / "ours")
 
 

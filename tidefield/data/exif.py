@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image, PngImagePlugin
 
-from tidefield.data.readers.files import open_picture
+from tidefield.data.readers.files import open_picture, quiet_pillow
 
 EXPOSURE_POWERS = {
     ExifTags.Base.ExposureTime: 1,
@@ -22,6 +22,8 @@ EXPOSURE_POWERS = {
 }
 """The tags that determine the exposure, with the power that each has in the light that is recorded."""
 
+_MOST_BYTES = 1_000_000
+"""Of EXIF that is parsed: a JPEG's has 64 kB; every tag of a longer one could refer to all of it."""
 _TIMES = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized, ExifTags.Base.DateTime)
 
 
@@ -102,6 +104,8 @@ def read_exif(image: Image.Image) -> Exif:
     # Pillow decodes the pixels of a PNG without EXIF in its header, to look for EXIF behind them.
     if isinstance(image, PngImagePlugin.PngImageFile) and "exif" not in image.info:
         return Exif(tags, gps)
+    if len(image.info.get("exif") or b"") > _MOST_BYTES:
+        return Exif(tags, gps, damaged=True)
     try:
         table = image.getexif()
         tags = {**table, **table.get_ifd(ExifTags.IFD.Exif)}
@@ -111,6 +115,7 @@ def read_exif(image: Image.Image) -> Exif:
     return Exif(tags, gps)
 
 
+@quiet_pillow()
 def read_exposures(paths: Sequence[Path]) -> Exposures:
     """Read exposures and capture times from the EXIF of photographs, without decoding pixels.
 

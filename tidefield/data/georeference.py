@@ -11,13 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from tidefield.data.readers.files import opened
+from tidefield.data.readers.files import number, numbers, parsing, read_json
 from tidefield.files import completed_file
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
 
 FILE_NAME = "georeference.json"
-_VERSION, _MEGABYTES = 1, 256
+_VERSION = 1
 
 Source = Literal["ground control", "GPS", "project", "none"]
 
@@ -160,20 +160,20 @@ def read_georeference(folder: Path) -> Georeference | None:
         SceneError: the file is damaged, or of a later version.
     """
     path = folder / FILE_NAME
-    if not path.exists():
-        return None
     expected = (
         "a file of `tidefield prepare`; prepare the scene again, or remove the file to use the scene without a "
         "georeference"
     )
-    with opened(path, expected, _MEGABYTES) as file:
-        values = json.load(file)
+    with parsing(path, expected):
+        if not path.exists():
+            return None
+        values = read_json(path)
         if values["version"] != _VERSION:
             raise ValueError(f"it is of version {values['version']}, expected {_VERSION}")
-        return _from_json(values)
+        return _from_json(values, path)
 
 
-def _from_json(values: dict[str, Any]) -> Georeference:
+def _from_json(values: dict[str, Any], path: Path) -> Georeference:
     if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
     similarity = values["world_from_model"]
@@ -182,9 +182,9 @@ def _from_json(values: dict[str, Any]) -> Georeference:
         frame=None if values["frame"] is None else LocalFrame.from_json(values["frame"]),
         source=values["source"],
         world_from_model=Similarity(
-            float(similarity["scale"]),
-            np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
-            np.array(similarity["translation"], dtype=np.float64).reshape(3),
+            number(similarity, "scale", path),
+            numbers(similarity, "rotation", path, (3, 3)),
+            numbers(similarity, "translation", path, (3,)),
         ),
         left_out=tuple(LeftOut(item["kind"], item["name"], item["reason"]) for item in values["left_out"]),
         notes=tuple(str(note) for note in values["notes"]),

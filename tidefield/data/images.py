@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +26,7 @@ from jaxtyping import UInt8
 from platformdirs import user_cache_path
 from torch import Tensor
 
-from tidefield.data.readers.files import open_picture
+from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens, rectify
@@ -90,6 +91,7 @@ class PhotographFile:
         return self.width * self.height * (4 if self.has_alpha else 3)
 
 
+@quiet_pillow()
 def read_header(path: Path) -> tuple[int, int, bool]:
     """Read the width, the height and the presence of alpha without decoding; EXIF orientation is not applied.
 
@@ -102,6 +104,7 @@ def read_header(path: Path) -> tuple[int, int, bool]:
         return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
 
 
+@quiet_pillow()
 def open_photographs(
     files: Sequence[PhotographFile],
     background_rgb: tuple[float, float, float],
@@ -122,6 +125,8 @@ def open_photographs(
     store = (cache or _cache_folder()) / f"{_key(files, background_rgb)}.photographs"
     expected = sum(file.bytes for file in files)
     try:
+        store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_shared(store.parent)
         if store.is_file() and store.stat().st_size == expected:
             os.utime(store)
         else:
@@ -142,8 +147,8 @@ def open_photographs(
         if cause.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
             raise
         _log.warning(
-            "the cache folder %s cannot be written (%s): photographs are held in memory and decoded again next time; "
-            "set XDG_CACHE_HOME to a writable folder",
+            "the cache folder %s cannot be used (%s): photographs are held in memory and decoded again next time; "
+            "set XDG_CACHE_HOME to a folder of yours",
             store.parent,
             cause.strerror,
         )
@@ -154,6 +159,14 @@ def _cache_folder() -> Path:
     """$XDG_CACHE_HOME/tidefield on every system, or else the system's own folder for caches."""
     chosen = os.environ.get("XDG_CACHE_HOME")
     return Path(chosen) / "tidefield" if chosen else user_cache_path("tidefield", appauthor=False)
+
+
+def _refuse_shared(folder: Path) -> None:
+    """Raise a PermissionError for a cache folder in which others can put pixels: only a file's size is checked."""
+    status = folder.stat()
+    # Windows has no such bits; there the folder belongs to the user's profile.
+    if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & stat.S_IWOTH):
+        raise PermissionError(errno.EPERM, "others own it or can write to it")
 
 
 def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:

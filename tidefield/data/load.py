@@ -17,6 +17,7 @@ from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
+from tidefield.data.readers.files import naming, reading
 from tidefield.data.readers.llff import read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
@@ -119,7 +120,7 @@ def load_scene(
     T_world_camera = posed.T_world_camera.copy()
     T_world_camera[:, :, 3] -= origin
     points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
-    pinholes = tuple(file.lens.pinhole().resized(file.width, file.height) for file in files)
+    pinholes = tuple(_pinhole(file) for file in files)
     near_far = posed.near_far
     if near_far is None:
         near_far = estimate_near_far(T_world_camera, pinholes, points)
@@ -160,9 +161,11 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
 
     Raises:
-        SceneError: the folder is not a scene, is damaged, or has fewer than three photographs.
+        SceneError: the folder is not a scene, is damaged, names a photograph twice, or has fewer than three.
     """
-    posed = _read(root, allow_missing)
+    with reading(root):
+        posed = _read(root, allow_missing)
+        _refuse_repeated(posed, root)
     if len(posed.names) < _FEWEST:
         raise SceneError(
             f"{root} has {len(posed.names)} posed photographs: expected at least {_FEWEST}; add photographs"
@@ -210,12 +213,32 @@ def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     raise SceneError(f"{root} has no posed photographs (found: {list_names(names, 8) or 'nothing'}): {_expected()}")
 
 
+def _refuse_repeated(posed: PosedPhotographs, root: Path) -> None:
+    """Refuse a photograph with two poses, of which one could be held out and the other be trained on."""
+    names: dict[tuple[int, int], str] = {}
+    for path, name in zip(posed.paths, posed.names, strict=True):
+        status = path.stat()
+        file = status.st_dev, status.st_ino  # the same for all names and links of a file
+        if file in names:
+            raise SceneError(
+                f"{root} has two poses for one photograph ({names[file]} and {name}): expected each photograph once; "
+                "remove one of them from the scene's description"
+            )
+        names[file] = name
+
+
 def _expected() -> str:
     lines = "\n".join(f"  {layout.files:<70} {layout.program}" for layout in LAYOUTS)
     return (
         f"expected one of\n{lines}\n; estimate poses of the photographs first (`tidefield prepare` or COLMAP), or give "
         "the folder that holds these"
     )
+
+
+def _pinhole(file: PhotographFile) -> Lens:
+    """The distortion-free camera of a photograph, at the size that it is read at."""
+    with naming(file.path):
+        return file.lens.pinhole().resized(file.width, file.height)
 
 
 def _sparse_points(

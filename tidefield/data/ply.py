@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from tidefield.data.readers.files import opened
+from tidefield.data.readers.files import in_range, opened
 from tidefield.files import completed_file
 
 _MEGABYTES = 4_000
@@ -30,7 +30,7 @@ def read_ply(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, 
         xyz = np.stack([vertex[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         coloured = all(c in vertex.dtype.names and vertex.dtype[c] == np.uint8 for c in _COLOURS)
         rgb = np.stack([vertex[c] for c in _COLOURS], axis=-1) if coloured else None
-    finite = np.isfinite(xyz).all(axis=1)
+    finite = in_range(xyz).all(axis=1)
     return (xyz[finite], None if rgb is None else rgb[finite]) if finite.any() else None
 
 

@@ -23,6 +23,16 @@ from jaxtyping import Float, UInt8
 
 from tidefield.errors import SceneError
 
+_WIDEST = 1_000_000
+_FOCAL_RANGE = 1e-3, 1e4
+"""Of the longer side: fields of view from 0.006 to 179.9 degrees."""
+_FARTHEST_PRINCIPAL = 10.0
+"""From the middle of the photograph, in its longer sides: those that are cut out of larger ones have theirs outside."""
+_LARGEST_TERM = 1e12
+"""Of the distortion, whose squares appear in its Jacobian; terms of real lenses are at most some hundreds."""
+_LEAST_SHARE = 0.01
+"""Of the field of view that a lens would have without distortion: a pinhole's is larger."""
+
 COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -59,11 +69,17 @@ class Lens:
     k3: float = 0.0
 
     def __post_init__(self) -> None:
-        finite = np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all()
-        if not finite or min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+        longer = max(self.width, self.height)
+        # Comparisons with NaN are false.
+        usable = 1 <= min(self.width, self.height) <= longer <= _WIDEST
+        usable &= all(_FOCAL_RANGE[0] * longer <= f <= _FOCAL_RANGE[1] * longer for f in (self.fx, self.fy))
+        usable &= abs(self.cx - self.width / 2) <= _FARTHEST_PRINCIPAL * longer
+        usable &= abs(self.cy - self.height / 2) <= _FARTHEST_PRINCIPAL * longer
+        if not (usable and all(abs(term) <= _LARGEST_TERM for term in self.distortion)):
             raise SceneError(
-                f"a camera has the unusable calibration {self}: expected finite numbers, a positive size and positive "
-                "focal lengths; calibrate the photographs again"
+                f"a camera has the unusable calibration {self}: expected a size of 1 to {_WIDEST} pixels, focal "
+                f"lengths of {_FOCAL_RANGE[0]:g} to {_FOCAL_RANGE[1]:g} times the longer side and a principal point "
+                "near the photograph; calibrate the photographs again"
             )
 
     @property
@@ -170,8 +186,14 @@ class Lens:
         rectangle = np.array([x0, x1, y0, y1])
         # Usually 1. Less where corners fold over, or stick out of a photograph with a wavy border.
         share = 1.0
-        while not self._contains(share * rectangle):
+        least = _LEAST_SHARE * min(self.width / self.fx, self.height / self.fy) / min(x1 - x0, y1 - y0)
+        while share >= least and not self._contains(share * rectangle):
             share *= 0.995
+        if share < least:
+            raise SceneError(
+                f"the distortion of {self} leaves nothing of its photographs: expected that of a lens; calibrate them "
+                "again"
+            )
         x0, x1, y0, y1 = (share * rectangle).tolist()
         return x0, x1, y0, y1
 

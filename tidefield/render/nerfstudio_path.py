@@ -11,7 +11,7 @@ scene's coordinates. Without it the path is taken to be in the scene's own coord
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tidefield.data.readers.files import read_json
+from tidefield.data.readers.files import LARGEST, in_range, number, numbers, parsing, read_json
 from tidefield.errors import TidefieldError
 
 NORMALISATION_FILE = "dataparser_transforms.json"
-LARGEST_SIDE = 16384  # the largest that x264 encodes
+LARGEST_SIDE = 16384.0  # the largest that x264 encodes
+_NARROWEST, _WIDEST = 0.01, 179.0  # degrees
+_SMALLEST_SCALE = 1e-9
+_SLOWEST, _FASTEST = 0.01, 1000.0  # frames per second
 
 
 @dataclass(frozen=True)
@@ -59,18 +62,16 @@ def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
     frames = top.get("camera_path")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise TidefieldError(f"{file} has no list camera_path of frames: expected nerfstudio's export of a camera path")
-    width, height = (
-        _number(top, key, str(file), lambda x: x == round(x) and 1 <= x <= LARGEST_SIDE, f"1 to {LARGEST_SIDE} pixels")
-        for key in ("render_width", "render_height")
-    )
+    width, height = (number(top, key, file, least=1.0, most=LARGEST_SIDE) for key in ("render_width", "render_height"))
     placed = [(frame, f"{file}, frame {i}") for i, frame in enumerate(frames)]
-    degrees = [_number(frame, "fov", place, lambda x: 0 < x < 180, "0 to 180 degrees") for frame, place in placed]
+    degrees = [number(frame, "fov", place, least=_NARROWEST, most=_WIDEST) for frame, place in placed]
     pose = np.stack([_pose(frame, place) for frame, place in placed])
     pose = _undo_normalisation(pose, file.with_name(NORMALISATION_FILE), scene_root)
     speed = None
-    for key, to_speed in (("fps", lambda x: x), ("seconds", lambda x: len(frames) / x)):
-        if speed is None and top.get(key) is not None:
-            speed = to_speed(_number(top, key, str(file), lambda x: x > 0, "a positive number"))
+    if top.get("fps") is not None:
+        speed = number(top, "fps", file, least=_SLOWEST, most=_FASTEST)
+    elif top.get("seconds") is not None:
+        speed = len(frames) / number(top, "seconds", file, least=len(frames) / _FASTEST, most=len(frames) / _SLOWEST)
     return NerfstudioPath(
         position=pose[:, :3, 3],
         rotation=pose[:, :3, :3] * (1.0, -1.0, -1.0),  # from OpenGL's to OpenCV's y and z
@@ -82,7 +83,7 @@ def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
 
 
 def _pose(frame: Mapping[str, Any], place: str) -> Float64[np.ndarray, "4 4"]:
-    matrix = _array(frame, "camera_to_world", place, (16,)).reshape(4, 4)
+    matrix = numbers(frame, "camera_to_world", place, (16,)).reshape(4, 4)
     last = np.array([0.0, 0.0, 0.0, 1.0])
     if not np.allclose(matrix[3], last) and np.allclose(matrix[:, 3], last):
         matrix = matrix.T  # three.js itself stores matrices column by column
@@ -100,26 +101,29 @@ def _undo_normalisation(pose: Float64[np.ndarray, "F 4 4"], file: Path, root: Pa
     if not file.is_file():
         return pose
     top, transform = read_json(file), np.eye(4)
-    transform[:3] = _array(top, "transform", str(file), (3, 4))
-    scale = float(_array(top, "scale", str(file), ()))
+    transform[:3] = numbers(top, "transform", file, (3, 4))
+    scale = number(top, "scale", file, least=_SMALLEST_SCALE)
     transforms = root / "transforms.json"
     if transforms.is_file() and not (root / "sparse").is_dir():
         # The normalisation starts from the coordinates before applied_transform and applied_scale; such a scene's own
         # coordinates are those after them.
         meta, applied = {"applied_scale": 1.0, **read_json(transforms)}, np.eye(4)
         if "applied_transform" in meta:
-            applied[:3] = _array(meta, "applied_transform", str(transforms), (3, 4))
-        transform = transform @ np.linalg.inv(applied)
-        scale /= float(_array(meta, "applied_scale", str(transforms), ()))
+            applied[:3] = numbers(meta, "applied_transform", transforms, (3, 4))
+        with parsing(transforms, "a rotation and a shift as applied_transform; export it again"):
+            transform = transform @ np.linalg.inv(applied)
+        scale /= number(meta, "applied_scale", transforms, least=_SMALLEST_SCALE)
     rotation = transform[:3, :3]
-    if scale <= 0 or not _is_rotation(rotation, mirrored=True):
+    if not _is_rotation(rotation, mirrored=True):
         raise TidefieldError(
-            f"{file} has scale {scale} and a transform of determinant {np.linalg.det(rotation):.3g}: expected a "
-            "positive scale and a rotation with a shift; copy the file again from nerfstudio's output folder"
+            f"{file} has a transform of determinant {np.linalg.det(rotation):.3g}: expected a rotation with a shift; "
+            "copy the file again from nerfstudio's output folder"
         )
     scene = pose.copy()
     scene[:, :3, :3] = rotation.T @ pose[:, :3, :3]
     scene[:, :3, 3] = (pose[:, :3, 3] / scale - transform[:3, 3]) @ rotation
+    if not in_range(scene).all():
+        raise TidefieldError(f"{file} takes the path farther than {LARGEST:g} away: copy it and the path again")
     return scene
 
 
@@ -127,24 +131,3 @@ def _is_rotation(matrix: Float64[np.ndarray, "3 3"], mirrored: bool = False) -> 
     """Return whether a matrix is orthogonal to 1e-3 and, unless it may be mirrored, of positive determinant."""
     orthogonal = np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3)
     return orthogonal and (mirrored or bool(np.linalg.det(matrix) > 0))
-
-
-def _number(top: Mapping[str, Any], key: str, place: str, valid: Callable[[float], bool], expected: str) -> float:
-    """Return a finite number that is valid, or raise one clear error."""
-    value = float(_array(top, key, place, ()))
-    if not valid(value):
-        raise TidefieldError(f"{place}: {key} is {value:g}: expected {expected}; correct it")
-    return value
-
-
-def _array(top: Mapping[str, Any], key: str, place: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return finite numbers of a shape, or raise one clear error."""
-    value = top.get(key)
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
-    if array.shape != shape or not np.isfinite(array).all() or isinstance(value, bool | str):
-        wanted = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
-        raise TidefieldError(f"{place}: {key} is missing or malformed: expected {wanted}; export the path again")
-    return array

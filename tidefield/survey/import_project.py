@@ -18,7 +18,7 @@ from tidefield.data.georeference import Georeference, Residuals, read_georeferen
 from tidefield.data.images import Progress
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.posed import Observations, PosedPhotographs
-from tidefield.errors import RunError, SceneError
+from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import colmap_parameters
@@ -57,7 +57,7 @@ def import_project(
         RunError: `out` exists already or cannot be written.
     """
     refuse_existing(out, replaceable=False)
-    posed = _at_file_size(read_posed(source, allow_missing), source)
+    posed = _at_file_size(read_posed(source, allow_missing))
     located = read_georeference(source)
     if located is None and posed.reference is not None:
         place = posed.reference
@@ -136,16 +136,13 @@ def _add_points(model: pycolmap.Reconstruction, points: Observations, keypoint: 
         model.add_point3D(points.xyz_world[k], track, grey if points.rgb is None else points.rgb[k])
 
 
-def _at_file_size(posed: PosedPhotographs, source: Path) -> PosedPhotographs:
+def _at_file_size(posed: PosedPhotographs) -> PosedPhotographs:
     """Scale lenses and observations to the sizes of the photographs' files, and normalise names.
 
     Raises:
-        SceneError: a file does not have its camera's shape, or a photograph is listed twice.
+        SceneError: a file does not have its camera's shape.
     """
     names = tuple(posixpath.normpath(name.replace("\\", "/")) for name in posed.names)
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise SceneError(f"{source} lists the photograph {twice} twice: expected each once; remove one")
     lenses = tuple(own_lens(path, lens)[0] for path, lens in zip(posed.paths, posed.lenses, strict=True))
     points = posed.points
     if points is not None:

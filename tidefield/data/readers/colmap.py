@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float64, Int
 
-from tidefield.data.readers.files import inside, keep_present, opened
+from tidefield.data.readers.files import in_range, inside, keep_present, naming, opened
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, Lens, lens_from_colmap
@@ -54,7 +54,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     assert suffix is not None, "find_colmap found no model here"
     cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
     is_binary = suffix == ".bin"
-    with opened(cameras_file, _EXPECTED, _MEGABYTES) as file:
+    with opened(cameras_file, _EXPECTED, _MEGABYTES) as file, naming(cameras_file):
         lenses = dict(_binary_cameras(file) if is_binary else _text_cameras(file))
     with opened(images_file, _EXPECTED, _MEGABYTES) as file:
         images = list(_binary_images(file) if is_binary else _text_images(file))
@@ -84,7 +84,8 @@ def _suffix(model: Path) -> str | None:
 
 
 def _poses(images: list[_Image]) -> Float64[np.ndarray, "V 3 4"]:
-    quaternion, translation = np.split(np.array([image.pose for image in images]).reshape(-1, 7), [4], axis=1)
+    pose = np.array([image.pose for image in images]).reshape(-1, 7)
+    quaternion, translation = np.split(np.where(in_range(pose), pose, np.nan), [4], axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):  # a quaternion of zeros becomes NaN, which is an error later
         w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     R_world_camera = np.array(  # the transpose of the quaternion's R_camera_world
@@ -107,7 +108,7 @@ def _observations(images: list[_Image], points: np.ndarray) -> Observations | No
     uv_px = np.concatenate([image.uv_px for image in images])
     photograph = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
     row = order[np.searchsorted(point_ids, seen, sorter=order).clip(max=len(order) - 1)]
-    valid = (point_ids[row] == seen) & np.isfinite(uv_px).all(axis=1) & np.isfinite(xyz_world[row]).all(axis=1)
+    valid = (point_ids[row] == seen) & in_range(uv_px).all(axis=1) & in_range(xyz_world[row]).all(axis=1)
     return Observations(xyz_world, row[valid], photograph[valid], uv_px[valid], points["rgb"])
 
 
@@ -188,7 +189,9 @@ def _text_images(file: BinaryIO) -> Iterator[_Image]:
         _, *pose, camera, name = line.split(maxsplit=9)
         seen = np.array((next(lines, "")).split(), dtype=np.float64).reshape(-1, 3)
         seen = seen[seen[:, 2] != _NO_POINT]
-        yield _Image(name, int(camera), np.array(pose, dtype=np.float64), seen[:, :2], seen[:, 2].astype(np.int64))
+        yield _Image(
+            name, int(camera), np.array(pose, dtype=np.float64).reshape(7), seen[:, :2], seen[:, 2].astype(np.int64)
+        )
 
 
 def _text_points(file: BinaryIO) -> Iterator[tuple[int, Sequence[float], Sequence[int]]]:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tidefield.data.readers.files import parsing
+from tidefield.data.readers.files import in_range, naming, opened
 from tidefield.data.readers.posed import PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
 
 _FOLDERS = ("images", "images_4", "images_8")
+_MEGABYTES = 64
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 # The bounds are the 0.1th and 99.9th percentile of the sparse points' depths; the margins are for surfaces without.
 _NEAREST, _FARTHEST = 0.75, 1.25
@@ -29,13 +30,13 @@ def read_llff(root: Path) -> PosedPhotographs:
         SceneError: the array is damaged, or there is not one photograph per row.
     """
     file = root / "poses_bounds.npy"
-    with parsing(file, "N x 17 numbers; export it again"):
+    with opened(file, "N x 17 numbers; export it again", _MEGABYTES):
         # Memory-mapped, so that nothing is allocated for a header that announces terabytes.
         rows = np.array(np.load(file, allow_pickle=False, mmap_mode="r"))
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} of shape {rows.shape}: expected N x 17 numbers; export it again")
     folder = next((root / name for name in _FOLDERS if (root / name).is_dir()), root / "images")
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
     if len(paths) != len(rows):
         raise SceneError(
             f"{folder} has {len(paths)} photographs, but {file} has {len(rows)} poses: expected one photograph per "
@@ -43,7 +44,7 @@ def read_llff(root: Path) -> PosedPhotographs:
         )
     matrix = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
     bounds = rows[:, 15:].astype(np.float64)
-    usable = (bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1]) & np.isfinite(bounds[:, 1])
+    usable = (bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1]) & in_range(bounds[:, 1])
     if not usable.all():
         name = paths[int(usable.argmin())].name
         raise SceneError(f"{file}: the depth bounds of {name} are unusable: expected 0 < near < far; export them again")
@@ -60,4 +61,5 @@ def read_llff(root: Path) -> PosedPhotographs:
 def _lens(path: Path, height: float, width: float, focal: float, *, file: Path) -> Lens:
     if not (np.isfinite([height, width]).all() and min(height, width) >= 1):
         raise SceneError(f"{file}: the size {width} x {height} of {path.name} is unusable; export it again")
-    return Lens(round(width), round(height), focal, focal, round(width) / 2, round(height) / 2)
+    with naming(f"{file}, {path.name}"):
+        return Lens(round(width), round(height), focal, focal, round(width) / 2, round(height) / 2)

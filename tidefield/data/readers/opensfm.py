@@ -33,7 +33,17 @@ from jaxtyping import Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from tidefield.data.images import read_header
-from tidefield.data.readers.files import inside, keep_present, number, opened, parsing, read_json
+from tidefield.data.readers.files import (
+    in_range,
+    inside,
+    keep_present,
+    naming,
+    number,
+    numbers,
+    opened,
+    parsing,
+    read_json,
+)
 from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.lenses import Lens
@@ -158,30 +168,26 @@ def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, fi
     fx, fy = (number(camera, key, file) for key in focal)
     # A perspective camera's principal point is the middle; other values are ignored.
     cx, cy = (0.0 if kind == "perspective" else number(camera, key, file, 0.0) for key in ("c_x", "c_y"))
-    return Lens(
-        width,
-        height,
-        fx=fx * longer,
-        fy=fy * longer,
-        cx=cx * longer + width / 2,
-        cy=cy * longer + height / 2,
-        **{term: number(camera, term, file, 0.0) for term in _TERMS[kind]},
-    )
+    terms = {term: number(camera, term, file, 0.0) for term in _TERMS[kind]}
+    with naming(f"{file}, {name}"):
+        return Lens(
+            width,
+            height,
+            fx=fx * longer,
+            fy=fy * longer,
+            cx=cx * longer + width / 2,
+            cy=cy * longer + height / 2,
+            **terms,
+        )
 
 
 def _poses(shots: Sequence[Object], names: Sequence[str], file: Path) -> Float64[np.ndarray, "V 3 4"]:
     rotation, translation = (
-        np.array([_vector(shot.get(key), f"{key} of {name}", file) for shot, name in zip(shots, names, strict=True)])
+        np.array([numbers(shot, key, f"{file}, {name},", (3,)) for shot, name in zip(shots, names, strict=True)])
         for key in ("rotation", "translation")
     )
     R_world_camera = Rotation.from_rotvec(rotation.reshape(-1, 3)).as_matrix().transpose(0, 2, 1)
     return np.concatenate([R_world_camera, -R_world_camera @ translation.reshape(-1, 3, 1)], axis=2)
-
-
-def _vector(value: object, what: str, file: Path) -> list[float]:
-    if not isinstance(value, list) or len(value) != 3:
-        raise SceneError(f"{file}: the {what} is {value!r}: expected three numbers; run OpenSfM again")
-    return [number({what: element}, what, file) for element in value]
 
 
 def _points(
@@ -195,7 +201,7 @@ def _points(
         rgb = rgb.reshape(len(points), 3)
         if not ((rgb >= 0) & (rgb <= 255)).all():
             raise ValueError("it has colours outside of 0 to 255")
-    names, finite = list(points), np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    names, finite = list(points), np.flatnonzero(in_range(xyz).all(axis=1))
     return [names[i] for i in finite], xyz[finite], rgb[finite].astype(np.uint8)
 
 

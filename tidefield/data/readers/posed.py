@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Int, UInt8
 
+from tidefield.data.readers.files import LARGEST, in_range
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
 
@@ -38,8 +39,8 @@ class Observations:
     def by_photograph(self, photographs: int) -> list[Int[np.ndarray, " _"]]:
         """Group the indices of the observations by photograph."""
         order = np.argsort(self.photograph_index, kind="stable")
-        starts = np.searchsorted(self.photograph_index[order], np.arange(1, photographs))
-        return np.split(order, starts)
+        ends = np.searchsorted(self.photograph_index[order], np.arange(photographs), side="right")
+        return np.split(order, ends)[:photographs]
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,10 @@ def proper_rotations(
     """Orthonormalise the rotations of poses to float64's precision.
 
     Raises:
-        SceneError: a pose is not finite, or not a rotation (R^T R = I within 1e-3, det R = +1).
+        SceneError: a pose is not finite, too far away, or not a rotation (R^T R = I within 1e-3, det R = +1).
     """
     rotation = T_world_camera[:, :, :3]
-    wrong, what = ~np.isfinite(T_world_camera).all(axis=(1, 2)), "has numbers that are not finite"
+    wrong, what = ~in_range(T_world_camera).all(axis=(1, 2)), f"has numbers that are not finite, or over {LARGEST:g}"
     if not wrong.any():
         off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
         wrong = (off > 1e-3) | (np.linalg.det(rotation) < 0)

@@ -24,7 +24,7 @@ from jaxtyping import Float64, UInt8
 
 from tidefield.data.images import read_header
 from tidefield.data.ply import read_ply, write_ply
-from tidefield.data.readers.files import inside, keep_present, number, parsing, read_json
+from tidefield.data.readers.files import LARGEST, inside, keep_present, naming, number, parsing, read_json
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.files import completed_file
@@ -72,7 +72,7 @@ def read_blender(root: Path, allow_missing: bool) -> PosedPhotographs:
     files = [root / "transforms_train.json", *[file for file in held_out if file.is_file()][:1]]
     parts = [_photographs(read_json(file), root, file, allow_missing)[1] for file in files]
     T_world_camera = np.concatenate([part.T_world_camera for part in parts])
-    distance = np.linalg.norm(T_world_camera[:, :, 3], axis=1)
+    distance = np.linalg.norm(T_world_camera[:, :, 3].clip(-LARGEST, LARGEST), axis=1)  # farther is an error later
     train, *test = (frozenset(part.names) for part in parts)
     return PosedPhotographs(
         names=sum((part.names for part in parts), ()),
@@ -133,15 +133,10 @@ def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
     fx, fy = _focal(values, "x", width, file), _focal(values, "y", height, file)
     if fx is None:
         raise SceneError(f"{file} has neither fl_x nor camera_angle_x for {path.name}: expected one; export it again")
-    return Lens(
-        width,
-        height,
-        fx=fx,
-        fy=fx if fy is None else fy,
-        cx=number(values, "cx", file, width / 2),
-        cy=number(values, "cy", file, height / 2),
-        **{key: number(values, key, file, 0.0) for key in _DISTORTION},
-    )
+    cx, cy = number(values, "cx", file, width / 2), number(values, "cy", file, height / 2)
+    terms = {key: number(values, key, file, 0.0) for key in _DISTORTION}
+    with naming(f"{file}, {path.name}"):
+        return Lens(width, height, fx, fx if fy is None else fy, cx, cy, **terms)
 
 
 def _poses(frames: Sequence[Mapping[str, Any]], file: Path) -> Float64[np.ndarray, "V 3 4"]:
@@ -167,7 +162,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, file: Path) -> float
     if f"camera_angle_{axis}" not in values:
         return None
     angle = number(values, f"camera_angle_{axis}", file)
-    if not 0 < angle < math.pi:
+    if not 1e-9 < angle < math.pi:  # the tangent of the least is not 0
         raise SceneError(f"{file} has camera_angle_{axis} = {angle}: expected radians between 0 and pi; correct it")
     return 0.5 * size / math.tan(0.5 * angle)
 
