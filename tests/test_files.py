@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.files import completed_file, completed_folder
+from tidefield.files import completed_file, completed_folder, read_json, require_writable
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path):
@@ -77,3 +77,58 @@ def test_a_folder_that_fails_leaves_nothing(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         fill(KeyboardInterrupt())
     assert os.listdir(tmp_path) == []
+
+
+def test_a_short_write_without_a_number_is_a_full_disk(tmp_path: Path):
+    def fill() -> None:
+        with completed_file(tmp_path / "depth.npy"):
+            raise OSError("3072 requested and 992 written")  # as NumPy's tofile does
+
+    with pytest.raises(RunError, match=r"depth\.npy cannot be written \(3072 requested and 992 written\)"):
+        fill()
+
+
+def test_what_fails_in_the_clean_up_does_not_hide_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fill() -> None:
+        with completed_file(tmp_path / "map.tif"):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    def unlink(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+    with pytest.raises(RunError, match="Read-only file system"):
+        fill()
+
+
+def test_a_name_that_no_file_can_have_is_one_clear_error(tmp_path: Path):
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for name in ("a" * 300, "a\0b", "loop/b", "file/b", "folder"):
+        for check in (lambda path: require_writable(path, overwrite=True), write):
+            with pytest.raises(RunError, match=r"cannot be written|has a zero byte|is a folder"):
+                check(tmp_path / name)
+    with pytest.raises(RunError, match=r"cannot be written"):
+        require_writable(Path("/proc/new/file"))
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder", "loop"]
+
+
+def write(path: Path) -> None:
+    with completed_file(path, overwrite=True) as partial:
+        partial.touch()
+
+
+def test_a_check_of_a_place_makes_nothing(tmp_path: Path):
+    require_writable(tmp_path / "new" / "folder" / "map.tif")
+    assert os.listdir(tmp_path) == []
+    (tmp_path / "map.tif").touch()
+    with pytest.raises(RunError, match="is there already"):
+        require_writable(tmp_path / "map.tif")
+    require_writable(tmp_path / "map.tif", overwrite=True)
+
+
+def test_json_nested_too_deeply_is_damaged(tmp_path: Path):
+    (tmp_path / "a.json").write_text("[" * 100_000)
+    with pytest.raises(RunError, match="is not valid JSON"):
+        read_json(tmp_path / "a.json")

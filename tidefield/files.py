@@ -15,7 +15,18 @@ from typing import Any
 
 from tidefield.errors import RunError
 
-_USERS_TO_MEND = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+_USERS_TO_MEND = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),  # no room
+    *(errno.EACCES, errno.EPERM, errno.EROFS),  # no permission
+    *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO),  # something else is there
+    *(errno.ENAMETOOLONG, errno.ELOOP),
+)
+"""The system's errors about a place that a user names."""
+
+
+def user_can_mend(error: OSError) -> bool:
+    """Whether the system refused a place that a user named. Libraries that lose the number report a short write."""
+    return error.errno is None or error.errno in _USERS_TO_MEND
 
 
 def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
@@ -37,16 +48,37 @@ def writing_to(path: Path) -> Iterator[None]:
     Raises:
         RunError: instead of the system's own errors.
     """
+    if "\0" in os.fspath(path):
+        raise RunError(f"{os.fspath(path)!r} has a zero byte: expected a name that a file can have; choose another")
     try:
         yield
     except OSError as error:
-        if error.errno not in _USERS_TO_MEND:
+        if not user_can_mend(error):
             raise
-        reason = error.strerror or os.strerror(error.errno)
+        reason = error.strerror or str(error)
+        if isinstance(error.filename, str) and Path(error.filename).parent != path.parent:
+            reason += f": {error.filename}"  # not the temporary name
         raise RunError(
             f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
             "another place"
         ) from error
+
+
+def require_writable(*paths: Path, overwrite: bool = False) -> None:
+    """Raise now, before long work, what writing these files at its end would raise.
+
+    Raises:
+        RunError: one is there already and must not be overwritten, is a folder, or its folder cannot be written to.
+    """
+    for path in paths:
+        if not overwrite:
+            refuse_existing(path)
+        with writing_to(path):
+            _refuse_folder(path)
+            there = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+            probe = _partial_name(there / path.name)
+            probe.touch()
+            probe.unlink()
 
 
 @contextmanager
@@ -54,23 +86,33 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary name next to `path` to write to; renamed to `path` when the block ends, deleted when it fails.
 
     Raises:
-        RunError: `path` is there already and must not be overwritten, or its folder cannot be written to.
+        RunError: `path` is there already and must not be overwritten, is a folder, or its folder cannot be written to.
     """
     if not overwrite:
         refuse_existing(path)
-    # The suffix stays, because writers choose their format by it.
-    partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
-    try:
-        with writing_to(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _partial_name(path)
+    with writing_to(path):
+        _refuse_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
             yield partial
             with partial.open("rb+") as file:
                 # Without this a power cut may leave the final name with nothing behind it.
                 os.fsync(file.fileno())
             os.replace(partial, path)
-    finally:
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has its final name
-            partial.unlink()
+        finally:
+            with suppress(OSError):  # it has its final name, or the error that is on its way says more
+                partial.unlink()
+
+
+def _partial_name(path: Path) -> Path:
+    """A temporary name next to `path`; the suffix stays, because writers choose their format by it."""
+    return path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
+
+
+def _refuse_folder(path: Path) -> None:
+    if path.is_dir():
+        raise RunError(f"{path} is a folder: expected the name of a file; choose another")
 
 
 @contextmanager
@@ -123,7 +165,7 @@ def read_json(path: Path) -> Any:
         return None
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RunError(
             f"{path} is not valid JSON ({error}): expected what this program wrote; delete it and repeat"
         ) from error
