@@ -5,16 +5,28 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import os
 import secrets
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
 from tidefield.errors import RunError
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+log = logging.getLogger(__name__)
+
+LOCK_FILE = ".lock"
+_LARGEST_JSON = 1 << 26
 _USERS_TO_MEND = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),  # no room
     *(errno.EACCES, errno.EPERM, errno.EROFS),  # no permission
@@ -64,6 +76,24 @@ def writing_to(path: Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def reading_from(path: Path) -> Iterator[None]:
+    """Turn the system's errors of a place that cannot be read into one clear error.
+
+    Raises:
+        RunError: instead of the system's own errors.
+    """
+    try:
+        yield
+    except OSError as error:
+        if not user_can_mend(error):
+            raise
+        raise RunError(
+            f"{path} cannot be read ({error.strerror or error}): expected one that you may read; ask its owner, or "
+            "name another"
+        ) from error
+
+
 def require_writable(*paths: Path, overwrite: bool = False) -> None:
     """Raise now, before long work, what writing these files at its end would raise.
 
@@ -95,7 +125,10 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         _refuse_folder(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            partial.touch()
+            mode = partial.stat().st_mode  # what the user's umask leaves; some writers would keep it to the user
             yield partial
+            partial.chmod(mode)
             with partial.open("rb+") as file:
                 # Without this a power cut may leave the final name with nothing behind it.
                 os.fsync(file.fileno())
@@ -108,6 +141,73 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 def _partial_name(path: Path) -> Path:
     """A temporary name next to `path`; the suffix stays, because writers choose their format by it."""
     return path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
+
+
+def delete_partials(*paths: Path) -> None:
+    """Delete what processes that were killed while they wrote these files have left of them."""
+    for path in paths:
+        for partial in path.parent.glob(f".{escape(path.stem)}-????????.partial{escape(path.suffix)}"):
+            with writing_to(partial):
+                partial.unlink(missing_ok=True)
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder holds nothing, or only its lock."""
+    with reading_from(folder):
+        return all(path.name == LOCK_FILE for path in folder.iterdir())
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Lock a folder, which is made, against other processes that write to it; one that still holds nothing is removed.
+
+    The system releases the lock when the process dies, however it dies.
+
+    Raises:
+        RunError: another process has the lock, or the folder cannot be written to.
+    """
+    made = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
+    path = folder / LOCK_FILE
+    with writing_to(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    try:
+        with file:
+            # The other process may have ended, and removed its lock, after we opened it.
+            if not (
+                _lock(file.fileno(), folder)
+                and path.exists()
+                and os.path.samestat(os.stat(path), os.stat(file.fileno()))
+            ):
+                raise RunError(
+                    f"another process is writing to {folder}: expected one at a time; wait until it ends, or choose "
+                    "another folder"
+                )
+            try:
+                yield
+            finally:
+                with suppress(OSError):  # Windows does not remove what is open; a lock that nobody holds does no harm
+                    path.unlink()
+    finally:
+        for one in made:
+            with suppress(OSError):  # something is in it
+                one.rmdir()
+
+
+def _lock(descriptor: int, folder: Path) -> bool:
+    """Lock an open file; False where another process has."""
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
+            raise
+        log.warning(f"{folder} is on a file system without locks: make sure that no other process writes to it")
+    return True
 
 
 def _refuse_folder(path: Path) -> None:
@@ -161,11 +261,13 @@ def read_json(path: Path) -> Any:
     Raises:
         RunError: when it is damaged.
     """
-    if not path.is_file():
-        return None
+    with reading_from(path):
+        if not path.is_file():
+            return None
+        content = path.read_bytes() if path.stat().st_size <= _LARGEST_JSON else b""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(content)
     except (ValueError, RecursionError) as error:
         raise RunError(
-            f"{path} is not valid JSON ({error}): expected what this program wrote; delete it and repeat"
+            f"{path} is not valid JSON ({error}): expected what this program wrote; restore it, or delete it and repeat"
         ) from error
