@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.train import report_end
-from tidefield.config import PRESETS, Budget
+from tidefield.config import PRESETS, Budget, checked_seed
 from tidefield.errors import RunError
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
     from tidefield.train.stream import Stream
 
     budget, folder, config = options.budget.checked(), options.out, PRESETS[options.preset]
+    seed = checked_seed(options.seed)
     occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
     if occupied:
@@ -60,9 +61,9 @@ def pretrain(options: Pretrain, console: Console) -> None:
     if across.is_distributed() and budget.steps is None:
         raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    with Stream(folder / "scenes", options.real, across.process_seed(options.seed), device) as stream:
+    with Stream(folder / "scenes", options.real, across.process_seed(seed), device) as stream:
         shown = next(iter(validation.scenes.values()))
-        trainer = across.Pretrainer(config, stream, shown, options.seed, device)
+        trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:
             trainer.resume(folder)
         finished = train(trainer, folder, budget, console, validation)
@@ -71,7 +72,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
         description = {
             "steps": done.step,
             "seconds": done.seconds,
-            "seed": options.seed,
+            "seed": seed,
             "real": [scene.resolve().name for scene in options.real],
             **machine.describe(),
             "processes": across.world_size(),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import Budget, Config, NerfstudioConfig, vary, warm_start
+from tidefield.config import Budget, Config, NerfstudioConfig, checked_seed, vary, warm_start
 from tidefield.errors import RunError, SceneError
 from tidefield.methods import configuration, make_trainer
 
@@ -141,7 +141,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     if weights is not None:
         assert isinstance(config, Config), "only our networks start from weights"
         config, digest = warm_start(config), weights_sha256(weights)
-    return Run(options.scene.resolve(), options.width, options.seed, config, digest), weights
+    return Run(options.scene.resolve(), options.width, checked_seed(options.seed), config, digest), weights
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:
