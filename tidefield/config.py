@@ -285,8 +285,8 @@ def config_to_json(config: AnyConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def config_from_json(data: Any) -> AnyConfig:
-    """The configuration of a JSON object.
+def config_from_json(data: Any, where: str = "config") -> AnyConfig:
+    """The configuration of a JSON object; `where` names it in messages.
 
     Raises:
         RunError: a field is missing, unknown, of another type or out of its range, or two do not fit each other.
@@ -295,13 +295,13 @@ def config_from_json(data: Any) -> AnyConfig:
     method = data.get("method") if isinstance(data, dict) else None
     kinds = typing.get_args(AnyConfig)
     kind = next((k for k in kinds if method in typing.get_args(typing.get_type_hints(k)["method"])), Config)
-    config = from_json(kind, data, "config")
+    config = from_json(kind, data, where)
     if isinstance(config, Config):
-        _require_fit(config)
+        _require_fit(config, where)
     return config
 
 
-def _require_fit(config: Config) -> None:
+def _require_fit(config: Config, where: str) -> None:
     """Raises: RunError when sizes that depend on each other do not fit."""
     network, passes = config.network, config.network.passes
     strides, swift = [one.stride for one in passes], network.kind == "swift"
@@ -313,7 +313,7 @@ def _require_fit(config: Config) -> None:
         (not swift or all(one.hidden == one.feature_channels for one in passes), "as many hidden as feature channels"),
     ):
         if not fits:
-            raise RunError(f"the sizes of the network do not fit each other: expected {expected}; train it again")
+            raise RunError(f"{where} has sizes that do not fit each other: expected {expected}; train it again")
 
 
 def _convert_0_1(data: Any) -> Any:
