@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -149,6 +149,18 @@ def delete_partials(*paths: Path) -> None:
         for partial in path.parent.glob(f".{escape(path.stem)}-????????.partial{escape(path.suffix)}"):
             with writing_to(partial):
                 partial.unlink(missing_ok=True)
+
+
+def delete_files(folder: Path, files: Iterable[Path]) -> None:
+    """Delete files in a folder, and the folders in it that hold nothing afterwards."""
+    files = [file for file in files if not file.is_dir()]
+    with writing_to(folder):
+        for file in files:
+            file.unlink(missing_ok=True)
+    emptied = {one for file in files for one in file.relative_to(folder).parents[:-1]}
+    for one in sorted(emptied, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):  # it holds other files
+            (folder / one).rmdir()
 
 
 def is_empty(folder: Path) -> bool:
