@@ -167,6 +167,12 @@ def test_a_damaged_header_or_state_of_training_is_one_clear_error(
         SceneTrainer(SMALL, scene, seed=1, device=CPU).resume(tmp_path)
 
 
+def test_a_checkpoint_is_no_weights_file(trained: bytes, tmp_path: Path) -> None:
+    (tmp_path / CHECKPOINT_FILE).write_bytes(trained)
+    with pytest.raises(RunError, match="is not a weights file"):
+        read_weights(tmp_path / CHECKPOINT_FILE, make_network(SMALL.network))
+
+
 def test_a_header_nested_too_deeply_is_one_clear_error(tmp_path: Path) -> None:
     save_file({}, tmp_path / CHECKPOINT_FILE, metadata={"tidefield": "[" * 100_000})
     with pytest.raises(RunError, match="damaged"):

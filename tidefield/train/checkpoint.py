@@ -357,7 +357,10 @@ def read_weights_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         RunError: there is no such file, or it is damaged.
     """
     _require_weights(path)
-    return _read_tensors(path, "what `tidefield pretrain` wrote; name another")
+    header, tensors = _read_tensors(path, "what `tidefield pretrain` wrote; name another")
+    if "config" not in header:
+        raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
+    return header, tensors
 
 
 def read_weights(path: Path, network: Network) -> None:
@@ -367,7 +370,7 @@ def read_weights(path: Path, network: Network) -> None:
         RunError: there is no such file, it is damaged, or it belongs to another network.
     """
     header, tensors = read_weights_file(path)
-    config = config_from_json(header.get("config"), f"{path}: config")
+    config = config_from_json(header["config"], f"{path}: config")
     if not isinstance(config, Config):
         raise RunError(f"{path} is of {config.method}: expected weights of a preset; name others")
     own, theirs = _comparable(asdict(network.config)), _comparable(asdict(config.network))
