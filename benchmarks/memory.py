@@ -81,6 +81,6 @@ def make_run(work: Path, preset: str, width: int, photographs: int) -> str:
     # Readers fit the cameras to photographs of another size than the model says. No weight depends on their size, so
     # small ones will do here.
     scene = load_scene(folder, width=min(width, 64))
-    SceneTrainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
     write_run(work / "run", Run(folder.resolve(), None, 0, PRESETS[preset]))
+    SceneTrainer(PRESETS[preset], scene, 0, torch.device("cpu")).save(work / "run")
     return scene.names[scene.test[-1]]

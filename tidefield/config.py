@@ -6,23 +6,44 @@ A run stores its `Config` as JSON next to its weights; `config_from_json` reads 
 from __future__ import annotations
 
 import dataclasses
+import math
+import reprlib
 import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
 from tidefield.errors import RunError
+
+
+@dataclass(frozen=True)
+class Range:
+    """The least and the greatest number that a field may have, which bounds what a damaged file can ask for."""
+
+    least: int | float
+    greatest: int | float
+
+
+Channels = Annotated[int, Range(1, 1024)]
+Layers = Annotated[int, Range(1, 64)]
+Count = Annotated[int, Range(1, 4096)]
+Pixels = Annotated[int, Range(1, 4096)]
+Share = Annotated[float, Range(0, 1)]
+Weight = Annotated[float, Range(0, 1e6)]
+Seed = Annotated[int, Range(-(1 << 63), (1 << 64) - 1)]
+"""What PyTorch's generators take."""
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
     """The feature network (Table 1)."""
 
-    widths: tuple[int, int, int, int] = (64, 64, 128, 256)
+    widths: tuple[Channels, Channels, Channels, Channels] = (64, 64, 128, 256)
     """Channels of the 7x7 convolution and of the three residual stages."""
-    blocks: tuple[int, int, int] = (3, 4, 6)
+    blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)
     """Basic blocks of the residual stages; ResNet-34 has 3, 4, 6."""
     instance_norm: bool = True
     """Instance norms in place of ResNet's batch norms; without them features do not depend on how much is encoded."""
@@ -32,15 +53,15 @@ class EncoderConfig:
 class PassConfig:
     """One pass along the rays; each searches closer to where the one before found the surface."""
 
-    stride: int
+    stride: Pixels
     """Pixels between rays: 4 means one ray for 4 x 4 pixels."""
-    samples: int
+    samples: Count
     """M, samples along a ray."""
-    feature_stride: int
-    """Pixels between the texels of the feature maps that this pass reads: 4, 2 or 1."""
-    feature_channels: int
+    feature_stride: Literal[4, 2, 1]
+    """Pixels between the texels of the feature maps that this pass reads."""
+    feature_channels: Channels
     """C, channels of these maps."""
-    hidden: int
+    hidden: Channels
     """H, channels of the aggregated features and of the ray transformer."""
 
 
@@ -56,13 +77,13 @@ class NetworkConfig:
     encoder: EncoderConfig
     passes: tuple[PassConfig, ...]
     """Coarse to fine; the paper has one."""
-    views: int
+    views: Annotated[int, Range(1, 256)]
     """N, neighbouring views of each sample."""
-    heads: int = 4
+    heads: Channels = 4
     """Attention heads of the ray transformer."""
-    harmonics_degree: int = 3
+    harmonics_degree: Annotated[int, Range(0, 4)] = 3
     """J of eq. 8."""
-    uniform_fraction: float = 0.05
+    uniform_fraction: Share = 0.05
     """Share of a finer pass's samples that are spread evenly instead of where the coarser pass found the surface."""
     without: tuple[Part, ...] = ()
     """Parts of the paper that are left out, for the ablation: views count alike instead of by direction (eq. 6),
@@ -73,21 +94,21 @@ class NetworkConfig:
 class TrainConfig:
     """How the network is trained."""
 
-    tile_px: int
+    tile_px: Pixels
     """Side of the square tiles that rays are drawn in."""
-    tiles: int
+    tiles: Count
     """Tiles per step."""
-    crop_px: int | None
+    crop_px: Pixels | None
     """Side of the crops of the neighbours that are encoded for a tile; None encodes whole photographs."""
-    learning_rate: float
-    warm_up: int = 50
+    learning_rate: Share
+    warm_up: Annotated[int, Range(1, 10**9)] = 50
     """Steps over which the learning rate rises."""
-    unseen_weight: float = 1.0
+    unseen_weight: Weight = 1.0
     """In the loss, of pixels that fewer than two other training photographs see: little can be learned from what
     cannot be known, and its large errors drown the rest."""
-    structure_weight: float = 0.0
+    structure_weight: Weight = 0.0
     """In the loss, of 1 - SSIM of the tiles: squared errors alone leave unpredictable detail blurred."""
-    depth_weight: float = 0.0
+    depth_weight: Weight = 0.0
     """In the loss, of the sparse points' depths; added where a surface misses a point by 1%."""
     neighbours: Literal["seen", "direction"] = "seen"
     """How neighbours are ranked: by what the target sees, or by viewing direction alone, as the paper does."""
@@ -98,19 +119,19 @@ class NerfConfig:
     """Classical NeRF, the baseline."""
 
     method: Literal["nerf"] = "nerf"
-    coarse: int = 64
+    coarse: Count = 64
     """Samples of the coarse pass; the fine one reads them again."""
-    fine: int = 128
+    fine: Count = 128
     """Further samples of the fine pass."""
-    depth: int = 8
-    width: int = 256
-    position_octaves: int = 10
-    direction_octaves: int = 4
-    rays: int = 1024
+    depth: Layers = 8
+    width: Annotated[int, Range(2, 4096)] = 256
+    position_octaves: Annotated[int, Range(0, 32)] = 10
+    direction_octaves: Annotated[int, Range(0, 32)] = 4
+    rays: Annotated[int, Range(1, 1 << 20)] = 1024
     """Rays of a step."""
-    learning_rate: float = 5e-4
+    learning_rate: Share = 5e-4
     """At the beginning; a tenth at the end."""
-    density_noise: float = 1.0
+    density_noise: Weight = 1.0
     """Standard deviation of what is added to densities of scenes without background, while training."""
 
 
@@ -183,10 +204,14 @@ class Budget:
         """This budget, or ten minutes where nothing is given.
 
         Raises:
-            RunError: both minutes and steps are given.
+            RunError: both minutes and steps are given, or one that is not a number above 0.
         """
         if self.minutes is not None and self.steps is not None:
             raise RunError("both --minutes and --steps are given: expected one of them; leave one out")
+        if self.steps is not None and not 1 <= self.steps < 1 << 63:
+            raise RunError(f"--steps {reprlib.repr(self.steps)} was asked for: expected 1 or more; choose another")
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise RunError(f"--minutes {self.minutes} was asked for: expected a time above 0; choose another")
         return Budget(minutes=10.0) if self.minutes is None and self.steps is None else self
 
     def share(self, step: int, seconds: float) -> float:
@@ -195,6 +220,17 @@ class Budget:
             return min(1.0, step / max(self.steps, 1))
         assert self.minutes is not None, "a budget is steps or minutes"
         return min(1.0, seconds / max(60 * self.minutes, 1e-9))
+
+
+def checked_seed(seed: int) -> int:
+    """The seed that --seed gives.
+
+    Raises:
+        RunError: random generators do not take it.
+    """
+    if not 0 <= seed < 1 << 63:
+        raise RunError(f"--seed {reprlib.repr(seed)} was asked for: expected 0 to {(1 << 63) - 1}; choose another")
+    return seed
 
 
 def warm_start(config: Config) -> Config:
@@ -249,17 +285,35 @@ def config_to_json(config: AnyConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def config_from_json(data: Any) -> AnyConfig:
-    """The configuration of a JSON object.
+def config_from_json(data: Any, where: str = "config") -> AnyConfig:
+    """The configuration of a JSON object; `where` names it in messages.
 
     Raises:
-        RunError: when a field is missing, unknown or of another type.
+        RunError: a field is missing, unknown, of another type or out of its range, or two do not fit each other.
     """
     data = _convert_0_1(data)
     method = data.get("method") if isinstance(data, dict) else None
     kinds = typing.get_args(AnyConfig)
     kind = next((k for k in kinds if method in typing.get_args(typing.get_type_hints(k)["method"])), Config)
-    return _build(kind, data, "config")
+    config = from_json(kind, data, where)
+    if isinstance(config, Config):
+        _require_fit(config, where)
+    return config
+
+
+def _require_fit(config: Config, where: str) -> None:
+    """Raises: RunError when sizes that depend on each other do not fit."""
+    network, passes = config.network, config.network.passes
+    strides, swift = [one.stride for one in passes], network.kind == "swift"
+    for fits, expected in (
+        (swift or len(passes) == 1, "one pass of the paper's network"),
+        (strides[-1:] == [1] and not any(a % b for a, b in pairwise(strides)), "strides that divide each other, to 1"),
+        (not any(config.train.tile_px % stride for stride in strides), "tiles that the strides divide"),
+        (not any(one.hidden % network.heads for one in passes), "as many hidden channels for every head"),
+        (not swift or all(one.hidden == one.feature_channels for one in passes), "as many hidden as feature channels"),
+    ):
+        if not fits:
+            raise RunError(f"{where} has sizes that do not fit each other: expected {expected}; train it again")
 
 
 def _convert_0_1(data: Any) -> Any:
@@ -283,32 +337,47 @@ def _convert_0_1(data: Any) -> Any:
         "uniform_fraction": network.get("doubt"),
         "without": network.get("without"),
     }
-    train = {name: value for name, value in data.get("train", {}).items() if name != "field_learning_rate"}
+    train = data.get("train")
+    if isinstance(train, dict):
+        train = {name: value for name, value in train.items() if name != "field_learning_rate"}
     return {**data, "network": kept, "train": train}
 
 
-def _build(kind: Any, data: Any, where: str) -> Any:
+def from_json(kind: Any, data: Any, where: str) -> Any:
+    """A value of a type from JSON: a dataclass, tuple, literal, number (also one with a `Range`), text or bool.
+
+    Raises:
+        RunError: it is something else; `where` says which value.
+    """
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
+        hints = typing.get_type_hints(kind, include_extras=True)
         if not isinstance(data, dict) or set(data) != set(hints):
             wrong = set(data) ^ set(hints) if isinstance(data, dict) else type(data).__name__
-            raise RunError(f"{where} does not fit this version ({wrong}): expected {sorted(hints)}; train it again")
-        return kind(**{name: _build(hint, data[name], f"{where}.{name}") for name, hint in hints.items()})  # type: ignore[operator]
+            raise RunError(
+                f"{where} does not fit this version ({reprlib.repr(wrong)}): expected {sorted(hints)}; train it again"
+            )
+        return kind(**{name: from_json(hint, data[name], f"{where}.{name}") for name, hint in hints.items()})  # type: ignore[operator]
     if origin is tuple:
         kinds = arguments[:1] * len(data) if isinstance(data, list) and arguments[-1] is ... else arguments
         if not isinstance(data, list) or len(data) != len(kinds):
-            raise RunError(f"{where} is {data!r}: expected a list of {len(kinds)}; train it again")
-        return tuple(_build(k, value, f"{where}[{i}]") for i, (k, value) in enumerate(zip(kinds, data, strict=True)))
+            raise RunError(f"{where} is {reprlib.repr(data)}: expected a list of {len(kinds)}; train it again")
+        return tuple(from_json(k, x, f"{where}[{i}]") for i, (k, x) in enumerate(zip(kinds, data, strict=True)))
     if origin in (typing.Union, types.UnionType):
         inner = next(k for k in arguments if k is not type(None))
-        return None if data is None else _build(inner, data, where)
+        return None if data is None else from_json(inner, data, where)
+    if origin is Annotated:
+        inner, allowed = arguments
+        if type(data) in (int, float) and not allowed.least <= data <= allowed.greatest:
+            expected = f"{allowed.least:g} to {allowed.greatest:g}"
+            raise RunError(f"{where} is {reprlib.repr(data)}: expected {expected}; train it again")
+        return from_json(inner, data, where)
     if origin is Literal:
-        if data not in arguments:
-            raise RunError(f"{where} is {data!r}: expected one of {arguments}")
+        if not any(type(data) is type(one) and data == one for one in arguments):
+            raise RunError(f"{where} is {reprlib.repr(data)}: expected one of {arguments}; train it again")
         return data
-    if kind is float and isinstance(data, int) and not isinstance(data, bool):
+    if kind is float and type(data) is int and abs(data) < 1 << 1023:  # more is no float
         return float(data)
     if type(data) is not kind:
-        raise RunError(f"{where} is {data!r}: expected {kind.__name__}")
+        raise RunError(f"{where} is {reprlib.repr(data)}: expected {kind.__name__}; train it again")
     return data

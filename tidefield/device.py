@@ -36,8 +36,8 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast to bfloat16 where the processor gains by it; elsewhere it would only cost accuracy."""
+def choose_precision(device: torch.device) -> torch.dtype:
+    """bfloat16 where the processor gains by it; elsewhere it would only cost accuracy."""
     if device.type == "cuda":
         gains = torch.cuda.is_bf16_supported(including_emulation=False)
     elif device.type == "cpu":
@@ -45,7 +45,12 @@ def mixed_precision(device: torch.device) -> AbstractContextManager[object]:
             gains = _cpu_gains_by_bfloat16()
     else:
         gains = False
-    if not gains:
+    return torch.bfloat16 if gains else torch.float32
+
+
+def mixed_precision(device: torch.device, precision: torch.dtype | None = None) -> AbstractContextManager[object]:
+    """Autocast to a precision; to that of `choose_precision` if None."""
+    if (precision or choose_precision(device)) == torch.float32:
         return nullcontext()
     # On CPUs several threads may be at work, which would share the cache of converted weights.
     return torch.autocast(device.type, dtype=torch.bfloat16, cache_enabled=device.type != "cpu")

@@ -5,17 +5,40 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
 from tidefield.errors import RunError
 
-_USERS_TO_MEND = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+log = logging.getLogger(__name__)
+
+LOCK_FILE = ".lock"
+_LARGEST_JSON = 1 << 26
+_USERS_TO_MEND = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),  # no room
+    *(errno.EACCES, errno.EPERM, errno.EROFS),  # no permission
+    *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO),  # something else is there
+    *(errno.ENAMETOOLONG, errno.ELOOP),
+)
+"""The system's errors about a place that a user names."""
+
+
+def user_can_mend(error: OSError) -> bool:
+    """Whether the system refused a place that a user named. Libraries that lose the number report a short write."""
+    return error.errno is None or error.errno in _USERS_TO_MEND
 
 
 def refuse_existing(*paths: Path, replaceable: bool = True) -> None:
@@ -37,12 +60,16 @@ def writing_to(path: Path) -> Iterator[None]:
     Raises:
         RunError: instead of the system's own errors.
     """
+    if "\0" in os.fspath(path):
+        raise RunError(f"{os.fspath(path)!r} has a zero byte: expected a name that a file can have; choose another")
     try:
         yield
     except OSError as error:
-        if error.errno not in _USERS_TO_MEND:
+        if not user_can_mend(error):
             raise
-        reason = error.strerror or os.strerror(error.errno)
+        reason = error.strerror or str(error)
+        if isinstance(error.filename, str) and Path(error.filename).parent != path.parent:
+            reason += f": {error.filename}"  # not the temporary name
         raise RunError(
             f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
             "another place"
@@ -50,27 +77,154 @@ def writing_to(path: Path) -> Iterator[None]:
 
 
 @contextmanager
+def reading_from(path: Path) -> Iterator[None]:
+    """Turn the system's errors of a place that cannot be read into one clear error.
+
+    Raises:
+        RunError: instead of the system's own errors.
+    """
+    try:
+        yield
+    except OSError as error:
+        if not user_can_mend(error):
+            raise
+        raise RunError(
+            f"{path} cannot be read ({error.strerror or error}): expected one that you may read; ask its owner, or "
+            "name another"
+        ) from error
+
+
+def require_writable(*paths: Path, overwrite: bool = False) -> None:
+    """Raise now, before long work, what writing these files at its end would raise.
+
+    Raises:
+        RunError: one is there already and must not be overwritten, is a folder, or its folder cannot be written to.
+    """
+    for path in paths:
+        if not overwrite:
+            refuse_existing(path)
+        with writing_to(path):
+            _refuse_folder(path)
+            there = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+            probe = _partial_name(there / path.name)
+            probe.touch()
+            probe.unlink()
+
+
+@contextmanager
 def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary name next to `path` to write to; renamed to `path` when the block ends, deleted when it fails.
 
     Raises:
-        RunError: `path` is there already and must not be overwritten, or its folder cannot be written to.
+        RunError: `path` is there already and must not be overwritten, is a folder, or its folder cannot be written to.
     """
     if not overwrite:
         refuse_existing(path)
-    # The suffix stays, because writers choose their format by it.
-    partial = path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
-    try:
-        with writing_to(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _partial_name(path)
+    with writing_to(path):
+        _refuse_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            partial.touch()
+            mode = partial.stat().st_mode  # what the user's umask leaves; some writers would keep it to the user
             yield partial
+            partial.chmod(mode)
             with partial.open("rb+") as file:
                 # Without this a power cut may leave the final name with nothing behind it.
                 os.fsync(file.fileno())
             os.replace(partial, path)
+        finally:
+            with suppress(OSError):  # it has its final name, or the error that is on its way says more
+                partial.unlink()
+
+
+def _partial_name(path: Path) -> Path:
+    """A temporary name next to `path`; the suffix stays, because writers choose their format by it."""
+    return path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
+
+
+def delete_partials(*paths: Path) -> None:
+    """Delete what processes that were killed while they wrote these files have left of them."""
+    for path in paths:
+        for partial in path.parent.glob(f".{escape(path.stem)}-????????.partial{escape(path.suffix)}"):
+            with writing_to(partial):
+                partial.unlink(missing_ok=True)
+
+
+def delete_files(folder: Path, files: Iterable[Path]) -> None:
+    """Delete files in a folder, and the folders in it that hold nothing afterwards."""
+    files = [file for file in files if not file.is_dir()]
+    with writing_to(folder):
+        for file in files:
+            file.unlink(missing_ok=True)
+    emptied = {one for file in files for one in file.relative_to(folder).parents[:-1]}
+    for one in sorted(emptied, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):  # it holds other files
+            (folder / one).rmdir()
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether a folder holds nothing, or only its lock."""
+    with reading_from(folder):
+        return all(path.name == LOCK_FILE for path in folder.iterdir())
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Lock a folder, which is made, against other processes that write to it; one that still holds nothing is removed.
+
+    The system releases the lock when the process dies, however it dies.
+
+    Raises:
+        RunError: another process has the lock, or the folder cannot be written to.
+    """
+    made = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
+    path = folder / LOCK_FILE
+    with writing_to(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    try:
+        with file:
+            # The other process may have ended, and removed its lock, after we opened it.
+            if not (
+                _lock(file.fileno(), folder)
+                and path.exists()
+                and os.path.samestat(os.stat(path), os.stat(file.fileno()))
+            ):
+                raise RunError(
+                    f"another process is writing to {folder}: expected one at a time; wait until it ends, or choose "
+                    "another folder"
+                )
+            try:
+                yield
+            finally:
+                with suppress(OSError):  # Windows does not remove what is open; a lock that nobody holds does no harm
+                    path.unlink()
     finally:
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # the first: it has its final name
-            partial.unlink()
+        for one in made:
+            with suppress(OSError):  # something is in it
+                one.rmdir()
+
+
+def _lock(descriptor: int, folder: Path) -> bool:
+    """Lock an open file; False where another process has."""
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
+            raise
+        log.warning(f"{folder} is on a file system without locks: make sure that no other process writes to it")
+    return True
+
+
+def _refuse_folder(path: Path) -> None:
+    if path.is_dir():
+        raise RunError(f"{path} is a folder: expected the name of a file; choose another")
 
 
 @contextmanager
@@ -119,11 +273,13 @@ def read_json(path: Path) -> Any:
     Raises:
         RunError: when it is damaged.
     """
-    if not path.is_file():
-        return None
+    with reading_from(path):
+        if not path.is_file():
+            return None
+        content = path.read_bytes() if path.stat().st_size <= _LARGEST_JSON else b""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise RunError(
-            f"{path} is not valid JSON ({error}): expected what this program wrote; delete it and repeat"
+            f"{path} is not valid JSON ({error}): expected what this program wrote; restore it, or delete it and repeat"
         ) from error

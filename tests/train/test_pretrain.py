@@ -159,7 +159,9 @@ def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         learner,
         "batch_loss",
-        lambda scene, priors, cameras, views, generator: seen.append(views) or (torch.zeros(()), torch.zeros(())),
+        lambda scene, priors, cameras, views, generator, precision: (
+            seen.append(views) or (torch.zeros(()), torch.zeros(()))
+        ),
     )
     for _ in range(200):
         learner.loss()
@@ -255,6 +257,8 @@ def test_what_ships_fits_its_preset_and_its_card() -> None:
     assert not (SHIPPED / "paper.safetensors").exists(), "54 times as large as swift's: a package of its own"
     for preset, file in files.items():
         read_weights(file, make_network(PRESETS[preset].network))
+        with safe_open(file, framework="pt") as stored:
+            assert "sha256" in json.loads(stored.metadata()["tidefield"])
         card = file.with_suffix(".md").read_text(encoding="utf-8")
         assert card.startswith(f"# Weights of the preset {preset}\n")
         assert weights_sha256(file) in card

@@ -22,7 +22,17 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield.commands import train as train_command
 from tidefield.commands.train import Train
-from tidefield.config import PAPER, PRESETS, SWIFT, Budget, Config, EncoderConfig, config_from_json, config_to_json
+from tidefield.config import (
+    PAPER,
+    PRESETS,
+    SWIFT,
+    Budget,
+    Config,
+    EncoderConfig,
+    checked_seed,
+    config_from_json,
+    config_to_json,
+)
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.model.network import make_network
@@ -135,6 +145,52 @@ def test_a_run_file_keeps_the_whole_configuration(config: Config, tmp_path: Path
     assert read_run(tmp_path) == run
 
 
+def change(data: Any, where: str, value: Any) -> Any:
+    """JSON, with another value at a place such as network.passes.0.samples."""
+    data = json.loads(json.dumps(data))
+    *path, last = [int(word) if word.isdigit() else word for word in where.split(".")]
+    inner = data
+    for word in path:
+        inner = inner[word]
+    inner[last] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        *[("network.views", value) for value in (-2, 0, 5.5, True, "5", None, 10**400)],
+        *[("network.passes.0.samples", value) for value in (0, 10**7)],
+        *[("network.passes.1.hidden", value) for value in (10**7, 18, 32)],
+        *[("train.learning_rate", value) for value in (10**400, math.nan, math.inf, -1, "fast")],
+        *[("network.passes", value) for value in ([], None, [1])],
+        *[("network.passes.0.stride", value) for value in (0, 5, 64)],
+        *[("network.passes.0.feature_stride", value) for value in (3, 4.0, [])],
+        *[("network.harmonics_degree", 5), ("train.tile_px", 30), ("network.kind", "paper"), ("network.kind", {})],
+    ],
+)
+def test_a_configuration_that_no_network_can_have_is_one_clear_error(where: str, value: Any) -> None:
+    with pytest.raises(RunError, match="expected") as refused:
+        config_from_json(change(config_to_json(SWIFT), where, value))
+    assert len(str(refused.value)) < 300
+
+
+@pytest.mark.parametrize(
+    "budget", [{"steps": s} for s in (0, -5)] + [{"minutes": m} for m in (0.0, -1.0, math.nan, math.inf)]
+)
+def test_a_budget_is_a_time_or_a_number_of_steps_above_0(budget: dict[str, Any]) -> None:
+    (name,) = budget
+    with pytest.raises(RunError, match=f"--{name} .* was asked for: expected"):
+        Budget(**budget).checked()
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 63, 1 << 70])
+def test_a_seed_is_what_random_generators_take(seed: int) -> None:
+    with pytest.raises(RunError, match="--seed"):
+        checked_seed(seed)
+    assert checked_seed((1 << 63) - 1) == (1 << 63) - 1
+
+
 def test_a_configuration_with_an_unknown_field_is_refused() -> None:
     data = json.loads(json.dumps(config_to_json(SWIFT)))
     data["network"]["colour_of_the_sea"] = "grey"
@@ -214,7 +270,9 @@ def test_runs_of_version_0_1_are_read_with_converted_names(scene: Scene, tmp_pat
         )
         older[name] = value
     assert len(set(older) - set(tensors)) > 20
-    save_file(older, tmp_path / CHECKPOINT_FILE, metadata=metadata)
+    header = {**json.loads(metadata["tidefield"]), "version": "0.1.0"}
+    del header["sha256"], header["run"], header["cpu_precision"]
+    save_file(older, tmp_path / CHECKPOINT_FILE, metadata={"tidefield": json.dumps(header)})
     again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
     again.resume(tmp_path)
     for name, value in weights(trainer).items():

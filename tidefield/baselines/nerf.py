@@ -57,12 +57,11 @@ class Mlp(nn.Module):
         """Densities before their ReLU, and colours in [0, 1]; positions in [-1, 1], directions of length 1."""
         position = encode(xyz, self.config.position_octaves)
         seen_from = encode(direction, self.config.direction_octaves)[:, None].expand(-1, xyz.shape[1], -1)
-        with mixed_precision(xyz.device):
-            x = position
-            for k, layer in enumerate(self.trunk):
-                x = F.relu(layer(torch.cat([position, x], dim=-1) if k == self.skip else x))
-            density = self.density(x)[..., 0]
-            colour = self.colour(F.relu(self.branch(torch.cat([self.feature(x), seen_from], dim=-1))))
+        x = position
+        for k, layer in enumerate(self.trunk):
+            x = F.relu(layer(torch.cat([position, x], dim=-1) if k == self.skip else x))
+        density = self.density(x)[..., 0]
+        colour = self.colour(F.relu(self.branch(torch.cat([self.feature(x), seen_from], dim=-1))))
         return density.float(), colour.float().sigmoid()
 
 
@@ -114,29 +113,43 @@ class Nerf(nn.Module):
         self.centre_world.copy_((low + high) / 2)
         self.radius.copy_((high - low).max() / 2)
 
-    def forward(self, rays: Rays, opaque: bool, generator: torch.Generator | None = None) -> tuple[Seen, Seen]:
+    def forward(
+        self,
+        rays: Rays,
+        opaque: bool,
+        generator: torch.Generator | None = None,
+        precision: torch.dtype | None = None,
+    ) -> tuple[Seen, Seen]:
         """What the coarse and the fine pass see.
 
         Args:
             opaque: whether the last sample stops all light: real scenes have no holes.
             generator: jitters samples and densities, for training.
+            precision: of the layers; that of `choose_precision` if None.
         """
         config, count = self.config, len(rays.near_far)
         even = torch.ones(1, count, config.coarse, device=rays.near_far.device)
         place = sample(even, config.coarse, generator)[0]
-        coarse = self._pass(self.coarse, rays, place, opaque, generator)
+        coarse = self._pass(self.coarse, rays, place, opaque, generator, precision)
         known = (coarse.weights.detach() + 1e-5)[None]
         finer = torch.cat([place, sample(known, config.fine, generator)[0]], dim=-1).sort(dim=-1).values
-        return coarse, self._pass(self.fine, rays, finer, opaque, generator)
+        return coarse, self._pass(self.fine, rays, finer, opaque, generator, precision)
 
     def _pass(
-        self, mlp: Mlp, rays: Rays, place: Float[Tensor, "R M"], opaque: bool, generator: torch.Generator | None
+        self,
+        mlp: Mlp,
+        rays: Rays,
+        place: Float[Tensor, "R M"],
+        opaque: bool,
+        generator: torch.Generator | None,
+        precision: torch.dtype | None,
     ) -> Seen:
         near, far = rays.near_far[:, :1], rays.near_far[:, 1:]
         z = near + (far - near) * place
         xyz = rays.origin_world[:, None] + rays.direction_world[:, None] * z[..., None]
         length = rays.direction_world.norm(dim=-1, keepdim=True)
-        density, colour = mlp((xyz - self.centre_world) / self.radius, rays.direction_world / length)
+        with mixed_precision(z.device, precision):
+            density, colour = mlp((xyz - self.centre_world) / self.radius, rays.direction_world / length)
         if generator is not None and opaque and self.config.density_noise:
             noise = torch.randn(density.shape, generator=generator).to(density)
             density = density + self.config.density_noise * noise
@@ -171,7 +184,7 @@ class NerfTrainer(Trainer):
         rays = Rays.of(self.cameras, which.to(device), uv.to(device))
         background, truth = scene.background_rgb, truth.to(device)
         errors = []
-        for seen in self.nerf(rays, background is None, self.generator):
+        for seen in self.nerf(rays, background is None, self.generator, self.precision):
             colour = seen.colour
             if background is not None:
                 colour = colour + (1 - seen.opacity[:, None]) * colour.new_tensor(background)

@@ -87,4 +87,8 @@ def open_trained(
     scene = load(run.scene, run.width, allow_missing, console)
     with trained(folder, run, scene, device) as (render, progress):
         done = {"steps": progress.step, "seconds": progress.seconds}
-        yield scene, render, {**config_to_json(run.config), "seed": run.seed, "weights": run.weights, "trained": done}
+        yield (
+            scene,
+            render,
+            {**config_to_json(run.config), "seed": run.seed, "weights": run.weights, "run": run.id, "trained": done},
+        )

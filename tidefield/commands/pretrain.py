@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,10 +11,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.train import report_end
-from tidefield.config import PRESETS, Budget
+from tidefield.config import PRESETS, Budget, checked_seed
 from tidefield.errors import RunError
+from tidefield.files import delete_partials, is_empty, only_writer
 
 if TYPE_CHECKING:
+    import torch
     from rich.console import Console
 
 
@@ -43,26 +46,39 @@ def pretrain(options: Pretrain, console: Console) -> None:
     """Run `tidefield pretrain`."""
     from rich.console import Console
 
-    from tidefield import machine
     from tidefield.device import choose_device
     from tidefield.train import pretrain as across
-    from tidefield.train.checkpoint import WEIGHTS_FILE, write_weights
-    from tidefield.train.loop import train
-    from tidefield.train.stream import Stream
 
-    budget, folder, config = options.budget.checked(), options.out, PRESETS[options.preset]
-    occupied = not options.resume and folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    budget, folder = options.budget.checked(), options.out
+    seed = checked_seed(options.seed)
+    occupied = folder.exists() and (not folder.is_dir() or not is_empty(folder))
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
-    if occupied:
+    if options.resume and not occupied:
+        raise RunError(f"{folder} holds no training: expected one to continue; leave --resume out")
+    if occupied and not options.resume:
         raise RunError(f"{folder} is not empty: expected a new folder; choose another, or continue it with --resume")
     if not across.is_main_process():
         console = Console(quiet=True)
     if across.is_distributed() and budget.steps is None:
         raise RunError("several processes were started with --minutes: expected --steps, which all of them can count")
+    with only_writer(folder) if across.is_main_process() else nullcontext():
+        _pretrain(options, budget, seed, device, console)
+
+
+def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device, console: Console) -> None:
+    from tidefield import machine
+    from tidefield.train import pretrain as across
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, WEIGHTS_FILE, write_weights
+    from tidefield.train.loop import train
+    from tidefield.train.stream import Stream
+
+    folder, config = options.out, PRESETS[options.preset]
+    if across.is_main_process():
+        delete_partials(*(folder / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    with Stream(folder / "scenes", options.real, across.process_seed(options.seed), device) as stream:
+    with Stream(folder / "scenes", options.real, across.process_seed(seed), device) as stream:
         shown = next(iter(validation.scenes.values()))
-        trainer = across.Pretrainer(config, stream, shown, options.seed, device)
+        trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:
             trainer.resume(folder)
         finished = train(trainer, folder, budget, console, validation)
@@ -71,7 +87,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
         description = {
             "steps": done.step,
             "seconds": done.seconds,
-            "seed": options.seed,
+            "seed": seed,
             "real": [scene.resolve().name for scene in options.real],
             **machine.describe(),
             "processes": across.world_size(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import Budget, Config, NerfstudioConfig, vary, warm_start
+from tidefield.config import Budget, Config, NerfstudioConfig, checked_seed, vary, warm_start
 from tidefield.errors import RunError, SceneError
+from tidefield.files import delete_files, delete_partials, is_empty, only_writer
 from tidefield.methods import configuration, make_trainer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from tidefield.data.scene import Scene
     from tidefield.train.checkpoint import Run, TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -51,7 +54,7 @@ class Train:
     weights: Path | None = None
     """Start from these weights, of `tidefield pretrain`."""
     resume: bool = False
-    """Continue the run in the folder."""
+    """Continue the run in the folder; one that has saved nothing yet starts again."""
     overwrite: bool = False
     """Replace the run in the folder."""
     curve: bool = False
@@ -63,10 +66,22 @@ class Train:
 
 def train(options: Train, console: Console) -> None:
     """Run `tidefield train`."""
+    from tidefield.evaluation.curves import CURVE_FILE
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
+
+    folder = options.run
+    if os.path.isfile(folder):
+        raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
+    with only_writer(folder):
+        delete_partials(*(folder / name for name in (RUN_FILE, CHECKPOINT_FILE, CURVE_FILE)))
+        _train(options, console)
+
+
+def _train(options: Train, console: Console) -> None:
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
     from tidefield.progress import ProgressBar
-    from tidefield.train.checkpoint import read_run, write_run
+    from tidefield.train.checkpoint import read_run
     from tidefield.train.loop import train as run_training
 
     budget, folder, weights = options.budget.checked(), options.run, None
@@ -77,6 +92,9 @@ def train(options: Train, console: Console) -> None:
             raise RunError(
                 f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
             )
+        if isinstance(run.config, NerfstudioConfig):
+            raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
+        weights = _resumed_weights(options, run)
     else:
         run, weights = _new_run(options)
     scene = load(run.scene, run.width, options.allow_missing, console)
@@ -90,9 +108,7 @@ def train(options: Train, console: Console) -> None:
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver
 
-        if options.resume:
-            raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
-        write_run(folder, run)
+        _start(folder, run, scene)
         with ProgressBar(console, "Training") as bar:
 
             def show(step: int, seconds: float) -> None:
@@ -105,7 +121,7 @@ def train(options: Train, console: Console) -> None:
         if options.resume:
             trainer.resume(folder)
         else:
-            write_run(folder, run)
+            _start(folder, run, scene)
         used = budget.share(trainer.progress.step, trainer.progress.seconds)
         callback = curve and curve.watch(folder, used)
         finished, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
@@ -118,6 +134,40 @@ def report_end(progress: TrainingProgress, finished: bool, folder: Path, console
     if not finished:
         console.print("interrupted; the same command with --resume continues")
         raise KeyboardInterrupt
+
+
+def _start(folder: Path, run: Run, scene: Scene) -> None:
+    """Write run.json, after what an earlier run in the folder has left is deleted: it is not of this run."""
+    from tidefield.baselines.nerfstudio.driver import delete_training
+    from tidefield.evaluation.curves import CURVE_FILE
+    from tidefield.evaluation.evaluate import delete_evaluation
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, write_run
+
+    events = folder.glob("tensorboard/events.out.tfevents.*")
+    delete_files(folder, [folder / CHECKPOINT_FILE, folder / CURVE_FILE, *events])
+    delete_training(folder)
+    delete_evaluation(folder, scene.names)
+    write_run(folder, run)
+
+
+def _resumed_weights(options: Train, run: Run) -> Path | None:
+    """The weights that a run started from, if it must start again because it has saved nothing yet.
+
+    Raises:
+        RunError: they are not those that are named or installed.
+    """
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, given_or_shipped, weights_sha256
+
+    if run.weights is None or (options.run / CHECKPOINT_FILE).exists():
+        return None
+    assert isinstance(run.config, Config), "only our networks start from weights"
+    weights = given_or_shipped(options.weights, run.config.preset)
+    if weights_sha256(weights) != run.weights:
+        raise RunError(
+            f"{options.run} has saved nothing, and started from other weights than {weights}: expected those with the "
+            f"SHA-256 {run.weights}; name them with --weights, or train with --overwrite"
+        )
+    return weights
 
 
 def _new_run(options: Train) -> tuple[Run, Path | None]:
@@ -141,19 +191,17 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     if weights is not None:
         assert isinstance(config, Config), "only our networks start from weights"
         config, digest = warm_start(config), weights_sha256(weights)
-    return Run(options.scene.resolve(), options.width, options.seed, config, digest), weights
+    return Run(options.scene.resolve(), options.width, checked_seed(options.seed), config, digest), weights
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:
-    """Raises: RunError when a folder holds a run, or is something else that a run would be mixed into."""
+    """Raises: RunError when a folder holds a run, or other files that a run would be mixed with."""
     from tidefield.train.checkpoint import RUN_FILE
 
-    if folder.exists() and not folder.is_dir():
-        raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     if (folder / RUN_FILE).exists():
         if not overwrite:
             raise RunError(
                 f"{folder} holds a run: expected a new folder; choose another, or add --resume or --overwrite"
             )
-    elif folder.exists() and any(folder.iterdir()):
+    elif not is_empty(folder):
         raise RunError(f"{folder} holds other files: expected a new or empty folder; choose a new name")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.run import EVALUATION_FILE, PROCESS_FILE, RUNS
+from tidefield.compare.run import PROCESS_FILE, RUNS, read_evaluation
 from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import read_json
 
@@ -67,7 +67,7 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
     for scene in scenes:
         for method in methods:
             folder = out / RUNS / scene / method
-            evaluation = read_json(folder / EVALUATION_FILE)
+            evaluation = read_evaluation(folder)
             if evaluation is not None:
                 curve = [(float(x), float(y)) for x, y in read_json(folder / CURVE_FILE) or ()]
                 found[scene, method] = Result(evaluation, read_json(folder / PROCESS_FILE) or {}, curve, folder)

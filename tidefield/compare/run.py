@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, read_json, write_json
@@ -216,7 +217,7 @@ def compare(
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
     for number, (folder, name, scene, method) in enumerate(jobs, start=1):
         title = f"{name}, {method} ({number} of {len(jobs)})"
-        if (folder / EVALUATION_FILE).exists():
+        if read_evaluation(folder) is not None:
             say(f"{title}: done before")
             continue
         portable = commands(Path("SCENE"), Path("RUN"), method, settings)
@@ -229,6 +230,21 @@ def compare(
             usage = run(tidefield(*words, *again), {})
             command = shlex.join(["tidefield", *portable[step]])
             write_json(folder / PROCESS_FILE, {**record, step: {"command": command, **asdict(usage), **describe()}})
+
+
+def read_evaluation(folder: Path) -> Any:
+    """The evaluation of the run in a folder, or of what needs no run; None where there is none.
+
+    Raises:
+        RunError: it is damaged, or of another run than the one that is there.
+    """
+    evaluation, run = read_json(folder / EVALUATION_FILE), read_json(folder / RUN_FILE)
+    if evaluation is not None and run is not None and evaluation["configuration"].get("run") != run.get("id"):
+        raise RunError(
+            f"{folder / EVALUATION_FILE} is of another run than {RUN_FILE}: expected two files of one run; delete it "
+            "and repeat the command"
+        )
+    return evaluation
 
 
 def _kind(method: str) -> str:

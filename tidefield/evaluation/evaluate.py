@@ -5,6 +5,7 @@ A method is only a function `render(camera) -> Rendering` here, so every method 
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -25,10 +26,11 @@ from tidefield.errors import RunError
 from tidefield.evaluation.lpips import Lpips, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
-from tidefield.files import completed_file, refuse_existing, write_json
+from tidefield.files import completed_file, delete_files, delete_partials, read_json, refuse_existing, write_json
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar
 
+EVALUATION_FILE, FOLDERS = "evaluation.json", ("renderings", "pictures")
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
 _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_cc": "doubly seen, colour fit"}
 
@@ -72,12 +74,13 @@ def evaluate(
         RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
             is not finite.
     """
-    path, console = out / "evaluation.json", console or Console()
+    path, console = out / EVALUATION_FILE, console or Console()
     if not overwrite:
         refuse_existing(path)
     if not scene.test:
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
     files = picture_names([scene.names[i] for i in scene.test])
+    delete_partials(path, *(out / folder / file for folder in FOLDERS for file in files))
     photographs: dict[str, dict[str, Any]] = {}
     memory: dict[str, int | None] = {}
     networks: dict[str, Lpips | str] = {}
@@ -116,6 +119,16 @@ def evaluate(
     for remark in _remarks(report, out):
         console.print(remark, soft_wrap=True, highlight=False, markup=False)
     return Evaluation(path, report)
+
+
+def delete_evaluation(out: Path, names: Sequence[str]) -> None:
+    """Delete an evaluation, its pictures, and those that one of these photographs, ended before its end, has left."""
+    report = read_json(out / EVALUATION_FILE)
+    listed = report.get("per_photograph") if isinstance(report, dict) else None
+    pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in (*names, *(listed or ()))}
+    pictures |= {f"{name}.png" for name in (*names, *(listed or ()))}
+    found = [(file, file.relative_to(out / folder)) for folder in FOLDERS for file in (out / folder).rglob("*.png")]
+    delete_files(out, [out / EVALUATION_FILE, *(file for file, name in found if name.as_posix() in pictures)])
 
 
 def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
@@ -173,7 +186,7 @@ def _write_pictures(out: Path, file: Path, image: Image8, truth: Image8, renderi
         Panel("error (FLIP)", colours(flip_map(image, truth), error), error),
         depth_panel("depth", rendering.depth),
     ]
-    for folder, picture in (("renderings", Image.fromarray(image.numpy())), ("pictures", side_by_side(panels))):
+    for folder, picture in zip(FOLDERS, (Image.fromarray(image.numpy()), side_by_side(panels)), strict=True):
         path = out / folder / file
         with completed_file(path, overwrite=True) as partial:
             picture.save(partial)

@@ -2,17 +2,21 @@
 
 RUN/run.json describes a run; RUN/checkpoint.safetensors holds the weights, the optimiser, the random state and, in its
 header, the progress. A weights file (`tidefield pretrain`) holds the weights alone, in half precision, and a
-description. Each file is replaced whole or not at all.
+description. Each file is replaced whole or not at all, has the SHA-256 of what it holds, and must fit the network
+exactly. The files of a run have its random id, so that those of another run are not taken for its own.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+import secrets
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -20,14 +24,30 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tidefield import __version__
-from tidefield.config import AnyConfig, Config, config_from_json, config_to_json
+from tidefield.config import AnyConfig, Config, Range, Seed, config_from_json, config_to_json, from_json
 from tidefield.errors import RunError
-from tidefield.files import completed_file, file_sha256, write_json
+from tidefield.files import completed_file, file_sha256, read_json, reading_from, write_json
 from tidefield.model.network import Network
 
 RUN_FILE, CHECKPOINT_FILE, WEIGHTS_FILE = "run.json", "checkpoint.safetensors", "weights.safetensors"
 SHIPPED = Path(__file__).parents[1] / "weights"
-_LARGEST_RUN_FILE, _LARGEST_WEIGHTS_FILE = 1 << 24, 1 << 30
+_LARGEST_WEIGHTS_FILE = 1 << 30
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_RUN = {
+    "scene": str,
+    "width": Annotated[int | None, Range(1, 1 << 20)],
+    "seed": Seed,
+    "version": str,
+    "weights": str | None,
+    "id": str | None,
+}
+_PROGRESS = {
+    "step": Annotated[int, Range(0, (1 << 63) - 1)],
+    "seconds": Annotated[float, Range(0, 1e12)],
+    "losses": tuple[Annotated[float, Range(0, 1e38)], ...],
+    "cpu_precision": Literal["bfloat16", "float32"] | None,
+}
+"""Types of what run.json and the header of a checkpoint hold."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +61,7 @@ class Run:
         config: network and training.
         weights: SHA-256 of the trained weights it started from; None from scratch.
         version: of the program that started it.
+        id: random; None in runs of version 0.1.
     """
 
     scene: Path
@@ -49,28 +70,23 @@ class Run:
     config: AnyConfig
     weights: str | None = None
     version: str = __version__
+    id: str | None = field(default_factory=lambda: secrets.token_hex(8))
 
 
 @dataclass
 class TrainingProgress:
-    """How far a run has been trained."""
+    """How far a run has been trained, and the precision that it was trained in if that was on a CPU."""
 
     step: int = 0
     seconds: float = 0.0
     losses: list[float] = field(default_factory=list)
+    cpu_precision: Literal["bfloat16", "float32"] | None = None
 
 
 def write_run(folder: Path, run: Run) -> None:
     """Write RUN/run.json."""
-    data = {
-        "scene": str(run.scene),
-        "width": run.width,
-        "seed": run.seed,
-        "version": run.version,
-        "config": config_to_json(run.config),
-        "weights": run.weights,
-    }
-    write_json(folder / RUN_FILE, data)
+    data = {name: getattr(run, name) for name in _RUN}
+    write_json(folder / RUN_FILE, {**data, "scene": str(run.scene), "config": config_to_json(run.config)})
 
 
 def read_run(folder: Path) -> Run:
@@ -80,21 +96,22 @@ def read_run(folder: Path) -> Run:
         RunError: the folder holds no run, or one that does not fit this version.
     """
     path = folder / RUN_FILE
-    if not path.is_file():
+    data = read_json(path)
+    if data is None:
         raise RunError(
             f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
         )
-    if path.stat().st_size > _LARGEST_RUN_FILE:
-        raise RunError(f"{path} has {path.stat().st_size} bytes: expected a small file that `tidefield train` wrote")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        keys = {"scene", "width", "seed", "version", "config", "weights"}
-        if not isinstance(data, dict) or set(data) != keys:
-            raise ValueError(f"expected the keys {sorted(keys)}")
-        config = config_from_json(data["config"])
-        return Run(Path(data["scene"]), data["width"], data["seed"], config, data["weights"], data["version"])
-    except (ValueError, TypeError) as error:
-        raise RunError(f"{path} cannot be read as a run ({error}): expected what `tidefield train` wrote") from error
+    keys = {*_RUN, "config"}
+    if not isinstance(data, dict) or not keys - {"id"} <= set(data) <= keys:
+        raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
+    values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
+    config = config_from_json(data["config"], f"{path}: config")
+    return Run(**{**values, "scene": Path(values["scene"])}, config=config)
+
+
+def _run_id(folder: Path) -> str | None:
+    """The id of the run in a folder; None where a pretraining is."""
+    return read_run(folder).id if (folder / RUN_FILE).exists() else None
 
 
 def save_checkpoint(
@@ -109,73 +126,145 @@ def save_checkpoint(
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
     tensors["generator"] = generator.get_state()
-    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    header = {"step": progress.step, "seconds": progress.seconds, "losses": progress.losses, "version": __version__}
-    with completed_file(folder / CHECKPOINT_FILE, overwrite=True) as partial:
-        try:
-            save_file(tensors, partial, metadata={"tidefield": json.dumps(header)})
-        except SafetensorError as error:
-            # The library hides the system's error number in its text.
-            raise RunError(
-                f"{folder / CHECKPOINT_FILE} cannot be written ({error}): expected a folder of yours with free space; "
-                "make room and continue with --resume; the checkpoint before it is untouched"
-            ) from error
+    header = {"run": _run_id(folder), **asdict(progress), "version": __version__}
+    _write_tensors(folder / CHECKPOINT_FILE, tensors, header)
 
 
 def load_network(folder: Path, network: nn.Module) -> TrainingProgress:
     """Read the weights of a run's checkpoint into its network.
 
     Raises:
-        RunError: there is no checkpoint, it is damaged, or it belongs to another network.
+        RunError: there is no checkpoint, it is damaged, or it belongs to another run or network.
     """
-    return _load_network(folder, network)[0]
+    progress, tensors = _read_checkpoint(folder)
+    state = {name: value for name, value in tensors.items() if name.startswith("network.")}
+    _require_fit(folder / CHECKPOINT_FILE, state, _named(network))
+    network.load_state_dict({name.removeprefix("network."): value for name, value in state.items()})
+    return progress
 
 
 def load_training(
     folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, generator: torch.Generator
 ) -> TrainingProgress:
-    """Read all of a run's checkpoint, so that training continues as if it had not stopped."""
-    progress, tensors = _load_network(folder, network)
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimizer."):
-            _, index, key = name.split(".", 2)
-            state.setdefault(int(index), {})[key] = value
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    generator.set_state(tensors["generator"])
+    """Read all of a run's checkpoint, so that training continues as if it had not stopped.
+
+    Raises:
+        RunError: as `load_network`.
+    """
+    progress, tensors = _read_checkpoint(folder)
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    stored = {name.split(".")[1] for name in tensors if name.startswith("optimizer.")}  # not of unused parameters
+    expected = {**_named(network), "generator": generator.get_state()}
+    for index, value in enumerate(parameters):
+        if str(index) in stored:
+            state = {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+            expected |= {f"optimizer.{index}.{name}": tensor for name, tensor in state.items()}
+    path = folder / CHECKPOINT_FILE
+    _require_fit(path, tensors, expected)
+    try:
+        generator.set_state(tensors["generator"])
+    except RuntimeError as error:
+        raise RunError(f"{path} is damaged ({error}): expected the state of a random generator; train again") from error
+    network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
+    moments = {
+        index: {name: tensors[f"optimizer.{index}.{name}"] for name in ("step", "exp_avg", "exp_avg_sq")}
+        for index in map(int, stored)
+    }
+    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
     return progress
 
 
-def _load_network(folder: Path, network: nn.Module) -> tuple[TrainingProgress, dict[str, Tensor]]:
-    """Read a checkpoint's weights into a network; returns its progress and all of its tensors."""
+def _named(network: nn.Module) -> dict[str, Tensor]:
+    return {f"network.{name}": value for name, value in network.state_dict().items()}
+
+
+def _read_checkpoint(folder: Path) -> tuple[TrainingProgress, dict[str, Tensor]]:
+    """The progress in a run's checkpoint, and its tensors."""
     path = folder / CHECKPOINT_FILE
-    if not path.is_file():
+    with reading_from(path):
+        there = path.is_file()
+    if not there:
         raise RunError(f"{folder} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
-    try:
-        header, tensors = _read_tensors(path)
-        losses = [float(x) for x in header["losses"]]
-        progress = TrainingProgress(int(header["step"]), float(header["seconds"]), losses)
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+    header, tensors = _read_tensors(path, "a checkpoint that `tidefield train` wrote; train again into a new folder")
+    if header.get("run") != _run_id(folder):
         raise RunError(
-            f"{path} is damaged or of another program ({error}): expected a checkpoint that `tidefield train` wrote; "
-            "train again into a new folder"
-        ) from error
-    try:
-        network.load_state_dict(
-            {name.removeprefix("network."): v for name, v in tensors.items() if name.startswith("network.")}
+            f"{path} is of another run than {RUN_FILE}: expected two files of one run; restore the right one"
         )
-    except RuntimeError as error:
-        raise RunError(
-            f"{path} does not fit {folder / RUN_FILE}: expected two files of one run; restore the right one"
-        ) from error
-    return progress, tensors
+    values = {name: from_json(kind, header.get(name), f"{path}: {name}") for name, kind in _PROGRESS.items()}
+    return TrainingProgress(**{**values, "losses": list(values["losses"])}), tensors
 
 
-def _read_tensors(path: Path) -> tuple[Any, dict[str, Tensor]]:
-    """The description in a file's header, and its tensors, in today's names."""
-    with safe_open(path, framework="pt") as file:
-        header = json.loads((file.metadata() or {})["tidefield"])
-        return header, convert_names_0_1({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+def _write_tensors(path: Path, tensors: Mapping[str, Tensor], header: dict[str, Any]) -> None:
+    """Replace a file of tensors, whose header is a description."""
+    stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    text = json.dumps({**header, "sha256": _sha256(stored, header)})
+    with completed_file(path, overwrite=True) as partial:
+        try:
+            save_file(stored, partial, metadata={"tidefield": text})
+        except SafetensorError as error:
+            # The library hides the system's error number in its text.
+            raise RunError(
+                f"{path} cannot be written ({error}): expected a folder of yours with free space; make room and "
+                "continue with --resume; what was saved before is untouched"
+            ) from error
+
+
+def _read_tensors(path: Path, expected: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The description in a file's header, and its tensors, in today's names.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    with reading_from(path):
+        path.open("rb").close()  # safetensors says of a file that may not be read that there is none
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {})["tidefield"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        stored = header.pop("sha256", None)
+        if stored is None and header["version"] != "0.1.0":
+            raise ValueError("without a SHA-256")
+        if stored is not None and stored != _sha256(tensors, header):
+            raise ValueError("its SHA-256 is not that of what it holds")
+    except (
+        *(SafetensorError, KeyError, ValueError, TypeError, AttributeError),
+        *(OverflowError, RecursionError),
+    ) as error:
+        raise RunError(f"{path} is damaged or of another program ({error}): expected {expected}") from error
+    return header, convert_names_0_1(tensors)
+
+
+def _sha256(tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> str:
+    """SHA-256 of a description, and of the names, types, shapes and values of tensors."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _require_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Raises: RunError unless these are exactly the expected tensors, and finite."""
+    for name in sorted({*tensors, *expected}):
+        fault = _fault(tensors.get(name), expected.get(name))
+        if fault is not None:
+            raise RunError(
+                f"{path} does not fit: {name} {fault}; expected exactly the tensors of its network; restore the right "
+                "file, or train again"
+            )
+
+
+def _fault(found: Tensor | None, wanted: Tensor | None) -> str | None:
+    """What is wrong with one tensor of a file."""
+    if wanted is None or found is None:
+        return "is missing" if found is None else "is not known"
+    if found.shape != wanted.shape:
+        return f"has the shape {tuple(found.shape)} instead of {tuple(wanted.shape)}"
+    if found.dtype != wanted.dtype and not (found.dtype in _FLOATS and wanted.dtype in _FLOATS):
+        return f"has the type {found.dtype} instead of {wanted.dtype}"
+    if found.dtype in _FLOATS and not found.to(wanted.dtype).isfinite().all():
+        return "is not finite"
+    return None
 
 
 _NAMES_0_1 = (
@@ -239,15 +328,14 @@ def given_or_shipped(given: Path | None, preset: str) -> Path:
 
 def write_weights(path: Path, network: Network, config: Config, description: dict[str, Any]) -> None:
     """Write a network's weights in half precision, over older ones; `description` is kept with them as JSON."""
-    state = network.state_dict()
-    tensors = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in state.items()}
-    header = {"config": config_to_json(config), "version": __version__, **description}
-    with completed_file(path, overwrite=True) as partial:
-        save_file(tensors, partial, metadata={"tidefield": json.dumps(header)})
+    tensors = {name: value.to(torch.float16) for name, value in network.state_dict().items()}
+    _write_tensors(path, tensors, {"config": config_to_json(config), "version": __version__, **description})
 
 
 def _require_weights(path: Path) -> None:
-    if not path.is_file() or path.stat().st_size > _LARGEST_WEIGHTS_FILE:
+    with reading_from(path):
+        usable = path.is_file() and path.stat().st_size <= _LARGEST_WEIGHTS_FILE
+    if not usable:
         raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
 
 
@@ -258,7 +346,8 @@ def weights_sha256(path: Path) -> str:
         RunError: there is no such file.
     """
     _require_weights(path)
-    return file_sha256(path)
+    with reading_from(path):
+        return file_sha256(path)
 
 
 def read_weights_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -268,13 +357,9 @@ def read_weights_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         RunError: there is no such file, or it is damaged.
     """
     _require_weights(path)
-    try:
-        header, tensors = _read_tensors(path)
-        header["config"]["network"].keys()
-    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise RunError(
-            f"{path} is damaged or of another program ({error}): expected what `tidefield pretrain` wrote; name another"
-        ) from error
+    header, tensors = _read_tensors(path, "what `tidefield pretrain` wrote; name another")
+    if "config" not in header:
+        raise RunError(f"{path} is not a weights file: expected one that `tidefield pretrain` wrote; name it")
     return header, tensors
 
 
@@ -285,16 +370,15 @@ def read_weights(path: Path, network: Network) -> None:
         RunError: there is no such file, it is damaged, or it belongs to another network.
     """
     header, tensors = read_weights_file(path)
-    config = config_from_json(header["config"])
-    assert isinstance(config, Config), "other methods have no weights files"
+    config = config_from_json(header["config"], f"{path}: config")
+    if not isinstance(config, Config):
+        raise RunError(f"{path} is of {config.method}: expected weights of a preset; name others")
     own, theirs = _comparable(asdict(network.config)), _comparable(asdict(config.network))
     if theirs != own:
         different = ", ".join(sorted(name for name in own if theirs.get(name) != own[name]))
         raise RunError(f"{path} belongs to another network ({different} differ): expected weights of this one")
-    with torch.no_grad():
-        for name, value in network.state_dict().items():
-            if name in tensors:
-                value.copy_(tensors[name])
+    _require_fit(path, tensors, network.state_dict())
+    network.load_state_dict(tensors)
 
 
 def _comparable(network: dict[str, Any]) -> dict[str, Any]:

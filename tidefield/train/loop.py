@@ -21,13 +21,20 @@ from torch import nn
 from tidefield.config import Budget, Config
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.scene import Scene
+from tidefield.device import choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
 from tidefield.progress import ProgressBar
-from tidefield.train.checkpoint import TrainingProgress, load_training, read_weights, save_checkpoint
+from tidefield.train.checkpoint import (
+    CHECKPOINT_FILE,
+    TrainingProgress,
+    load_training,
+    read_weights,
+    save_checkpoint,
+)
 from tidefield.train.losses import BatchLoss
 
 log = logging.getLogger(__name__)
@@ -47,7 +54,7 @@ class Trainer(ABC):
     """A network, its optimiser and its position in the sequence of random batches.
 
     The same seed, scene and budget in steps give the same weights bit for bit on a CPU, however often training is
-    stopped and resumed. `learning_rate` is the peak; `adam` are further options of the optimiser.
+    stopped and resumed there. `learning_rate` is the peak; `adam` are further options of the optimiser.
     """
 
     def __init__(
@@ -97,8 +104,21 @@ class Trainer(ABC):
         """Whether to stop: where several processes train together, when one of them is asked to."""
         return asked
 
+    @property
+    def precision(self) -> torch.dtype:
+        """Of convolutions and layers; what was chosen on a CPU stays, since it changes what is learned."""
+        if self.device.type != "cpu":
+            return choose_precision(self.device)
+        if self.progress.cpu_precision is None:
+            chosen = choose_precision(self.device)
+            self.progress.cpu_precision = "bfloat16" if chosen == torch.bfloat16 else "float32"
+        return {"bfloat16": torch.bfloat16, "float32": torch.float32}[self.progress.cpu_precision]
+
     def resume(self, folder: Path) -> None:
-        """Continue with a run's checkpoint."""
+        """Continue with a run's checkpoint; a run that was ended before its first one starts again."""
+        if not (folder / CHECKPOINT_FILE).exists():
+            log.info(f"{folder} was ended before it saved anything: it starts again")
+            return
         self.progress = load_training(folder, self.network, self.optimizer, self.generator)
 
     def save(self, folder: Path) -> None:
@@ -153,7 +173,9 @@ class SceneTrainer(Trainer):
         return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.batch_loss(self.scene, self.priors, self.cameras, self.config.network.views, self.generator)
+        return self.batch_loss(
+            self.scene, self.priors, self.cameras, self.config.network.views, self.generator, self.precision
+        )
 
     def renderer(self) -> Render:
         return Renderer(self.network, self.scene, self.config, self.device)

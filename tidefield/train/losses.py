@@ -43,7 +43,13 @@ class BatchLoss(nn.Module):
         self.network, self.config = network, config
 
     def forward(
-        self, scene: Scene, priors: DepthPriors, cameras: Cameras, views: int, generator: torch.Generator
+        self,
+        scene: Scene,
+        priors: DepthPriors,
+        cameras: Cameras,
+        views: int,
+        generator: torch.Generator,
+        precision: torch.dtype | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """The loss of a random batch, and the mean squared error of its colours.
 
@@ -53,6 +59,7 @@ class BatchLoss(nn.Module):
             cameras: the scene's, on the network's device.
             views: neighbours of each tile.
             generator: of everything random.
+            precision: of the encoder's convolutions; that of `choose_precision` if None.
         """
         network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
         batch = draw_batch(scene, priors, config, views, generator).to(device)
@@ -60,10 +67,10 @@ class BatchLoss(nn.Module):
         opaque = scene.background_rgb is None
         parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]
         if len(parts) == 1:
-            rendering = self._render(batch, cameras, own, opaque, generator)
+            rendering = self._render(batch, cameras, own, opaque, generator, precision)
         else:
             tasks = [
-                partial(self._render_tensors, part, cameras, prior, opaque, _derived(generator))
+                partial(self._render_tensors, part, cameras, prior, opaque, _derived(generator), precision)
                 for part, prior in zip(parts, own.split([len(part.targets) for part in parts]), strict=True)
             ]
             trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
@@ -76,10 +83,16 @@ class BatchLoss(nn.Module):
         return loss, error
 
     def _render(
-        self, batch: Batch, cameras: Cameras, priors: Float[Tensor, "T 3 h w"], opaque: bool, generator: torch.Generator
+        self,
+        batch: Batch,
+        cameras: Cameras,
+        priors: Float[Tensor, "T 3 h w"],
+        opaque: bool,
+        generator: torch.Generator,
+        precision: torch.dtype | None,
     ) -> TileRendering:
         network = self.network
-        with mixed_precision(priors.device):
+        with mixed_precision(priors.device, precision):
             encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
         neighbours = cameras[batch.neighbours.reshape(-1)]
         views = Views(neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))

@@ -110,7 +110,7 @@ class Pretrainer(SceneTrainer):
         drawn = self.stream.draw(self.progress.step, self.generator)
         shares = torch.tensor(list(VIEWS.values()))
         views = list(VIEWS)[int(torch.multinomial(shares, 1, generator=self.generator))]
-        loss, error = self.batch_loss(drawn.scene, drawn.priors, drawn.cameras, views, self.generator)
+        loss, error = self.batch_loss(drawn.scene, drawn.priors, drawn.cameras, views, self.generator, self.precision)
         # All scenes count alike: the gradient is that of decibels. Otherwise the least predictable scenes (trees,
         # brighton_beach) would have a hundred times the weight of bare mud, and nothing would be learned from it.
         return loss / (error.detach() + LEAST_ERROR), error

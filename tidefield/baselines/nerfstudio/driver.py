@@ -5,6 +5,7 @@ RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio w
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -24,7 +25,7 @@ from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, QualityCurve
-from tidefield.files import read_json, write_json
+from tidefield.files import delete_files, read_json, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
@@ -36,6 +37,21 @@ KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_T
 """What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """A worker may take so long to end."""
+
+
+def delete_training(folder: Path) -> None:
+    """Delete what training in a run's folder has left."""
+    names = (
+        JOB_FILE,
+        LOG_FILE,
+        "rendering.npz",
+        f"{DATA}/transforms.json",
+        f"{DATA}/*.ply",
+        f"{DATA}/images/?????.png",
+    )
+    found = (folder.glob(name) for name in (*names, f"{CURVE}/*.npz", "nerfstudio/*/run/**/*"))
+    if (folder / JOB_FILE).exists():
+        delete_files(folder, itertools.chain.from_iterable(found))
 
 
 def train(

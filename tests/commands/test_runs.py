@@ -1,0 +1,196 @@
+"""Runs that are replaced, killed and continued: nothing of another run is taken for theirs, nothing is lost or left."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import textured_wall as wall
+import torch
+from networks import SMALL
+from rich.console import Console
+from scenes_on_disk import PINHOLE, survey, write_colmap
+
+from tidefield.commands.evaluate import Evaluate, evaluate
+from tidefield.commands.pretrain import Pretrain
+from tidefield.commands.pretrain import pretrain as pretrain_command
+from tidefield.commands.train import Train, train
+from tidefield.compare.run import read_evaluation
+from tidefield.config import PRESETS, Budget
+from tidefield.errors import RunError
+from tidefield.files import only_writer
+from tidefield.model.network import make_network
+from tidefield.train import checkpoint, pretrain, stream
+from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE, load_network, read_run, write_run, write_weights
+from tidefield.train.loop import SceneTrainer
+
+QUIET = Console(quiet=True)
+
+
+class Killed(BaseException):
+    """Stands in for kill -9, after which nothing is saved."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setitem(PRESETS, "swift", SMALL)
+        patch.setattr(checkpoint, "SHIPPED", tmp_path_factory.mktemp("weights"))
+        torch.manual_seed(5)
+        write_weights(checkpoint.SHIPPED / "swift.safetensors", make_network(SMALL.network), SMALL, {})
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flat") / "flats"
+    write_colmap(folder, survey(PINHOLE))
+    return folder
+
+
+def start(scene: Path, run: Path, steps: int = 3, **options: Any) -> None:
+    train(Train(scene, run, width=48, budget=Budget(steps=steps), device="cpu", **options), QUIET)
+
+
+def start_and_kill(patch: pytest.MonkeyPatch, scene: Path, run: Path, **options: Any) -> None:
+    def die(*_: object) -> float:
+        raise Killed
+
+    with patch.context() as context:
+        context.setattr(SceneTrainer, "step", die)
+        with pytest.raises(Killed):
+            start(scene, run, **options)
+
+
+def state(run: Path) -> dict[str, torch.Tensor]:
+    network = make_network(SMALL.network)
+    load_network(run, network)
+    return network.state_dict()
+
+
+def files(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_that_replaces_another_and_dies_leaves_nothing_of_it(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    start(scene, run, curve=True)
+    evaluate(Evaluate(run, device="cpu"), QUIET)
+    made = files(run)
+    assert len(made) > 5
+    (run / "pictures" / "for-my-thesis.png").touch()
+    (run / "notes.txt").touch()
+    before = read_run(run)
+    start_and_kill(monkeypatch, scene, run, overwrite=True, seed=99)
+    left = files(run)
+    assert left & made == {RUN_FILE}
+    assert {"pictures/for-my-thesis.png", "notes.txt"} < left
+    assert read_run(run).seed == 99
+    assert read_run(run).id != before.id
+    with pytest.raises(RunError, match="--resume"):
+        evaluate(Evaluate(run, device="cpu"), QUIET)
+
+
+@pytest.mark.parametrize("options", [{}, {"from_scratch": True}])
+def test_a_run_that_died_before_its_first_save_starts_again_on_resume(
+    options: dict[str, Any],
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    start(scene, tmp_path / "unbroken", seed=7, **options)
+    start_and_kill(monkeypatch, scene, tmp_path / "run", seed=7, **options)
+    caplog.set_level(logging.INFO)
+    start(scene, tmp_path / "run", resume=True)
+    assert [record.message for record in caplog.records if "starts again" in record.message] == [
+        f"{tmp_path / 'run'} was ended before it saved anything: it starts again"
+    ]
+    expected = state(tmp_path / "unbroken")
+    assert all(torch.equal(value, expected[name]) for name, value in state(tmp_path / "run").items())
+
+
+def test_a_run_that_starts_again_needs_the_weights_it_started_from(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "w.safetensors"
+    write_weights(other, make_network(SMALL.network), SMALL, {})
+    start_and_kill(monkeypatch, scene, tmp_path / "run", weights=other)
+    with pytest.raises(RunError, match="name them with --weights"):
+        start(scene, tmp_path / "run", resume=True)
+    start(scene, tmp_path / "run", resume=True, weights=other)
+
+
+def test_a_folder_is_trained_into_by_one_process_at_a_time(scene: Path, tmp_path: Path) -> None:
+    start(scene, tmp_path / "run")
+    for options in ({"resume": True}, {"overwrite": True}):
+        with only_writer(tmp_path / "run"), pytest.raises(RunError, match="another process is writing to"):
+            start(scene, tmp_path / "run", **options)
+    start(scene, tmp_path / "run", steps=4, resume=True)
+
+
+def test_what_killed_saves_have_left_is_swept_when_a_run_is_continued(scene: Path, tmp_path: Path) -> None:
+    start(scene, tmp_path / "run")
+    there = files(tmp_path / "run")
+    left = [".checkpoint-0123abcd.partial.safetensors", ".run-0123abcd.partial.json"]
+    for name in left:
+        (tmp_path / "run" / name).touch()
+    (tmp_path / "run" / ".flight-0123abcd.partial.mp4").touch()  # a live `render` may be writing it
+    start(scene, tmp_path / "run", steps=4, resume=True)
+    assert {file for file in files(tmp_path / "run") if "tensorboard" not in file} == {
+        *(file for file in there if "tensorboard" not in file),
+        ".flight-0123abcd.partial.mp4",
+    }
+
+
+def test_a_run_that_died_before_it_was_described_does_not_block_its_folder(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / ".run-0123abcd.partial.json").touch()
+    start(scene, tmp_path)
+    assert (tmp_path / CHECKPOINT_FILE).exists()
+
+
+def test_a_name_that_no_folder_can_have_is_one_clear_error(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("a" * 300, "a\0b", "loop", "loop/run", "/proc/run"):
+        with pytest.raises(RunError, match=r"cannot be written|has a zero byte"):
+            start(scene, tmp_path / name)
+    assert os.listdir(tmp_path) == ["loop"]
+
+
+def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    start(scene, run)
+    evaluate(Evaluate(run, device="cpu"), QUIET)
+    assert read_evaluation(run) == json.loads((run / "evaluation.json").read_text())
+    assert read_evaluation(run)["configuration"]["run"] == read_run(run).id
+    write_run(run, checkpoint.Run(scene, 48, 0, SMALL))
+    with pytest.raises(RunError, match="of another run"):
+        read_evaluation(run)
+
+
+def test_a_pretraining_that_died_before_its_first_save_starts_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = wall.scene(wall.cameras(5), (1, 3))
+    drawn = stream.Drawn(at, stream.DepthPriors(at), at.cameras)
+    monkeypatch.setattr(stream.Stream, "draw", lambda *_: drawn)
+    monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": at})
+    options = {"budget": Budget(steps=1), "device": "cpu"}
+    with pytest.raises(RunError, match="holds no training"):
+        pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out" / "scenes").mkdir(parents=True)
+    (tmp_path / "out" / ".checkpoint-0123abcd.partial.safetensors").touch()
+    with only_writer(tmp_path / "out"), pytest.raises(RunError, match="another process"):
+        pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
+    pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
+    assert {name for name in os.listdir(tmp_path / "out") if name.startswith(".")} == set()
+    assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
