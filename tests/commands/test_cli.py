@@ -169,6 +169,53 @@ def test_progress_is_told_where_there_is_no_terminal(
     assert (printed.out, printed.err) == ("", "")
 
 
+@pytest.mark.parametrize("name", ["[/red]", "[x] :sea: [bold]", "caf\udce9"])
+def test_a_name_is_printed_as_it_is(
+    name: str, scene: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    call("import", scene, tmp_path / name)
+    call("evaluate", tmp_path / name, tmp_path / name / "out", "--method", "nearest", "--width", 40)
+    printed = capfdbinary.readouterr().out.decode()
+    assert printed.count(name.encode(errors="backslashreplace").decode()) >= 2
+
+
+def test_a_reader_that_is_gone_ends_a_command_quietly(scene: Path, tmp_path: Path) -> None:
+    for words in (["import", scene, tmp_path / "new"], ["--version"]):
+        reading, writing = os.pipe()
+        os.close(reading)
+        command = [sys.executable, "-m", "tidefield.cli", *map(str, words)]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writing)
+        assert (done.returncode, done.stderr) == (141, "")
+    assert (tmp_path / "new" / "sparse").is_dir()
+
+
+def test_what_is_no_users_mistake_is_reported_as_a_defect(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stumble(words: list[str]) -> None:
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(cli, "_run", stumble)
+    with pytest.raises(SystemExit) as ended:
+        call("train", "a b")
+    message = capsys.readouterr().err
+    assert ended.value.code == 70
+    assert re.search(r"Traceback.*in stumble.*ZeroDivisionError: oh\n.*a defect of the program", message, re.DOTALL)
+    assert message.endswith("  command: tidefield train 'a b'\n")
+
+
+def test_a_place_that_the_system_refuses_is_one_clear_message(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for place, reason in (("a" * 300, "name too long"), ("loop/x", "symbolic links|cannot be"), ("a\0b", "zero byte")):
+        assert re.search(reason, fails(capsys, "train", scene, tmp_path / place, "--steps", 1))
+        assert re.search(reason, fails(capsys, "import", scene, tmp_path / place))
+        assert fails(capsys, "train", tmp_path / place, tmp_path / "new", "--steps", 1)
+        assert fails(capsys, "evaluate", tmp_path / place)
+
+
 def test_help_does_not_import_torch() -> None:
     code = "import sys; sys.argv = ['tidefield', '--help']\nfrom tidefield import cli\n"
     code += "try:\n    cli.main()\nexcept SystemExit:\n    assert 'torch' not in sys.modules\n    print('fine')\n"

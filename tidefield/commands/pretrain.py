@@ -65,7 +65,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
         trainer = across.Pretrainer(config, stream, shown, options.seed, device)
         if options.resume:
             trainer.resume(folder)
-        finished = train(trainer, folder, budget, console, validation)
+        stopped = train(trainer, folder, budget, console, validation)
     if trainer.is_main_process:
         done = trainer.progress
         description = {
@@ -78,4 +78,4 @@ def pretrain(options: Pretrain, console: Console) -> None:
             "validation": validation.points,
         }
         write_weights(folder / WEIGHTS_FILE, trainer.network, config, description)
-    report_end(trainer.progress, finished, folder, console)
+    report_end(trainer.progress, stopped, folder, console)

@@ -23,6 +23,7 @@ from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import METHODS
+from tidefield.processes import Ended, end_with_parent
 
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and the same with another seed, for the noise of an ablation."""
@@ -139,12 +140,14 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str]) -> Usag
         RunError: when it fails.
     """
     start = time.perf_counter()
-    process = subprocess.Popen(command, env={**os.environ, **environment})
+    process = subprocess.Popen(command, env={**os.environ, **environment}, preexec_fn=end_with_parent)
     try:
         # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
         _, status, usage = os.wait4(process.pid, 0)
-    except KeyboardInterrupt:
-        process.wait()  # Ctrl-C has reached it, too, and it saves before it stops.
+    except KeyboardInterrupt as error:
+        if isinstance(error, Ended):
+            process.send_signal(error.number)
+        process.wait()  # Ctrl-C has reached it, too; a training saves before it stops.
         raise
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:

@@ -27,7 +27,7 @@ from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, sc
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, refuse_existing, write_json
 from tidefield.model.rendering import Render, Rendering, to_8_bit
-from tidefield.progress import ProgressBar
+from tidefield.progress import ProgressBar, make_console
 
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
 _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_cc": "doubly seen, colour fit"}
@@ -72,7 +72,7 @@ def evaluate(
         RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
             is not finite.
     """
-    path, console = out / "evaluation.json", console or Console()
+    path, console = out / "evaluation.json", console or make_console()
     if not overwrite:
         refuse_existing(path)
     if not scene.test:
@@ -114,7 +114,7 @@ def evaluate(
     write_json(path, report)
     console.print(_table(scene, report))
     for remark in _remarks(report, out):
-        console.print(remark, soft_wrap=True, highlight=False, markup=False)
+        console.print(remark, soft_wrap=True)
     return Evaluation(path, report)
 
 
