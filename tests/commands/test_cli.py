@@ -146,11 +146,47 @@ def test_the_demonstration_makes_all_that_it_names(
     monkeypatch.setattr(demo, "FLIGHT_SIZE", (64, 36))
     monkeypatch.setattr(demo, "TRAINING_WIDTH", 32)
     out = tmp_path / "demo"
-    call("demo", out, "--minutes", 0.01, "--device", "cpu")
+    words = "demo", out, "--minutes", 0.01, "--device", "cpu"
+    call(*words)
     named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("Written:")[1].strip().splitlines()]
     names = ["scene", "first-view.png", "run/evaluation.json", "side-by-side.png", "run/pictures", "flight.mp4"]
     assert named == [out / name for name in names]
     assert all(path.exists() for path in named)
+    # Again: what is there is used, what was changed stays, what is missing is made.
+    (out / "run" / "evaluation.json").write_text("{}")
+    (out / "thesis.docx").write_text("years of work")
+    (out / "side-by-side.png").unlink()
+    before = contents(out)
+    call(*words)
+    after = contents(out)
+    assert after.pop(Path("side-by-side.png"))
+    assert after == before
+    # Anew: what the demonstration made is replaced, unless something else would be lost with it.
+    (out / "run" / "notes.txt").write_text("mine")
+    assert "no demonstration made (run/notes.txt)" in fails(capsys, *words, "--overwrite")
+    assert contents(out).items() >= before.items()
+    (out / "run" / "notes.txt").unlink()
+    (out / "link").symlink_to(out)
+    call("demo", out / "link", *words[2:], "--overwrite")
+    assert (out / "thesis.docx").read_text() == "years of work"
+    assert json.loads((out / "run" / "evaluation.json").read_text())["mean"]
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_the_demonstration_leaves_alone_what_it_did_not_make(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "mine"
+    for name in ("scene/truth/height.npy", "run/evaluation.json", "thesis.docx"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("years of work")
+    before = contents(out)
+    assert "no demonstration made" in fails(capsys, "demo", out, *options)
+    assert contents(out) == before
 
 
 def test_progress_is_told_where_there_is_no_terminal(
