@@ -135,6 +135,33 @@ def test_users_mistakes_are_one_clear_message(
     assert not (tmp_path / "new").exists()
 
 
+def test_where_a_rendering_goes_is_checked_before_it_is_made(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tidefield.methods.trained", lambda *_: pytest.fail("a run was opened"))
+    (tmp_path / "file").touch()
+    for name in ("folder.mp4", "folder.png", "other_depth.npy"):
+        (tmp_path / name).mkdir()
+    for out, message in (
+        ("folder.mp4", "is a folder"),
+        ("folder.png", "is a folder"),
+        ("other.png", "other_depth.npy is a folder"),
+        ("file/a.mp4", "Not a directory"),
+    ):
+        camera = ["--camera", "vegetation_0001"] if out.endswith(".png") else []
+        assert message in fails(capsys, "render", run, tmp_path / out, *camera, "--overwrite", "-q")
+    monkeypatch.undo()
+    monkeypatch.setattr("tidefield.evaluation.evaluate._timed", lambda *_: pytest.fail("something was rendered"))
+    assert "Not a directory" in fails(capsys, "evaluate", run, tmp_path / "file" / "out", "-q")
+
+
+@pytest.mark.parametrize("frames", [0, -1])
+def test_a_video_needs_a_frame(frames: int, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(capsys, "render", run, tmp_path / "a.mp4", "--frames", frames, "--width", 32, "-q")
+    assert "expected at least one" in message
+    assert not (tmp_path / "a.mp4").exists()
+
+
 def test_the_demonstration_makes_all_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

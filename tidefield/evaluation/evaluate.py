@@ -25,7 +25,7 @@ from tidefield.errors import RunError
 from tidefield.evaluation.lpips import Lpips, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
-from tidefield.files import completed_file, refuse_existing, write_json
+from tidefield.files import completed_file, require_writable, write_json
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar, make_console
 
@@ -73,8 +73,7 @@ def evaluate(
             is not finite.
     """
     path, console = out / "evaluation.json", console or make_console()
-    if not overwrite:
-        refuse_existing(path)
+    require_writable(path, overwrite=overwrite)
     if not scene.test:
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
     files = picture_names([scene.names[i] for i in scene.test])
