@@ -8,13 +8,14 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt
 REQUIRED := pyproject.toml constraints.txt $(VENV)/.made
 
-.PHONY: demo test bench lint docs lowest clean help
+.PHONY: demo test bench kills lint docs lowest clean help
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo     the whole job on the built-in scene, into $(OUT)/ (OUT=FOLDER for another)"
 	@echo "make test     the tests (ARGS=... for pytest)"
 	@echo "make bench    the benchmarks (ARGS=... for them)"
+	@echo "make kills    commands killed at random moments, and what they complete afterwards"
 	@echo "make lint     ruff and pyright"
 	@echo "make docs     the site, in docs/_build/html"
 	@echo "make lowest   the main job with the lowest promised versions, in $(VENV)-lowest"
@@ -30,6 +31,9 @@ test: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks $(ARGS)
+
+kills: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks kills $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | frames | memory | surveys | table | card`; without a name, speed.
+"""`python -m benchmarks speed | frames | memory | surveys | kills | table | card`; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -163,6 +163,23 @@ def surveys(
     print(out)
 
 
+def kills(runs: Path = MEASURED, train: int = 20, prepare: int = 10, compare: int = 10, seed: int = 0) -> None:
+    """Kill commands at random moments, complete their work, and compare it with that of uninterrupted ones (minutes).
+
+    Args:
+        runs: Store the counts in this folder's kills.json.
+        train: How often `tidefield train` is killed.
+        prepare: How often `tidefield prepare`.
+        compare: How often `tidefield compare`.
+        seed: Of the moments.
+    """
+    from benchmarks.kills import measure_kills
+
+    counts = {"train": train, "prepare": prepare, "compare": compare}
+    for name, of in measure_kills(runs, counts, seed, partial(print, flush=True)).items():
+        print(f"{name}: {of['identical']} of {of['kills']} identical")
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -202,7 +219,8 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    commands = {"speed": speed, "frames": frames, "memory": memory, "table": table, "card": card, "surveys": surveys}
+    functions = (speed, frames, memory, table, card, surveys, kills)
+    commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
     except TidefieldError as error:

@@ -23,7 +23,7 @@ RANK = {
     "commands": 8,
     "cli": 9,
 }
-FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "parallel"}
+FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "parallel", "processes"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -8,15 +8,21 @@ from __future__ import annotations
 import difflib
 import logging
 import os
+import shlex
+import signal
 import sys
-from typing import TYPE_CHECKING, Any
+import traceback
+from io import TextIOWrapper
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import tyro
 
 from tidefield import __version__
 from tidefield.commands import ablate, baselines, compare, demo, evaluate, import_, prepare, pretrain, render, train
 from tidefield.errors import TidefieldError
+from tidefield.files import user_can_mend
 from tidefield.machine import tune_process
+from tidefield.processes import Ended, ended_by_signals
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,23 +55,46 @@ tidefield demo does all of it on a built-in scene."""
 
 
 def main() -> None:
-    """Entry point: exit status 0, 2 for a user's mistake, 130 after an interruption."""
+    """Entry point; `docs/commands.md` lists the exit statuses."""
     try:
-        _run(sys.argv[1:])
+        with ended_by_signals():
+            _run(sys.argv[1:])
+            if sys.stdout is not None:
+                sys.stdout.flush()
     except TidefieldError as error:
-        print(f"tidefield: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("tidefield: interrupted", file=sys.stderr)
-        sys.exit(130)
+        _end(2, str(error))
+    except KeyboardInterrupt as error:
+        number = error.number if isinstance(error, Ended) else signal.SIGINT
+        _end(128 + number, f"interrupted ({signal.Signals(number).name})")
     except BrokenPipeError:
         # The reader, such as `head`, has seen enough. Python would complain once more when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if sys.stdout is not None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None and user_can_mend(error):
+            place = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else error.filename
+            _end(2, f"{place} cannot be used ({error.strerror}): expected a place of yours; check name and permissions")
+        traceback.print_exc()
+        _end(
+            70,
+            "this is a defect of the program; please report it with the lines above and these:\n"
+            f"  version: {__version__}, Python {sys.version.split()[0]}, {sys.platform}\n"
+            f"  command: {shlex.join(sys.argv)}",
+        )
+
+
+def _end(status: int, message: str) -> NoReturn:
+    print(f"tidefield: {message}", file=sys.stderr)
+    sys.exit(status)
 
 
 def _run(words: list[str]) -> None:
     """Parse the command line and run its command."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of a name that is no UTF-8, as standard error does
+    if any("\0" in word for word in words):
+        raise TidefieldError("a word of the command has a zero byte: expected names that files can have")
     if words == ["--version"]:
         print(f"tidefield {__version__}")
         return
@@ -97,7 +126,8 @@ def _set_up(verbosity: Verbosity) -> Console:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    console = Console(quiet=verbosity.quiet)
+    from tidefield.progress import make_console
+
     level = logging.ERROR if verbosity.quiet else logging.DEBUG if verbosity.verbose else logging.INFO
     terminal, handler = Console(stderr=True), logging.StreamHandler()
     form = "%(asctime)s %(message)s"
@@ -105,7 +135,7 @@ def _set_up(verbosity: Verbosity) -> Console:
         handler, form = RichHandler(console=terminal, show_path=False, show_level=False), "%(message)s"
     logging.basicConfig(level=logging.WARNING, format=form, datefmt="%H:%M:%S", handlers=[handler], force=True)
     logging.getLogger("tidefield").setLevel(level)
-    return console
+    return make_console(quiet=verbosity.quiet)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,17 @@ log = logging.getLogger(__name__)
 LINE_SECONDS = 10.0
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command what to do when nobody reads; Rich would exit with status 1."""
+        raise
+
+
+def make_console(quiet: bool = False) -> Console:
+    """A console that prints texts as they are: a path with `[x]` or `:sea:` in it is no markup."""
+    return _Console(quiet=quiet, markup=False, emoji=False, highlight=False)
+
+
 class ProgressBar:
     """Shows the share of a job that is done, and the time left.
 
@@ -27,10 +38,10 @@ class ProgressBar:
 
     def __init__(self, console: Console, job: str) -> None:
         columns = [
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[rest]}"),
+            TextColumn("{task.fields[rest]}", markup=False),
         ]
         self._job, self._bar_shows = job, console.is_interactive
         self._bar = Progress(*columns, console=console, disable=not self._bar_shows, transient=True)

@@ -123,6 +123,14 @@ def test_without_nerfstudio_the_message_says_how_to_install_it(tmp_path: Path, m
         environment.python()
 
 
+def test_a_home_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(environment, "_NEWEST_PYTHON", sys.version_info[:2])
+    with pytest.raises(RunError, match=r"file/tidefield/nerfstudio-.* cannot be written \(Not a directory"):
+        environment.install(False, Console(quiet=True))
+
+
 def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     asked, starts = [], False

@@ -49,8 +49,10 @@ def test_memory_and_failure_of_a_process_are_reported() -> None:
     )
     assert usage.peak_memory_bytes > 600_000_000
     assert usage.seconds > 0
-    with pytest.raises(RunError, match="status 3"):
+    with pytest.raises(SystemExit, match="3"):  # without a second message
         run_measured([sys.executable, "-c", "raise SystemExit(3)"], {})
+    with pytest.raises(RunError, match="SIGKILL ended"):
+        run_measured([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"], {})
 
 
 def test_time_is_charged_to_the_innermost_stage() -> None:

@@ -135,6 +135,33 @@ def test_users_mistakes_are_one_clear_message(
     assert not (tmp_path / "new").exists()
 
 
+def test_where_a_rendering_goes_is_checked_before_it_is_made(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tidefield.methods.trained", lambda *_: pytest.fail("a run was opened"))
+    (tmp_path / "file").touch()
+    for name in ("folder.mp4", "folder.png", "other_depth.npy"):
+        (tmp_path / name).mkdir()
+    for out, message in (
+        ("folder.mp4", "is a folder"),
+        ("folder.png", "is a folder"),
+        ("other.png", "other_depth.npy is a folder"),
+        ("file/a.mp4", "Not a directory"),
+    ):
+        camera = ["--camera", "vegetation_0001"] if out.endswith(".png") else []
+        assert message in fails(capsys, "render", run, tmp_path / out, *camera, "--overwrite", "-q")
+    monkeypatch.undo()
+    monkeypatch.setattr("tidefield.evaluation.evaluate._timed", lambda *_: pytest.fail("something was rendered"))
+    assert "Not a directory" in fails(capsys, "evaluate", run, tmp_path / "file" / "out", "-q")
+
+
+@pytest.mark.parametrize("frames", [0, -1])
+def test_a_video_needs_a_frame(frames: int, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(capsys, "render", run, tmp_path / "a.mp4", "--frames", frames, "--width", 32, "-q")
+    assert "expected at least one" in message
+    assert not (tmp_path / "a.mp4").exists()
+
+
 def test_the_demonstration_makes_all_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -146,11 +173,47 @@ def test_the_demonstration_makes_all_that_it_names(
     monkeypatch.setattr(demo, "FLIGHT_SIZE", (64, 36))
     monkeypatch.setattr(demo, "TRAINING_WIDTH", 32)
     out = tmp_path / "demo"
-    call("demo", out, "--minutes", 0.01, "--device", "cpu")
+    words = "demo", out, "--minutes", 0.01, "--device", "cpu"
+    call(*words)
     named = [Path(line.split()[-1]) for line in capsys.readouterr().out.split("Written:")[1].strip().splitlines()]
     names = ["scene", "first-view.png", "run/evaluation.json", "side-by-side.png", "run/pictures", "flight.mp4"]
     assert named == [out / name for name in names]
     assert all(path.exists() for path in named)
+    # Again: what is there is used, what was changed stays, what is missing is made.
+    (out / "run" / "evaluation.json").write_text("{}")
+    (out / "thesis.docx").write_text("years of work")
+    (out / "side-by-side.png").unlink()
+    before = contents(out)
+    call(*words)
+    after = contents(out)
+    assert after.pop(Path("side-by-side.png"))
+    assert after == before
+    # Anew: what the demonstration made is replaced, unless something else would be lost with it.
+    (out / "run" / "notes.txt").write_text("mine")
+    assert "no demonstration made (run/notes.txt)" in fails(capsys, *words, "--overwrite")
+    assert contents(out).items() >= before.items()
+    (out / "run" / "notes.txt").unlink()
+    (out / "link").symlink_to(out)
+    call("demo", out / "link", *words[2:], "--overwrite")
+    assert (out / "thesis.docx").read_text() == "years of work"
+    assert json.loads((out / "run" / "evaluation.json").read_text())["mean"]
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_the_demonstration_leaves_alone_what_it_did_not_make(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "mine"
+    for name in ("scene/truth/height.npy", "run/evaluation.json", "thesis.docx"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("years of work")
+    before = contents(out)
+    assert "no demonstration made" in fails(capsys, "demo", out, *options)
+    assert contents(out) == before
 
 
 def test_progress_is_told_where_there_is_no_terminal(
@@ -167,6 +230,53 @@ def test_progress_is_told_where_there_is_no_terminal(
     call(*command, "-q")
     printed = capfd.readouterr()
     assert (printed.out, printed.err) == ("", "")
+
+
+@pytest.mark.parametrize("name", ["[/red]", "[x] :sea: [bold]", "caf\udce9"])
+def test_a_name_is_printed_as_it_is(
+    name: str, scene: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    call("import", scene, tmp_path / name)
+    call("evaluate", tmp_path / name, tmp_path / name / "out", "--method", "nearest", "--width", 40)
+    printed = capfdbinary.readouterr().out.decode()
+    assert printed.count(name.encode(errors="backslashreplace").decode()) >= 2
+
+
+def test_a_reader_that_is_gone_ends_a_command_quietly(scene: Path, tmp_path: Path) -> None:
+    for words in (["import", scene, tmp_path / "new"], ["--version"]):
+        reading, writing = os.pipe()
+        os.close(reading)
+        command = [sys.executable, "-m", "tidefield.cli", *map(str, words)]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writing)
+        assert (done.returncode, done.stderr) == (141, "")
+    assert (tmp_path / "new" / "sparse").is_dir()
+
+
+def test_what_is_no_users_mistake_is_reported_as_a_defect(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stumble(words: list[str]) -> None:
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(cli, "_run", stumble)
+    with pytest.raises(SystemExit) as ended:
+        call("train", "a b")
+    message = capsys.readouterr().err
+    assert ended.value.code == 70
+    assert re.search(r"Traceback.*in stumble.*ZeroDivisionError: oh\n.*a defect of the program", message, re.DOTALL)
+    assert message.endswith("  command: tidefield train 'a b'\n")
+
+
+def test_a_place_that_the_system_refuses_is_one_clear_message(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for place, reason in (("a" * 300, "name too long"), ("loop/x", "symbolic links|cannot be"), ("a\0b", "zero byte")):
+        assert re.search(reason, fails(capsys, "train", scene, tmp_path / place, "--steps", 1))
+        assert re.search(reason, fails(capsys, "import", scene, tmp_path / place))
+        assert fails(capsys, "train", tmp_path / place, tmp_path / "new", "--steps", 1)
+        assert fails(capsys, "evaluate", tmp_path / place)
 
 
 def test_help_does_not_import_torch() -> None:

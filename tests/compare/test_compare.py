@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield import cli
+from tidefield.commands.ablate import Ablate, ablate
 from tidefield.commands.compare import Compare, make_settings
 from tidefield.commands.compare import compare as compare_command
 from tidefield.compare.figures import most_different, side_by_side
@@ -33,7 +35,7 @@ from tidefield.compare.tables import (
 from tidefield.config import Budget
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
-from tidefield.errors import RunError, SceneError
+from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import write_json
 from tidefield.methods import METHODS
 
@@ -283,6 +285,61 @@ def test_missing_software_is_reported_before_anything_is_trained(
         options = Compare((disk,), methods=("tidefield", method), out=tmp_path / "out", device="cpu")
         with pytest.raises(RunError, match=message):
             compare_command(options, Console(quiet=True))
+
+
+def test_mistakes_are_reported_before_anything_is_trained(disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr("tidefield.compare.run.run_measured", lambda *_: pytest.fail("something was run"))
+    options = Compare((disk,), methods=("nearest",), out=tmp_path / "out", device="cpu")
+    ablation = Ablate((disk,), out=tmp_path / "out", device="cpu")
+    (tmp_path / "file").touch()
+    for changed, message in (
+        ({"scenes": (disk, tmp_path / "none")}, "none is missing"),
+        ({"width": 3}, "the width is 3 pixels"),
+        ({"out": tmp_path / "file"}, r"cannot be written \(Not a directory"),
+        ({"scenes": ()}, "nothing to compare on"),
+    ):
+        with pytest.raises(TidefieldError, match=message):
+            compare_command(replace(options, **changed), Console(quiet=True))
+        with pytest.raises(TidefieldError, match=message):
+            ablate(replace(ablation, **changed), Console(quiet=True))
+    with pytest.raises(RunError, match="expected methods; name some"):
+        compare_command(replace(options, methods=()), Console(quiet=True))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "damaged"),
+    [
+        ("evaluation.json", "{}"),
+        ("evaluation.json", "[1]"),
+        ("evaluation.json", lambda whole: whole.replace("1234.0", '"fast"')),
+        ("evaluation.json", lambda whole: whole.replace('"psnr": 20.0', '"psnr": "good"')),
+        ("process.json", "[1]"),
+        ("process.json", '{"settings": "x"}'),
+        ("process.json", '{"settings": {}, "train": {"peak_memory_bytes": "x"}}'),
+        ("curve.json", "[[1]]"),
+        ("curve.json", "7"),
+    ],
+)
+def test_a_damaged_result_is_named(name: str, damaged, disk: Path, tmp_path: Path):
+    run, out = Children(load_scene(disk, width=48)), tmp_path / "out"
+    compare({"flats": disk}, ("tidefield",), SETTINGS, out, run, quiet)
+    file = out / "runs" / "flats" / "tidefield" / name
+    file.write_text(damaged if isinstance(damaged, str) else damaged(file.read_text()))
+    with pytest.raises(RunError, match=f"{name} is damaged"):
+        read_results(out, ["flats"], ["tidefield"])
+    if name != "curve.json":
+        with pytest.raises(RunError, match=f"{name} is damaged"):
+            compare({"flats": disk}, ("tidefield", "nearest"), SETTINGS, out, run, quiet)
+        assert len(run.words) == 2, "before anything is trained"
+
+
+def test_an_evaluation_that_was_not_recorded_is_repeated(disk: Path, tmp_path: Path):
+    run, out = Children(load_scene(disk, width=48)), tmp_path / "out"
+    compare({"flats": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    (out / "runs" / "flats" / "nearest" / "process.json").unlink()  # ended before it was written
+    compare({"flats": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    assert run.words[1] == [*run.words[0], "--overwrite"]
 
 
 def test_the_record_says_which_device_auto_was() -> None:

@@ -113,7 +113,7 @@ def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkey
 
 def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path: Path) -> None:
     trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
-    assert train(trainer, tmp_path, Budget(steps=30), Console(quiet=True))
+    assert train(trainer, tmp_path, Budget(steps=30), Console(quiet=True)) is None
     losses = trainer.progress.losses
     assert sum(losses[-10:]) < sum(losses[:10])
     again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
@@ -121,17 +121,18 @@ def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path
     assert all(torch.equal(v, weights(again)[n]) for n, v in weights(trainer).items())
 
 
-def test_an_interruption_saves_before_it_stops(scene: Scene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interruption_saves_before_it_stops(number: signal.Signals, scene: Scene, tmp_path: Path) -> None:
     trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
     step = trainer.step
 
     def interrupted_step(budget: Budget) -> float:
         if trainer.progress.step == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return step(budget)
 
     trainer.step = interrupted_step  # type: ignore[method-assign]
-    assert not train(trainer, tmp_path, Budget(steps=50), Console(quiet=True))
+    assert train(trainer, tmp_path, Budget(steps=50), Console(quiet=True)) == number
     assert 3 <= trainer.progress.step < 50
     other = SceneTrainer(SMALL, scene, seed=1, device=CPU)
     other.resume(tmp_path)

@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.compare import make_settings, print_lines, run_all
 from tidefield.config import PRESETS, Budget, vary
+from tidefield.errors import RunError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,6 +44,8 @@ def ablate(options: Ablate, console: Console) -> None:
     from tidefield.compare.ablation import variants, write_ablation
     from tidefield.compare.run import named
 
+    if not options.scenes:
+        raise RunError("nothing to compare on: expected scenes; name some")
     for name in options.variants:
         vary(PRESETS[options.preset], name)  # before anything is trained
     # From scratch, all of them: trained weights would belong to one of the variants only.

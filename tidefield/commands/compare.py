@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AnyMethod, Device, Verbosity
-from tidefield.config import Budget
+from tidefield.config import Budget, checked_seed
 from tidefield.errors import RunError
+from tidefield.files import require_writable
+from tidefield.methods import METHODS
+from tidefield.processes import worker_processes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,10 +58,15 @@ def compare(options: Compare, console: Console) -> None:
     from tidefield.baselines.nerfstudio import driver
     from tidefield.compare.tables import write_comparison
     from tidefield.device import choose_device
+    from tidefield.train.checkpoint import given_or_shipped
 
-    for method in ("nerfacto", "splatfacto"):
-        if method in options.methods:
-            driver.require(method, choose_device(options.device))  # before anything is trained
+    if not options.methods:
+        raise RunError("nothing to compare: expected methods; name some, or leave --methods out")
+    for method in options.methods:  # before anything is trained
+        if method in ("nerfacto", "splatfacto"):
+            driver.require(method, choose_device(options.device))
+        elif METHODS[method].kind == "zero-shot":
+            given_or_shipped(None, str(METHODS[method].preset))
     scenes = _scenes(options)
     settings = make_settings(options.budget, options.width, options.device, options.seed, options.from_scratch)
     results = run_all(scenes, options.methods, settings, options.out, console)
@@ -74,7 +82,7 @@ def make_settings(
 
     budget = budget.checked()
     return Settings(
-        budget.minutes, budget.steps, width, str(choose_device(device)), seed, preset=preset, from_scratch=from_scratch
+        budget.minutes, budget.steps, width, str(choose_device(device)), checked_seed(seed), preset=preset, from_scratch=from_scratch
     )
 
 
@@ -83,8 +91,13 @@ def run_all(
 ) -> Results:
     """Train and evaluate what has not been done yet, and read all results."""
     from tidefield.compare.results import read_results
-    from tidefield.compare.run import compare, run_measured
+    from tidefield.compare.run import PROCESS_FILE, check_scene, compare, run_measured
 
+    require_writable(out / PROCESS_FILE, overwrite=True)
+    # In a process of its own, because the memory of a scene would be charged to every process that this one starts.
+    with worker_processes(1) as pool:
+        for scene in scenes.values():
+            pool.submit(check_scene, scene, settings.width).result()
     compare(scenes, methods, settings, out, run_measured, lambda text: print_lines(console, [text]))
     return read_results(out, list(scenes), methods)
 

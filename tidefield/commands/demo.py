@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +17,8 @@ from tidefield.commands.evaluate import Evaluate, evaluate
 from tidefield.commands.render import Render, render
 from tidefield.commands.train import Train, train
 from tidefield.config import Budget
-from tidefield.errors import RunError
-from tidefield.files import write_json
+from tidefield.errors import RunError, list_names
+from tidefield.files import completed_file, completed_folder, read_json, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -44,7 +47,8 @@ class Demo:
     """Minutes of training."""
     device: Device = "auto"
     overwrite: bool = False
-    """Start anew in a folder that holds a demonstration; without it, what is there is used and completed."""
+    """Start anew in a folder that holds a demonstration, and replace what that made; without it, nothing is replaced:
+    what is there is used and completed."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
@@ -54,29 +58,34 @@ def demo(options: Demo, console: Console) -> None:
     from tidefield.train.checkpoint import CHECKPOINT_FILE
 
     out, device = options.out, options.device
-    if options.overwrite and out.exists():
-        if not (out / "scene" / "truth").is_dir():
-            raise RunError(f"{out} holds no demonstration: expected one to replace; choose another folder")
-        shutil.rmtree(out)
-    scene, run, path = (out / name for name in ("scene", "run", "creek.json"))
-    first, video, picture = (out / name for name in ("first-view.png", "flight.mp4", "side-by-side.png"))
+    products = ("scene", "run", "creek.json", "first-view.png", "flight.mp4", "side-by-side.png")
+    scene, run, path, first, video, picture = (out / name for name in products)
+    made = Made(out, (*products, "first-view_depth.npy", "first-view_depth.png"))
+    made.require_own(options.overwrite)
+    if options.overwrite:
+        made.delete()
     if not scene.exists():
         console.print("Making a survey of a tidal flat ...")
-        partial = out / "scene.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        write_survey(make_survey("river_mouths", seed=7, views=40, width=SURVEY_WIDTH), partial)
-        partial.rename(scene)
+        with made.making(), completed_folder(scene) as partial:
+            write_survey(make_survey("river_mouths", seed=7, views=40, width=SURVEY_WIDTH), partial)
     if not first.exists():
         console.print("A first view, with trained weights that have never seen this place:")
-        zero_shot = ZeroShot(zero_shot=True)
-        render(Render(scene, first, camera=PHOTOGRAPH, zero=zero_shot, width=TRAINING_WIDTH, device=device), console)
-    if not (run / CHECKPOINT_FILE).exists():
-        budget = Budget(options.minutes)
-        train(Train(scene, run, budget=budget, width=TRAINING_WIDTH, device=device, overwrite=True), console)
-    evaluate(Evaluate(run, device=device, overwrite=True), console)
-    write_json(path, creek_flight())
-    render(Render(run, video, path=str(path), device=device, overwrite=True), console)
-    shutil.copyfile(run / "pictures" / f"{PHOTOGRAPH}.png", picture)
+        view = Render(scene, first, camera=PHOTOGRAPH, zero=ZeroShot(True), width=TRAINING_WIDTH, device=device)
+        with made.making():  # the picture is the last of its three files
+            render(replace(view, overwrite="first-view_depth.npy" in made.files), console)
+    with made.making():
+        if not (run / CHECKPOINT_FILE).exists():
+            budget = Budget(options.minutes)
+            train(Train(scene, run, budget=budget, width=TRAINING_WIDTH, device=device, overwrite=True), console)
+        if not (run / "evaluation.json").exists():
+            evaluate(Evaluate(run, device=device), console)
+        if not video.exists():
+            if not path.exists():
+                write_json(path, creek_flight())
+            render(Render(run, video, path=str(path), device=device), console)
+        if not picture.exists():
+            with completed_file(picture) as partial:
+                shutil.copyfile(run / "pictures" / f"{PHOTOGRAPH}.png", partial)
     console.print("\nWritten:")
     for what, file in (
         ("the survey, as COLMAP scene", scene),
@@ -87,6 +96,78 @@ def demo(options: Demo, console: Console) -> None:
         ("the flight along the creek", video),
     ):
         console.print(f"  {what:<34} {file.resolve()}", highlight=False, soft_wrap=True)
+
+
+class Made:
+    """What a demonstration has made in its folder, which OUT/demonstration.json lists; the rest is the user's.
+
+    Args:
+        out: the folder.
+        names: that the demonstration makes in it.
+
+    Raises:
+        RunError: the list is damaged.
+    """
+
+    def __init__(self, out: Path, names: Sequence[str]) -> None:
+        self.out, self.names, self.file = out, names, out / "demonstration.json"
+        record = read_json(self.file) or {"files": [], "unfinished": False}
+        try:
+            self.files, unfinished = {str(name) for name in record["files"]}, bool(record["unfinished"])
+        except (KeyError, TypeError) as error:
+            raise RunError(f"{self.file} is damaged: expected a list of files; choose another folder") from error
+        if unfinished:  # it was killed, and what is new was being made
+            self.files |= self._present()
+            for name in names:
+                for partial in out.glob(f".{Path(name).stem}-????????.partial*"):
+                    _delete(partial)
+
+    def require_own(self, overwrite: bool) -> None:
+        """Raise a RunError when the names are a user's, or when there are files of a user's in what is overwritten."""
+        foreign = sorted(self._present() - self.files)
+        if foreign and (overwrite or not self.file.exists()):
+            raise RunError(
+                f"{self.out} holds what no demonstration made ({list_names(foreign)}): expected a new folder or one of "
+                "a demonstration; move these files, or choose another folder"
+            )
+
+    @contextmanager
+    def making(self) -> Iterator[None]:
+        """Record what is made in the block, even if it is interrupted."""
+        self._write(unfinished=True)
+        try:
+            yield
+        finally:
+            self.files |= self._present()
+            self._write(unfinished=False)
+
+    def delete(self) -> None:
+        """Delete what was made."""
+        self._write(unfinished=True)
+        for name in self.names:
+            _delete(self.out / name)
+        self.files.clear()
+        self._write(unfinished=False)
+
+    def _present(self) -> set[str]:
+        """Files, links and empty folders below the names."""
+        found: set[str] = set()
+        for place in (self.out / name for name in self.names):
+            inside = sorted(place.rglob("*")) if place.is_dir() and not place.is_symlink() else []
+            found |= {p.relative_to(self.out).as_posix() for p in inside if p.is_symlink() or not p.is_dir()}
+            if os.path.lexists(place) and not inside:
+                found.add(place.relative_to(self.out).as_posix())
+        return found
+
+    def _write(self, unfinished: bool) -> None:
+        write_json(self.file, {"files": sorted(self.files), "unfinished": unfinished})
+
+
+def _delete(place: Path) -> None:
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)
 
 
 def creek_flight() -> dict[str, Any]:

@@ -81,7 +81,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:
             trainer.resume(folder)
-        finished = train(trainer, folder, budget, console, validation)
+        stopped = train(trainer, folder, budget, console, validation)
     if trainer.is_main_process:
         done = trainer.progress
         description = {
@@ -94,4 +94,4 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
             "validation": validation.points,
         }
         write_weights(folder / WEIGHTS_FILE, trainer.network, config, description)
-    report_end(trainer.progress, finished, folder, console)
+    report_end(trainer.progress, stopped, folder, console)

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
 from tidefield.errors import RunError, TidefieldError
-from tidefield.files import refuse_existing
+from tidefield.files import require_writable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -51,15 +51,14 @@ def render(options: Render, console: Console) -> None:
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
     from tidefield.render.camera_paths import make_trajectory
-    from tidefield.render.stills import write_still
+    from tidefield.render.stills import still_files, write_still
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
     suffix = ".mp4" if camera is None else ".png"
     if out.suffix.lower() != suffix:
         what = "a video" if camera is None else "one view (--camera)"
         raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
-    if not overwrite:
-        refuse_existing(out)
+    require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
     device = choose_device(options.device)
     with ExitStack() as stack:
         if options.zero.zero_shot:

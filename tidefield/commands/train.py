@@ -13,8 +13,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
 from tidefield.config import Budget, Config, NerfstudioConfig, checked_seed, vary, warm_start
 from tidefield.errors import RunError, SceneError
-from tidefield.files import delete_files, delete_partials, is_empty, only_writer
+from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
+from tidefield.processes import Ended
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -88,7 +89,7 @@ def _train(options: Train, console: Console) -> None:
     device = choose_device(options.device)
     if options.resume:
         run = read_run(folder)  # its other options were settled when it was started
-        if run.scene != options.scene.resolve():
+        if run.scene != Path(os.path.realpath(options.scene)):
             raise RunError(
                 f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
             )
@@ -115,7 +116,7 @@ def _train(options: Train, console: Console) -> None:
                 bar(budget.share(step, seconds), 1, f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
 
             progress = driver.train(run.config.method, scene, folder, budget, run.seed, device, curve, show)
-        finished = True
+        stopped = None
     else:
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
@@ -124,16 +125,16 @@ def _train(options: Train, console: Console) -> None:
             _start(folder, run, scene)
         used = budget.share(trainer.progress.step, trainer.progress.seconds)
         callback = curve and curve.watch(folder, used)
-        finished, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
-    report_end(progress, finished, folder, console)
+        stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
+    report_end(progress, stopped, folder, console)
 
 
-def report_end(progress: TrainingProgress, finished: bool, folder: Path, console: Console) -> None:
-    """Print what was done; an interrupted training ends its command as an interruption."""
+def report_end(progress: TrainingProgress, stopped: int | None, folder: Path, console: Console) -> None:
+    """Print what was done; a training that a signal stopped ends its command as the signal does."""
     console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
-    if not finished:
+    if stopped is not None:
         console.print("interrupted; the same command with --resume continues")
-        raise KeyboardInterrupt
+        raise Ended(stopped)
 
 
 def _start(folder: Path, run: Run, scene: Scene) -> None:
@@ -191,7 +192,8 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     if weights is not None:
         assert isinstance(config, Config), "only our networks start from weights"
         config, digest = warm_start(config), weights_sha256(weights)
-    return Run(options.scene.resolve(), options.width, checked_seed(options.seed), config, digest), weights
+    root = Path(os.path.realpath(options.scene))
+    return Run(root, options.width, checked_seed(options.seed), config, digest), weights
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:
@@ -205,3 +207,4 @@ def _require_free(folder: Path, overwrite: bool) -> None:
             )
     elif not is_empty(folder):
         raise RunError(f"{folder} holds other files: expected a new or empty folder; choose a new name")
+    require_writable(folder / RUN_FILE, overwrite=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tidefield.compare.run import PROCESS_FILE, RUNS, read_evaluation
+from tidefield.compare.run import RUNS, read_evaluation, read_process
+from tidefield.errors import RunError
 from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import read_json
 
@@ -69,9 +70,15 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
             folder = out / RUNS / scene / method
             evaluation = read_evaluation(folder)
             if evaluation is not None:
-                curve = [(float(x), float(y)) for x, y in read_json(folder / CURVE_FILE) or ()]
-                found[scene, method] = Result(evaluation, read_json(folder / PROCESS_FILE) or {}, curve, folder)
+                found[scene, method] = Result(evaluation, read_process(folder), _curve(folder / CURVE_FILE), folder)
     return Results(tuple(scenes), tuple(methods), found)
+
+
+def _curve(path: Path) -> list[tuple[float, float]]:
+    try:
+        return [(float(x), float(y)) for x, y in read_json(path) or ()]
+    except (TypeError, ValueError) as error:
+        raise RunError(f"{path} is damaged: expected what this program wrote; delete it and repeat") from error
 
 
 def figures_of(results: Results) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -24,6 +25,7 @@ from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import METHODS
+from tidefield.processes import Ended, end_with_parent
 
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and the same with another seed, for the noise of an ablation."""
@@ -133,25 +135,40 @@ def tidefield(*words: object) -> list[str]:
     return [sys.executable, "-m", "tidefield.cli", *map(str, words)]
 
 
+def check_scene(scene: Path, width: int | None) -> None:
+    """Raises: SceneError when a scene cannot be compared on; reads its poses, and no photograph."""
+    from tidefield.data.load import read_posed, require_width
+
+    require_width(width)
+    posed = read_posed(scene, allow_missing=False)
+    if posed.split is not None and not posed.split[1]:
+        raise SceneError(f"{scene} holds no photograph out: expected at least one to compare with; add photographs")
+
+
 def run_measured(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
     """Run a command in a process of its own; it prints to our output.
 
     Raises:
-        RunError: when it fails.
+        SystemExit: it failed, and has said why; with its status.
+        RunError: a signal ended it.
     """
     start = time.perf_counter()
-    process = subprocess.Popen(command, env={**os.environ, **environment})
+    process = subprocess.Popen(command, env={**os.environ, **environment}, preexec_fn=end_with_parent)
     try:
         # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
         _, status, usage = os.wait4(process.pid, 0)
-    except KeyboardInterrupt:
-        process.wait()  # Ctrl-C has reached it, too, and it saves before it stops.
+    except KeyboardInterrupt as error:
+        if isinstance(error, Ended):
+            process.send_signal(error.number)
+        process.wait()  # Ctrl-C has reached it, too; a training saves before it stops.
         raise
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
+    if process.returncode > 0:
+        sys.exit(process.returncode)
+    if process.returncode < 0:
         raise RunError(
-            f"`{shlex.join(command)}` ended with status {process.returncode}: expected 0; correct what its message "
-            "says and repeat the command, which continues from there"
+            f"{signal.Signals(-process.returncode).name} ended `{shlex.join(command)}`: expected it to go on, with "
+            "memory enough for it; repeat the command, which continues from there"
         )
     # Kilobytes on Linux, bytes on macOS.
     return Usage(time.perf_counter() - start, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
@@ -210,41 +227,83 @@ def compare(
     """
     jobs = [(out / RUNS / name / method, name, scene, method) for name, scene in scenes.items() for method in methods]
     for folder, _, scene, method in jobs:
-        wanted, found = _record(scene, method, settings), (read_json(folder / PROCESS_FILE) or {}).get("settings")
+        read_evaluation(folder)  # a damaged one is reported before anything is trained
+        wanted, found = _record(scene, method, settings), read_process(folder).get("settings")
         if found not in (None, wanted):
             was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
             asked = {key: wanted[key] for key in was}
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
     for number, (folder, name, scene, method) in enumerate(jobs, start=1):
         title = f"{name}, {method} ({number} of {len(jobs)})"
-        if read_evaluation(folder) is not None:
+        if read_evaluation(folder) is not None and "evaluate" in read_process(folder):
             say(f"{title}: done before")
             continue
         portable = commands(Path("SCENE"), Path("RUN"), method, settings)
         for step, words in commands(scene, folder, method, settings).items():
             say(f"{title}: {step}")
-            record = read_json(folder / PROCESS_FILE) or {"settings": _record(scene, method, settings)}
+            record = read_process(folder) or {"settings": _record(scene, method, settings)}
             if step == "train" and step in record:
                 continue
-            again = ["--overwrite"] if step == "train" and (folder / RUN_FILE).exists() else []
+            written = {"train": RUN_FILE, "evaluate": EVALUATION_FILE}[step]
+            again = ["--overwrite"] if (folder / written).exists() else []
             usage = run(tidefield(*words, *again), {})
             command = shlex.join(["tidefield", *portable[step]])
             write_json(folder / PROCESS_FILE, {**record, step: {"command": command, **asdict(usage), **describe()}})
 
 
-def read_evaluation(folder: Path) -> Any:
+def read_evaluation(folder: Path) -> dict[str, Any] | None:
     """The evaluation of the run in a folder, or of what needs no run; None where there is none.
 
     Raises:
         RunError: it is damaged, or of another run than the one that is there.
     """
-    evaluation, run = read_json(folder / EVALUATION_FILE), read_json(folder / RUN_FILE)
+    evaluation, run = _read(folder / EVALUATION_FILE, _is_evaluation), read_json(folder / RUN_FILE)
     if evaluation is not None and run is not None and evaluation["configuration"].get("run") != run.get("id"):
         raise RunError(
             f"{folder / EVALUATION_FILE} is of another run than {RUN_FILE}: expected two files of one run; delete it "
             "and repeat the command"
         )
     return evaluation
+
+
+def read_process(folder: Path) -> dict[str, Any]:
+    """The process.json of a run, empty where there is none.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    return _read(folder / PROCESS_FILE, _is_process) or {}
+
+
+def _read(path: Path, is_valid: Callable[[Any], bool]) -> Any:
+    data = read_json(path)
+    try:
+        valid = data is None or is_valid(data)
+    except (AttributeError, KeyError, TypeError):  # a part is missing or of another kind
+        valid = False
+    if not valid:
+        raise RunError(f"{path} is damaged: expected what this program wrote; delete it and repeat")
+    return data
+
+
+def _is_evaluation(data: Any) -> bool:
+    """Whether a comparison can read all that it needs."""
+    mean, trained = dict(data["mean"]), data["configuration"].get("trained") or {}
+    reasons, weights = mean.pop("reasons", {}), data.get("lpips_weights", {})
+    optional = [*mean.values(), *(trained.get(name) for name in ("steps", "seconds"))]
+    numbers = [data["rays_per_second"], data["seconds_per_frame"], *(x for x in optional if x is not None)]
+    numbers += [one["psnr"] for one in data["per_photograph"].values()]
+    texts = [*reasons.values(), *weights.values()]
+    return all(_is_number(x) for x in numbers) and all(isinstance(x, str) for x in texts) and set(weights) <= set(mean)
+
+
+def _is_process(data: Any) -> bool:
+    peaks = [step.get("peak_memory_bytes") for step in data.values()]
+    return isinstance(data["settings"], dict) and all(peak is None or _is_number(peak) for peak in peaks)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _kind(method: str) -> str:

@@ -107,8 +107,7 @@ def load_scene(
         SceneError: the folder is not a scene, or is damaged.
     """
     root = Path(root)
-    if width is not None and width < _SMALLEST_WIDTH:
-        raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
+    require_width(width)
     posed = read_posed(root, allow_missing)
     files = []
     for path, lens in zip(posed.paths, posed.lenses, strict=True):
@@ -151,6 +150,12 @@ def load_scene(
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
         hull=visual_hull(cameras, photographs, train) if sparse is None and transparent else None,
     )
+
+
+def require_width(width: int | None) -> None:
+    """Raises: SceneError when photographs of a width in pixels are too small."""
+    if width is not None and width < _SMALLEST_WIDTH:
+        raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
 
 
 def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:

@@ -26,9 +26,9 @@ from tidefield.errors import RunError
 from tidefield.evaluation.lpips import Lpips, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
-from tidefield.files import completed_file, delete_files, delete_partials, read_json, refuse_existing, write_json
+from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
 from tidefield.model.rendering import Render, Rendering, to_8_bit
-from tidefield.progress import ProgressBar
+from tidefield.progress import ProgressBar, make_console
 
 EVALUATION_FILE, FOLDERS = "evaluation.json", ("renderings", "pictures")
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
@@ -74,9 +74,8 @@ def evaluate(
         RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
             is not finite.
     """
-    path, console = out / EVALUATION_FILE, console or Console()
-    if not overwrite:
-        refuse_existing(path)
+    path, console = out / EVALUATION_FILE, console or make_console()
+    require_writable(path, overwrite=overwrite)
     if not scene.test:
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
     files = picture_names([scene.names[i] for i in scene.test])
@@ -117,7 +116,7 @@ def evaluate(
     write_json(path, report)
     console.print(_table(scene, report))
     for remark in _remarks(report, out):
-        console.print(remark, soft_wrap=True, highlight=False, markup=False)
+        console.print(remark, soft_wrap=True)
     return Evaluation(path, report)
 
 

@@ -124,8 +124,10 @@ def make_trajectory(
         frames, width, height, frames_per_second: of the video, pixels; a JSON has its own instead.
 
     Raises:
-        TidefieldError: the name is none of these, or the file cannot be read as a camera path.
+        TidefieldError: the name is none of these, it would have no frames, or the file cannot be read as a camera path.
     """
+    if frames < 1:
+        raise TidefieldError(f"a video of {frames} frames was asked for: expected at least one; choose more --frames")
     if path in SHAPES:
         return Trajectory(_well_seen(SHAPES[path], scene, frames, width, height), frames_per_second)
     if Path(path).suffix.lower() != ".json":

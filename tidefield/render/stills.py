@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, PngImagePlugin
 
 from tidefield.errors import RunError
-from tidefield.files import completed_file, refuse_existing
+from tidefield.files import completed_file, require_writable
 from tidefield.model.rendering import Rendering, to_8_bit
 
 MIN_OPACITY = 0.5
@@ -56,11 +56,8 @@ def write_still(rendering: Rendering, path: Path, *, overwrite: bool = False) ->
     Raises:
         RunError: the name is no PNG, one of the files exists, or the folder cannot be written to.
     """
-    if path.suffix.lower() != ".png":
-        raise RunError(f"a picture cannot be written as {path.name}: expected a name that ends in .png")
-    numbers, picture = (path.with_name(f"{path.stem}_depth{suffix}") for suffix in (".npy", ".png"))
-    if not overwrite:
-        refuse_existing(path, numbers, picture)
+    path, numbers, picture = still_files(path)
+    require_writable(path, numbers, picture, overwrite=overwrite)
     near, far = depth_range(rendering)
     text = PngImagePlugin.PngInfo()
     text.add_text("near", f"{near:.9g}")
@@ -72,4 +69,16 @@ def write_still(rendering: Rendering, path: Path, *, overwrite: bool = False) ->
         Image.fromarray(depth_picture(rendering, near, far)).save(partial, pnginfo=text)
     with completed_file(path, overwrite=overwrite) as partial:
         Image.fromarray(colour_picture(rendering)).save(partial)
+    return path, numbers, picture
+
+
+def still_files(path: Path) -> tuple[Path, Path, Path]:
+    """The files of a view: its colours, its depth as numbers and as a picture.
+
+    Raises:
+        RunError: the name is no PNG.
+    """
+    if path.suffix.lower() != ".png":
+        raise RunError(f"a picture cannot be written as {path.name}: expected a name that ends in .png")
+    numbers, picture = (path.with_name(f"{path.stem}_depth{suffix}") for suffix in (".npy", ".png"))
     return path, numbers, picture

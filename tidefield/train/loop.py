@@ -27,6 +27,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
+from tidefield.processes import STOPPING, handled
 from tidefield.progress import ProgressBar
 from tidefield.train.checkpoint import (
     CHECKPOINT_FILE,
@@ -181,13 +182,15 @@ class SceneTrainer(Trainer):
         return Renderer(self.network, self.scene, self.config, self.device)
 
 
-def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, callback: Callback | None = None) -> bool:
-    """Train until the budget is used; save every minute, at the end, and on Ctrl-C or SIGTERM.
+def train(
+    trainer: Trainer, folder: Path, budget: Budget, console: Console, callback: Callback | None = None
+) -> int | None:
+    """Train until the budget is used; save every minute, at the end, and on Ctrl-C, SIGTERM or SIGHUP.
 
     `callback` is called after every step; its time does not count.
 
     Returns:
-        Whether the budget was used up; False after an interruption, from which `resume` continues.
+        The signal that stopped it, after which `resume` continues; None if the budget was used up.
     """
     progress = trainer.progress
 
@@ -196,8 +199,8 @@ def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, call
 
     writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=trainer.is_main_process)
     saved = pictured = time.monotonic()
-    with writer, ProgressBar(console, "Training") as bar, _stop_requests() as stop_requested:
-        while used() < 1 and not trainer.should_stop(stop_requested()):
+    with writer, ProgressBar(console, "Training") as bar, _stop_requests() as stopped_by:
+        while used() < 1 and not trainer.should_stop(stopped_by() is not None):
             error = trainer.step(budget)
             if not math.isfinite(error):
                 raise FloatingPointError(
@@ -222,9 +225,10 @@ def train(trainer: Trainer, folder: Path, budget: Budget, console: Console, call
                 pictured = time.monotonic()
         if trainer.is_main_process:
             trainer.save(folder)
-            if not stop_requested():
+            if stopped_by() is None:
                 _write_picture(trainer, writer)
-    return used() >= 1
+    # Without a signal of its own, a process stops with the others of a distributed training.
+    return None if used() >= 1 else stopped_by() or signal.SIGINT
 
 
 def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:
@@ -237,19 +241,15 @@ def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:
 
 
 @contextmanager
-def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Turn SIGINT and SIGTERM into a question to ask between steps; a second SIGINT interrupts at once."""
-    asked = False
+def _stop_requests() -> Iterator[Callable[[], int | None]]:
+    """Turn SIGINT, SIGTERM and SIGHUP into a question to ask between steps; a second SIGINT interrupts at once."""
+    first: int | None = None
 
     def handler(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked and number == signal.SIGINT:
+        nonlocal first
+        if first is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
-        asked = True
+        first = first or number
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+    with handled(handler, signal.SIGINT, *STOPPING):
+        yield lambda: first

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -27,6 +26,7 @@ from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.processes import start_worker
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
 POOL_SIZE = 8
@@ -188,8 +188,7 @@ class Stream:
         self.pool: dict[int, Drawn] = {}
         self.pending: dict[int, AsyncResult[None]] = {}
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
-        # By default SIGTERM ends it without a message; imported libraries would print a traceback.
-        self.maker = get_context("spawn").Pool(1, signal.signal, (signal.SIGTERM, signal.SIG_DFL))
+        self.maker = get_context("spawn").Pool(1, start_worker)
         folder.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Stream:

@@ -29,6 +29,7 @@ from tidefield.files import delete_files, read_json, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
+from tidefield.processes import end_with_parent
 from tidefield.train.checkpoint import TrainingProgress
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
@@ -190,6 +191,7 @@ def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process
             stderr=log,
             text=True,
             env={**os.environ, **KEEP_LARGE_ALLOCATIONS},
+            preexec_fn=end_with_parent,
         )
         try:
             yield _Process(process, folder)

@@ -13,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from tidefield.errors import RunError
+from tidefield.files import writing_to
 
 VERSION = "1.1.5"
 WORKER = Path(__file__).with_name("worker.py")
@@ -93,9 +94,10 @@ def install(overwrite: bool, console: Console) -> None:
             f"expected {'.'.join(map(str, _NEWEST_PYTHON))} or older; install Tidefield there"
         )
     shutil.rmtree(folder, ignore_errors=True)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    console.print(f"Making {folder} (gigabytes; minutes) ...", highlight=False, soft_wrap=True)
-    venv.create(folder, with_pip=True)
+    console.print(f"Making {folder} (gigabytes; minutes) ...", soft_wrap=True)
+    with writing_to(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        venv.create(folder, with_pip=True)
     torch = version("torch").partition("+")[0]
     # torchvision's wheel may be for a PyTorch of other hardware; what is needed of it is Python.
     for words in ([f"torch=={torch}", *_NEEDED], ["--no-deps", f"torchvision=={_vision(torch)}"]):

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -21,6 +19,7 @@ from jaxtyping import Float32, UInt8
 
 from tidefield.errors import DeviceError
 from tidefield.machine import cores
+from tidefield.processes import worker_processes
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import Photograph, Progress
 
@@ -112,13 +111,13 @@ def extract(
             image = db.read_image_with_name(encode_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
                 todo.append((photograph, camera_id))
-        # Processes, because pycolmap holds the interpreter's lock during extraction; spawned, because forking a process
-        # with threads may hang. A GPU works on one photograph at a time.
+        # Processes, because pycolmap holds the interpreter's lock during extraction. A GPU works on one photograph at a
+        # time.
         on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
         workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
         # Only a few photographs are submitted in advance, so that memory use does not grow with their number.
         ahead = 2 * cores() + 1
-        with ProcessPoolExecutor(workers, get_context("spawn"), _silence_pycolmap) as pool:
+        with worker_processes(workers, _silence_pycolmap) as pool:
             running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
             for k, (photograph, camera_id) in enumerate(todo):
                 keypoints, descriptors = running.popleft().result()

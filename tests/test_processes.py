@@ -1,0 +1,90 @@
+"""Processes: what signals end, and what ends with the process that started it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CHILD = """
+import os, sys, time
+from tidefield.processes import worker_processes
+from tidefield.compare.run import run_measured
+
+def work(file):
+    open(file, "w").write(str(os.getpid()))
+    time.sleep(60)
+
+def start():
+    import tidefield.survey  # whose pycolmap handles SIGTERM in its own way
+
+if __name__ == "__main__":
+    from tidefield.processes import ended_by_signals
+    with ended_by_signals():
+        if sys.argv[1] == "pool":
+            with worker_processes(1, start) as pool:
+                pool.submit(work, sys.argv[2]).result()
+        else:
+            code = f"import os, time; open({sys.argv[2]!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+            run_measured([sys.executable, "-c", code], {})
+"""
+
+
+def start(folder: Path, kind: str) -> tuple[subprocess.Popen[str], int]:
+    """A process with a child of a kind, and the child's number."""
+    program, file = folder / "program.py", folder / "child"
+    program.write_text(CHILD)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(program), kind, str(file)]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert within(30, lambda: file.exists() and file.read_text() != ""), "it did not start"
+    return process, int(file.read_text())
+
+
+def within(seconds: float, condition) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def has_ended(number: int) -> bool:
+    stat = Path(f"/proc/{number}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("kind", ["pool", "measured"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_children_end_with_the_process_that_started_them(number: signal.Signals, kind: str, tmp_path: Path):
+    process, child = start(tmp_path, kind)
+    process.send_signal(number)
+    _, message = process.communicate(timeout=20)
+    assert within(10, lambda: has_ended(child))
+    assert "SIGTERM received" not in message, "pycolmap's handler prints its stack"
+    if number != signal.SIGKILL:
+        assert f"Ended: {number.name}" in message
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_command_with_its_exit_status(number: signal.Signals):
+    code = "import time; from tidefield import cli; cli._run = lambda _: (print('x', flush=True), time.sleep(60))"
+    command = [sys.executable, "-c", f"{code}; cli.main()"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "x\n"
+    process.send_signal(number)
+    _, message = process.communicate(timeout=20)
+    assert (process.returncode, message) == (128 + number, f"tidefield: interrupted ({number.name})\n")
+
+
+def test_nohup_keeps_its_meaning():
+    code = "import signal, os; from tidefield import cli; cli._run = lambda _: os.kill(os.getpid(), signal.SIGHUP)"
+    ignore = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); {code}; cli.main()"
+    assert subprocess.run([sys.executable, "-c", ignore], cwd=ROOT, check=False).returncode == 0

@@ -1,0 +1,106 @@
+"""Processes: signals that end a command, and children that end with the process that started them."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from types import FrameType
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""The signals, other than Ctrl-C's SIGINT, that ask a process to end; Windows has no SIGHUP."""
+_SET_PARENT_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl.h."""
+_PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+Handler = Callable[[int, FrameType | None], object]
+
+
+class Ended(KeyboardInterrupt):
+    """A signal ended the command, as Ctrl-C does.
+
+    Attributes:
+        number: the signal's.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextmanager
+def handled(handler: Handler, *numbers: int) -> Iterator[None]:
+    """Call a handler for signals while the block lasts; `nohup` keeps SIGHUP ignored."""
+    numbers = tuple(n for n in numbers if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN)
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Raise Ended in the block on SIGTERM and SIGHUP, once: what is being cleaned up is not interrupted again."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for each in STOPPING:
+            signal.signal(each, signal.SIG_IGN)
+        raise Ended(number)
+
+    with handled(end, *STOPPING):
+        yield
+
+
+def restore_sigterm() -> None:
+    """Put back the handler that the import of pycolmap replaced by one that prints its stack."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+
+
+def end_with_parent() -> None:
+    """Have the kernel end this process (SIGTERM) when the thread that started it ends, by whatever; Linux only.
+
+    For `Popen(preexec_fn=...)`.
+    """
+    if _PRCTL is not None:
+        _PRCTL(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+
+
+def start_worker(*initializers: Callable[[], object]) -> None:
+    """Set up a process of multiprocessing: its parent alone decides when it ends, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_end_after_parent, daemon=True).start()
+    for initialize in initializers:
+        initialize()
+
+
+def _end_after_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker has a parent"
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterator[ProcessPoolExecutor]:
+    """Processes that work for this one, spawned, because forking a process with threads may hang.
+
+    They end with the block. After an error or a signal they do not finish what they are doing.
+    """
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), start_worker, initializers)
+    try:
+        yield pool
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
