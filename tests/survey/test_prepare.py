@@ -20,6 +20,7 @@ from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.features import FeatureOptions
+from tidefield.survey.stages import Stages
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
 OPTIONS = FeatureOptions(count=1500)
@@ -108,6 +109,62 @@ def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends
     name = flight.names[0]
     assert (scene / "images" / name).read_bytes() == (flight.folder / name).read_bytes()
     assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
+
+
+def test_the_originals_behind_a_linked_images_folder_stay_as_they_are(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path
+):
+    scene, mine = shutil.copytree(made[0], tmp_path / "scene"), shutil.copytree(flight.folder, tmp_path / "mine")
+    (mine / "notes.txt").write_text("mine")
+    shutil.rmtree(scene / "images")
+    (scene / "images").symlink_to(mine)
+    with pytest.raises(RunError, match="is a link to"):
+        run(mine, scene)
+    assert (mine / "notes.txt").exists()
+    assert all((mine / name).read_bytes() == (flight.folder / name).read_bytes() for name in flight.names)
+
+
+DAMAGE = {
+    "an empty database": ("prepare/database.db", "features", lambda _: b""),
+    "a database of garbage": ("prepare/database.db", "features", lambda _: b"garbage" * 999),
+    "half a database": ("prepare/database.db", "features", lambda data: data[: len(data) // 2]),
+    "half a file of frames": ("prepare/model/frames.bin", "poses", lambda data: data[: len(data) // 2]),
+    "frames of garbage": ("prepare/model/frames.bin", "poses", lambda data: data[:8] + b"x" * (len(data) - 8)),
+    "half a file of cameras": ("prepare/model/cameras.bin", "poses", lambda data: data[: len(data) // 2]),
+    "an empty file of rigs": ("prepare/model/rigs.bin", "poses", lambda _: b""),
+    "half a file of the scene's images": ("sparse/0/images.bin", "georeference", lambda data: data[: len(data) // 2]),
+    "a damaged georeference": ("georeference.json", "georeference", lambda _: b"{}"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_stage_whose_files_are_damaged_is_done_again_with_one_warning(
+    damage: str, made: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+):
+    class Again(Exception): ...
+
+    def stop(self: Stages, file: str) -> None:
+        raise Again
+
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    name, stage, change = DAMAGE[damage]
+    (scene / name).write_bytes(change((scene / name).read_bytes()))
+    stages = json.loads((scene / "prepare" / "stages.json").read_text())
+    stages[stage]["files"].append("images/stale.jpg")  # is removed first of all
+    (scene / "prepare" / "stages.json").write_text(json.dumps(stages))
+    monkeypatch.setattr(Stages, "_remove", stop)
+    with pytest.raises(Again):
+        run(made[1].survey.folder, scene)
+    (warning,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert f"what the stage {stage} wrote is damaged" in warning
+
+
+def test_a_damaged_database_makes_the_same_scene_again(made: tuple[Path, Prepared], tmp_path: Path):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    (scene / "prepare" / "database.db").write_bytes(b"")
+    run(made[1].survey.folder, scene)
+    for path in (*made[0].glob("images/*"), *made[0].glob("sparse/0/*")):
+        assert (scene / path.relative_to(made[0])).read_bytes() == path.read_bytes()
 
 
 def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

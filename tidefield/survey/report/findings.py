@@ -22,6 +22,7 @@ from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.sfm.features import decode_name
 from tidefield.survey.sfm.mapping import lens_notes
+from tidefield.survey.sfm.model_files import read_model
 from tidefield.survey.survey import Survey
 
 MOST_THUMBNAILS = 24  # of each stage
@@ -154,7 +155,7 @@ def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]
         title=prepared.survey.folder.resolve().name,
         date=datetime.now(UTC),
         survey=prepared.survey,
-        reconstruction=pycolmap.Reconstruction(scene / "sparse" / "0"),
+        reconstruction=read_model(scene / "sparse" / "0"),
         georeference=prepared.georeference,
         left_out=(*_rejected(prepared), *_unregistered(prepared, scene)),
         models=tuple(len(names) for names in prepared.models),

@@ -6,9 +6,11 @@ make matching slower) and reports no progress.
 
 from __future__ import annotations
 
+import sqlite3
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -65,6 +67,17 @@ def encode_name(name: str) -> str:
 def decode_name(encoded: str) -> str:
     """Decode a photograph's name from the database."""
     return unquote(encoded)
+
+
+def is_database(path: Path) -> bool:
+    """Check that a file is a whole COLMAP database; pycolmap takes an empty file for one."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master")}
+            (verdict,) = db.execute("PRAGMA quick_check(1)").fetchone()
+        return verdict == "ok" and {"cameras", "images", "keypoints", "descriptors"} <= tables
+    except (sqlite3.Error, UnicodeError):
+        return False
 
 
 def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
