@@ -52,18 +52,15 @@ class Prepare:
 
 def prepare(options: Prepare, console: Console) -> None:
     """Run `tidefield prepare`."""
-    import pycolmap
-
     from tidefield.survey.io.photographs import read_survey
     from tidefield.survey.prepare import prepare as prepare_scene
     from tidefield.survey.report import collect_findings, write_report
-    from tidefield.survey.sfm.features import FeatureOptions, choose_device
+    from tidefield.survey.sfm.features import FeatureOptions, choose_device, set_up_pycolmap
 
     if options.control is not None and options.no_control:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
+    set_up_pycolmap(options.verbosity.verbose)
     survey = read_survey(options.photographs, options.gps, options.control)
-    # pycolmap logs every step of structure from motion.
-    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.verbosity.verbose else pycolmap.logging.ERROR)
     if options.no_control:
         survey = replace(survey, control=None)
     for remark in survey.remarks:

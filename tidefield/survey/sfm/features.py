@@ -6,14 +6,18 @@ make matching slower) and reports no progress.
 
 from __future__ import annotations
 
+import os
+import signal
 import sqlite3
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from urllib.parse import quote, unquote
 
 import cv2
@@ -21,7 +25,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
-from tidefield.errors import DeviceError
+from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import Photograph, Progress
@@ -131,7 +135,8 @@ def extract(
         workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
         # Only a few photographs are submitted in advance, so that memory use does not grow with their number.
         ahead = 2 * cores() + 1
-        with ProcessPoolExecutor(workers, get_context("spawn"), _silence_pycolmap) as pool:
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _set_up_worker)
+        try:
             running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
             for k, (photograph, camera_id) in enumerate(todo):
                 keypoints, descriptors = running.popleft().result()
@@ -139,12 +144,38 @@ def extract(
                     running.append(pool.submit(_features, todo[k + ahead][0], options, device))
                 _write_features(db, photograph, camera_id, keypoints, descriptors)
                 progress(len(photographs) - len(todo) + k + 1, len(photographs))
+        except BrokenProcessPool as error:
+            raise RunError(
+                f"a process that finds features was killed at {photograph.name}, which happens when memory runs out: "
+                f"expected memory for {workers} photographs at a time; give fewer --features or a smaller "
+                "--feature-width, and continue with the same command"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)  # an interruption waits for the photographs in progress only
         return db.num_keypoints()
 
 
-def _silence_pycolmap() -> None:
-    """Keep the log of a worker process from mixing with the progress bar."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+def set_up_pycolmap(verbose: bool = False) -> None:
+    """Make pycolmap quiet, unless the user wants its log, and undo what it does to SIGTERM.
+
+    When it is imported, its logger takes over the signal to print a C++ stack, whatever Python does about the signal.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL)
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+
+
+def _set_up_worker() -> None:
+    """Make a worker process quiet, and end it with its parent, however that ends."""
+    set_up_pycolmap()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent ends its workers
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None, "this is a worker process"
+    parent.join()
+    os._exit(1)
 
 
 def _features(
