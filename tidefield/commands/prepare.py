@@ -41,9 +41,9 @@ class Prepare:
     colour: Literal["auto", "on", "off"] = "auto"
     """Correct exposures and the lens' falloff: where it helps, always, or never."""
     features: int = 6000
-    """Most features to find in a photograph."""
+    """Most features to find in a photograph: 100 to 50000."""
     feature_width: int = 2400
-    """Longer side in pixels to which larger photographs are reduced to find features."""
+    """Longer side in pixels to which larger photographs are reduced to find features: 100 to 50000."""
     redo: str | None = None
     """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
@@ -60,6 +60,7 @@ def prepare(options: Prepare, console: Console) -> None:
     if options.control is not None and options.no_control:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     set_up_pycolmap(options.verbosity.verbose)
+    features = FeatureOptions(options.feature_width, options.features)
     survey = read_survey(options.photographs, options.gps, options.control)
     if options.no_control:
         survey = replace(survey, control=None)
@@ -68,7 +69,7 @@ def prepare(options: Prepare, console: Console) -> None:
     prepared = prepare_scene(
         survey,
         options.scene,
-        FeatureOptions(options.feature_width, options.features),
+        features,
         choose_device(options.device),
         console,
         keep_all=options.keep_all,

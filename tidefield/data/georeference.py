@@ -177,16 +177,20 @@ def _from_json(values: dict[str, Any]) -> Georeference:
     if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
     similarity = values["world_from_model"]
+    world_from_model = Similarity(
+        float(similarity["scale"]),
+        np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
+        np.array(similarity["translation"], dtype=np.float64).reshape(3),
+    )
+    numbers = [world_from_model.scale, *world_from_model.rotation.flat, *world_from_model.translation]
+    if not np.isfinite(numbers).all() or world_from_model.scale <= 0:
+        raise ValueError("its similarity is not one of finite numbers with a positive scale")
     residuals = {kind: Residuals.from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}
     return Georeference(
         frame=None if values["frame"] is None else LocalFrame.from_json(values["frame"]),
         source=values["source"],
-        world_from_model=Similarity(
-            float(similarity["scale"]),
-            np.array(similarity["rotation"], dtype=np.float64).reshape(3, 3),
-            np.array(similarity["translation"], dtype=np.float64).reshape(3),
-        ),
-        left_out=tuple(LeftOut(item["kind"], item["name"], item["reason"]) for item in values["left_out"]),
+        world_from_model=world_from_model,
+        left_out=tuple(LeftOut(item["kind"], str(item["name"]), str(item["reason"])) for item in values["left_out"]),
         notes=tuple(str(note) for note in values["notes"]),
         **residuals,
     )

@@ -89,6 +89,12 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
     photographs, raws, others = [], [], []
     for path in sorted(_walk(folder)):
         suffix = path.suffix.casefold()
+        name = os.fsencode(path.relative_to(folder))
+        if suffix in (*_PHOTOGRAPHS, *_RAWS, *_OTHER_IMAGES) and name.decode(errors="replace").encode() != name:
+            raise SurveyError(
+                f"{folder} has a photograph whose name is not UTF-8, {name.decode(errors='backslashreplace')}: "
+                "expected names that COLMAP models and JSON can hold; rename it"
+            )
         if suffix in _PHOTOGRAPHS:
             photographs.append(path)
         elif suffix in _RAWS or suffix in _OTHER_IMAGES:

@@ -37,14 +37,29 @@ DEFAULT_FOCAL = 1.2
 """Focal length in widths of the photograph where no prior exists: COLMAP's default."""
 
 
+OPTION_RANGE = (100, 50_000)
+"""Of the number of features, and of the side in pixels to which photographs are reduced."""
+
+
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Options of feature extraction."""
+    """Options of feature extraction.
+
+    Raises:
+        RunError: one of them is out of its range.
+    """
 
     side_px: int = 2400
     """Longer side to which larger photographs are reduced."""
     count: int = 6000
     """Maximum number of features per photograph; the largest are kept."""
+
+    def __post_init__(self) -> None:
+        for option, value in (("--features", self.count), ("--feature-width", self.side_px)):
+            if not OPTION_RANGE[0] <= value <= OPTION_RANGE[1]:
+                raise RunError(
+                    f"{option} is {value}: expected a number from {OPTION_RANGE[0]} to {OPTION_RANGE[1]}; give another"
+                )
 
 
 def choose_device(name: str) -> pycolmap.Device:
@@ -146,7 +161,7 @@ def extract(
                 progress(len(photographs) - len(todo) + k + 1, len(photographs))
         except BrokenProcessPool as error:
             raise RunError(
-                f"a process that finds features was killed at {photograph.name}, which happens when memory runs out: "
+                "a process that finds features was killed, which happens when memory runs out: "
                 f"expected memory for {workers} photographs at a time; give fewer --features or a smaller "
                 "--feature-width, and continue with the same command"
             ) from error
@@ -185,7 +200,7 @@ def _features(
     grey = cv2.cvtColor(upright(photograph), cv2.COLOR_RGB2GRAY)
     scale = min(1.0, options.side_px / max(grey.shape))
     if scale < 1:
-        size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
+        size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     sift = pycolmap.FeatureExtractionOptions()
     sift.num_threads = 1
