@@ -201,7 +201,18 @@ def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(fl
 def test_photographs_without_overlap_are_an_error(tmp_path: Path):
     for k in range(4):
         fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=k)
-    with pytest.raises(SurveyError, match="overlap"):
+    with pytest.raises(SurveyError, match=r"none of the 4 photographs fit together \(4 match no other photograph\)"):
+        run(tmp_path / "card", tmp_path / "scene")
+
+
+def test_two_photographs_that_fit_are_too_few_and_the_others_are_explained(
+    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """pycolmap keeps a model of two where none is larger."""
+    fly(tmp_path / "card", rows=1, columns=2)
+    for k in range(3):
+        fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=10 + k)
+    with pytest.raises(SurveyError, match=r"of the 5 photographs fit together \(3 match no other photograph\)"):
         run(tmp_path / "card", tmp_path / "scene")
 
 

@@ -21,7 +21,7 @@ from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.sfm.features import decode_name
-from tidefield.survey.sfm.mapping import lens_notes
+from tidefield.survey.sfm.mapping import FEW_FEATURES, lens_notes
 from tidefield.survey.sfm.model_files import read_model
 from tidefield.survey.survey import Survey
 
@@ -215,7 +215,7 @@ def _why(features: int, matches: list[int], model: list[str] | None) -> str:
     if model:
         where = f"{model[0]} to {model[-1]}"
         return f"matches only {len(model) - 1} others, of a place that nothing connects with the rest ({where})"
-    if features < 500:
+    if features < FEW_FEATURES:
         return f"only {features} features were found: the ground has too little texture, or the photograph is blurred"
     if not matches:
         return f"none of its {features} features match another photograph: expected overlap with at least two others"
