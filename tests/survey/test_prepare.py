@@ -1,7 +1,9 @@
 """`tidefield prepare`, from photograph files to a scene that trains."""
 
 import json
+import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -186,6 +188,57 @@ def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypa
     assert written == [*flight.names[:7], *flight.names[6:]]
 
 
+def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    folder, scene = shutil.copytree(flight.folder, tmp_path / "card"), shutil.copytree(made[0], tmp_path / "scene")
+    times = {name: (flight.folder / name).stat() for name in flight.names}
+    for name, state in times.items():
+        os.utime(folder / name, ns=(state.st_atime_ns, state.st_mtime_ns))
+    x, y, height = ground_flight.FRAME.to_crs(np.array([[3.0, 4.0, 0.0]]))[0]
+    rng = np.random.default_rng(0)
+    lines = [
+        f"{x + 9 * k} {y - 9 * k % 20} {height} {rng.uniform(1, 399)} {rng.uniform(1, 299)} {name} P{k}"
+        for k in range(5)
+        for name in flight.names[:6]
+    ]
+    (folder / "gcp_list.txt").write_text("\n".join([ground_flight.FRAME.crs, *lines]))
+    survey = read_survey(folder)
+    assert survey.control is not None
+    asked = replace(survey, control_was_found=False)
+    with pytest.raises(SurveyError, match="control"):
+        prepare(asked, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    prepared = prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    assert prepared.georeference.source == "GPS"
+    assert "--no-control" in prepared.georeference.notes[-1]
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 1
+    with pytest.raises(SurveyError, match="control"):
+        prepare(asked, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+
+
+def test_the_report_has_no_paths_and_no_options_that_are_off(made: tuple[Path, Prepared], tmp_path: Path):
+    from tidefield.commands.prepare import Prepare, _shown
+
+    scene, prepared = made
+    folder = prepared.survey.folder
+    survey = replace(prepared.survey, remarks=(f"Left out: {folder / 'a.jpg'} cannot be read.",))
+    options = Prepare(folder, scene, gps=tmp_path / "gps.csv", keep_all=True)
+    shown = _shown(options)
+    assert "None" not in shown.values()
+    assert "False" not in shown.values()
+    assert (shown["gps"], shown["keep all"], shown["photographs"]) == ("gps.csv", "yes", folder.name)
+    page = write_report(collect_findings(replace(prepared, survey=survey), scene, shown), scene)
+    for text in (page.read_text(encoding="utf-8"), (scene / "report.json").read_text(encoding="utf-8")):
+        assert "a.jpg cannot be read" in text
+        assert str(folder.parent) not in text
+
+
+def test_every_stage_says_when_it_starts_and_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level("INFO", "tidefield"):
+        Stages(tmp_path, 0).run("one", 0, [], lambda _: {})
+    assert [record.message for record in caplog.records] == ["one: started", "one: done in 0.0 s"]
+
+
 def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(flight: Flight, tmp_path: Path):
     folder = shutil.copytree(flight.folder, tmp_path / "both")
     other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
@@ -229,6 +282,24 @@ def test_a_folder_with_other_content_is_left_alone(flight: Flight, tmp_path: Pat
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file"):
         run(flight.folder, tmp_path / "file")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize("part", [".", "prepare", "prepare/stages.json", "sparse", "images", "georeference.json"])
+def test_a_scene_that_may_not_be_read_is_one_error(part: str, made: tuple[Path, Prepared], tmp_path: Path):
+    scene, folder = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey.folder
+    parents = {path: path.stat().st_mode for path in (*folder.parents, *scene.parents) if "pytest" in str(path)}
+    for path in parents:
+        path.chmod(0o755)
+    (scene / part).chmod(0)
+    os.seteuid(54321)
+    try:
+        with pytest.raises(RunError, match=r"cannot be written \(Permission denied\): expected"):
+            run(folder, scene)
+    finally:
+        os.seteuid(0)
+        for path, mode in parents.items():
+            path.chmod(mode)
 
 
 def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: Path):

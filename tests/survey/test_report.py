@@ -264,7 +264,7 @@ def test_the_json_has_the_names_and_meanings_of_opensfm(table):
         "total_time_human": "1 h 2 min",
         "average_gsd": pytest.approx(100 * GSD),
     }
-    assert table["processing_statistics"]["area"] == pytest.approx(5 * AHEAD * 2 * ASIDE)
+    assert table["processing_statistics"]["area"] == table["tidefield"]["coverage"]["area"]
     assert table["processing_statistics"]["date"] == "04/05/2026 at 12:30:00"
     assert table["processing_statistics"]["steps_times"]["Total Time"] == 3775.0
     lens = table["camera_errors"]["Maker Drone"]
@@ -407,3 +407,16 @@ def test_numbers_become_plain_python_and_durations_are_formatted():
         "1 h 0 min",
         "2 h 3 min",
     ]
+
+
+@pytest.mark.parametrize(("behind_m", "text"), [(0.8, "0.80 m behind"), (-0.8, "0.80 m ahead of"), (0.02, None)])
+def test_residuals_in_two_clusters_are_remarked_with_the_lag_of_the_clocks(tmp_path, behind_m, text):
+    position = flight(4, 6)
+    direction = np.repeat([1.0, -1.0, 1.0, -1.0], 6)
+    error = np.random.default_rng(0).normal((0.3, 0.2, 1.0), 0.05, (24, 3))
+    error[:, 0] += behind_m * direction
+    names = tuple(p.name for p in findings(position).survey.photographs)
+    _, table = report(findings(position, georeference=located(gps=Residuals(names, error))), tmp_path)
+    remarks = [remark for remark in table["tidefield"]["remarks"] if "two clusters" in remark]
+    assert len(remarks) == (text is not None)
+    assert text is None or (text in remarks[0] and "0.1 s" in remarks[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Verbosity
 from tidefield.errors import RunError
+from tidefield.files import writing_to
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -61,9 +62,7 @@ def prepare(options: Prepare, console: Console) -> None:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     set_up_pycolmap(options.verbosity.verbose)
     features = FeatureOptions(options.feature_width, options.features)
-    survey = read_survey(options.photographs, options.gps, options.control)
-    if options.no_control:
-        survey = replace(survey, control=None)
+    survey = read_survey(options.photographs, options.gps, options.control, find_control=not options.no_control)
     for remark in survey.remarks:
         log.warning(remark)
     prepared = prepare_scene(
@@ -76,8 +75,8 @@ def prepare(options: Prepare, console: Console) -> None:
         colour=options.colour,
         redo=options.redo,
     )
-    given = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
-    page = write_report(collect_findings(prepared, options.scene, given), options.scene)
+    with writing_to(options.scene):
+        page = write_report(collect_findings(prepared, options.scene, _shown(options)), options.scene)
     missing = len(survey.photographs) - len(prepared.models[0])
     reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
     console.print(
@@ -85,3 +84,17 @@ def prepare(options: Prepare, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _shown(options: Prepare) -> dict[str, str]:
+    """The options that the report shows: those that are on, and of paths their names, as a report is sent on."""
+    given = {name: value for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
+    return {
+        name.replace("_", " "): "yes"
+        if value is True
+        else value.resolve().name
+        if isinstance(value, Path)
+        else str(value)
+        for name, value in given.items()
+        if value is not None and value is not False
+    }

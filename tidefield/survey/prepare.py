@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,11 +15,13 @@ from rich.console import Console
 
 from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.load import load_scene
-from tidefield.errors import RunError
+from tidefield.errors import RunError, SurveyError
+from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import write_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
 from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract, is_database
@@ -27,6 +30,8 @@ from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, previ
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
 from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
+
+log = logging.getLogger(__name__)
 
 COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
@@ -81,7 +86,8 @@ def prepare(
         RunError: the scene's folder contains something else, or cannot be written to.
         SurveyError: too few photographs are good, or fit together.
     """
-    _refuse_foreign(scene, survey)
+    with writing_to(scene):
+        _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
     database, model = work / "database.db", work / "model"
     if redo not in (None, *STAGES):
@@ -145,7 +151,7 @@ def prepare(
 
     located = stages.run(
         "georeference",
-        {"control": repr(good.control)},
+        {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
         [*model_files(sparse), scene / "georeference.json"],
         lambda _: georeference_model(good, model, sparse, console),
         read_located,
@@ -190,7 +196,16 @@ def georeference_model(good: Survey, model: Path, sparse: Path, console: Console
     """Georeference the largest model; write it, and `georeference.json`, to the scene."""
     reconstruction = read_model(model)
     with ProgressBar(console, "Georeferencing") as bar:
-        located = georeference(reconstruction, good, bar)
+        try:
+            located = georeference(reconstruction, good, bar)
+        except SurveyError as error:
+            if good.control is None or not good.control_was_found:
+                raise
+            remark = control_remark(error)
+            log.warning(remark)
+            reconstruction = read_model(model)
+            located = georeference(reconstruction, replace(good, control=None), bar)
+            located = replace(located, notes=(*located.notes, remark))
     write_model(reconstruction, sparse)
     located.write(sparse.parents[1])
     return {}

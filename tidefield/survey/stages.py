@@ -91,7 +91,9 @@ class Stages:
         self._is_redoing = self._is_redoing or name == self._redo
         record = self._records.get(name, {})
         is_same = record.get("key") == self._key and not self._is_redoing
-        if is_same and record["done"] and all(path.exists() for path in outputs):
+        with writing_to(self._scene):
+            is_complete = is_same and record["done"] and all(path.exists() for path in outputs)
+        if is_complete:
             try:
                 result = read(record["facts"])
             except _DAMAGE as error:
@@ -108,6 +110,7 @@ class Stages:
         record = {"key": self._key, "done": False, "seconds": earlier, "files": [*files, *sorted(stale)]}
         self._records[name] = record
         write_json(self._file, self._records)
+        log.info(f"{name}: started")
         start = time.monotonic()
         try:
             with writing_to(self._scene):
@@ -115,6 +118,7 @@ class Stages:
                     self._remove(file)
                 facts = job(is_same)
             record |= {"done": True, "facts": facts, "files": files}
+            log.info(f"{name}: done in {time.monotonic() - start:.1f} s")
         finally:
             self.seconds[name] = record["seconds"] = earlier + time.monotonic() - start
             write_json(self._file, self._records)

@@ -21,7 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report.findings import Comparison, Findings
-from tidefield.survey.report.statistics import Statistics, unite
+from tidefield.survey.report.statistics import Statistics, headings, unite
 
 Numbers = dict[str, Any]
 
@@ -38,6 +38,7 @@ LOW_FORWARD, LOW_SIDE = 0.6, 0.4  # the least of what flight planning asks for
 LARGE_ERROR_PX = 1.0
 FOCAL_CHANGE = 0.05
 TILT_DEG = 30.0
+FEWEST_CLUSTERED, LAG_M, LAG_SPREADS = 8, 0.1, 2.0  # positions; the least distance along the flight, also in spreads
 
 
 def numbers(findings: Findings, statistics: Statistics) -> Numbers:
@@ -60,7 +61,7 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
             "date": findings.date.strftime(_OPENSFM_TIME),
             "start_date": start,
             "end_date": end,
-            "area": np.ptp(block.position[:, :2], axis=0).prod(),  # OpenSfM's: of the cameras' bounding box
+            "area": statistics.coverage.area(1),  # as on the page; OpenSfM's is that of the cameras' bounding box
         },
         "features_statistics": {
             "detected_features": _spread(block.detected),
@@ -382,6 +383,7 @@ def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers])
         found.append(
             "No check points were held out: the residuals of control points are those of a fit, and flatter it."
         )
+    found += _clock_remark(findings, statistics)
     share = statistics.coverage.area(3) / max(statistics.coverage.area(1), 1e-12)
     if share < THIN_SHARE:
         found.append(
@@ -407,3 +409,32 @@ def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers])
                 "straight down cannot tell focal length from height, so check the flight height."
             )
     return found
+
+
+def _clock_remark(findings: Findings, statistics: Statistics) -> list[str]:
+    """Warn where the clocks of camera and receiver differ: residuals along the flight change their sign with it."""
+    gps = next((comparison for comparison in findings.comparisons() if comparison.kind == "gps"), None)
+    row = {name: i for i, name in enumerate(statistics.block.names)}
+    if gps is None:
+        return []
+    mine = [i for i, name in enumerate(gps.residuals.names) if gps.used[i] and name in row]
+    rows = np.array([row[gps.residuals.names[i]] for i in mine], dtype=int)
+    position = statistics.block.position[:, :2]
+    heading = headings(position, statistics.order)[rows]
+    if len(rows) < FEWEST_CLUSTERED or np.linalg.norm(heading.mean(0)) > 0.5:
+        return []  # with one direction of flight the lag is a common shift
+    error = gps.residuals.error_m[mine, :2]
+    along = ((error - np.median(error, axis=0)) * heading).sum(1)
+    lag_m = float(np.median(along))
+    spread = 1.4826 * float(np.median(np.abs(along - lag_m)))
+    if not abs(lag_m) > max(LAG_M, LAG_SPREADS * spread):
+        return []
+    times = np.array([photograph.time_s for photograph in statistics.photographs])[statistics.order]
+    speed = np.linalg.norm(np.diff(position[statistics.order], axis=0), axis=1) / np.diff(times).clip(1e-9)
+    seconds = abs(lag_m) / float(np.median(speed))
+    clock = f", as if the clocks of camera and receiver differed by about {seconds:.1f} s" if seconds < 60 else ""
+    return [
+        "The residuals of the positions fall into two clusters, one for each direction of flight: the receiver's "
+        f"positions are {abs(lag_m):.2f} m {'behind' if lag_m > 0 else 'ahead of'} the cameras{clock}. Flown there and "
+        "back, the error cancels; on single lines it shifts the survey."
+    ]
