@@ -3,7 +3,9 @@
 import json
 import math
 import re
+import sqlite3
 import time
+from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -420,3 +422,29 @@ def test_residuals_in_two_clusters_are_remarked_with_the_lag_of_the_clocks(tmp_p
     remarks = [remark for remark in table["tidefield"]["remarks"] if "two clusters" in remark]
     assert len(remarks) == (text is not None)
     assert text is None or (text in remarks[0] and "0.1 s" in remarks[0])
+
+
+def test_the_geopackage_has_the_same_features_in_layers_in_the_surveys_own_system(written, folder):
+    features = json.loads((folder / "survey.geojson").read_text(encoding="utf-8"))["features"]
+    with closing(sqlite3.connect(folder / "survey.gpkg")) as db:
+        db.row_factory = sqlite3.Row
+        assert db.execute("PRAGMA application_id").fetchone()[0] == int.from_bytes(b"GPKG", "big")
+        assert db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+        assert not db.execute("PRAGMA foreign_key_check").fetchall()
+        layers = {row["identifier"]: row for row in db.execute("SELECT * FROM gpkg_contents")}
+        assert set(layers) == {feature["properties"]["kind"] for feature in features}
+        for name, contents in layers.items():
+            assert contents["srs_id"] == FRAME.epsg
+            rows = db.execute(f"SELECT * FROM {contents['table_name']}").fetchall()
+            places = [shapely.from_wkb(row["geom"][8:]) for row in rows]
+            assert {row["geom"][:8] for row in rows} == {b"GP\0\x01" + FRAME.epsg.to_bytes(4, "little")}
+            np.testing.assert_allclose(shapely.total_bounds(places), list(contents)[5:9])
+            mine = [feature for feature in features if feature["properties"]["kind"] == name]
+            assert [{"kind": name, **dict(zip(row.keys()[2:], row[2:], strict=True))} for row in rows] == [
+                feature["properties"] for feature in mine
+            ]
+            for place, feature in zip(places, mine, strict=True):
+                xy = shapely.get_coordinates(place)
+                degrees = shapely.get_coordinates(shapely.geometry.shape(feature["geometry"]))
+                world = FRAME.from_geographic(np.c_[degrees, np.zeros(len(degrees))])
+                np.testing.assert_allclose(FRAME.from_crs(np.c_[xy, np.zeros(len(xy))])[:, :2], world[:, :2], atol=2e-3)
