@@ -78,3 +78,33 @@ def test_a_damaged_file_is_an_error(tmp_path, change):
     path.write_text(change(path.read_text()))
     with pytest.raises(SceneError, match=r"is damaged|holds a list|has \w+ = "):
         read_georeference(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("world_from_model", "scale"), math.nan),
+        (("world_from_model", "scale"), 0),
+        (("world_from_model", "scale"), 10**400),
+        (("world_from_model", "translation"), [math.inf, 0, 0]),
+        (("frame", "origin", "latitude_deg"), 1e9),
+        (("frame", "origin", "height_m"), math.nan),
+        (("frame", "crs"), "EPSG:32600"),
+    ],
+)
+def test_impossible_values_are_errors(tmp_path, keys, value):
+    FOUND.write(tmp_path)
+    values = json.loads((tmp_path / FILE_NAME).read_text())
+    place = values
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    (tmp_path / FILE_NAME).write_text(json.dumps(values))
+    with pytest.raises(SceneError, match="is damaged"):
+        read_georeference(tmp_path)
+
+
+def test_nesting_without_end_is_an_error(tmp_path):
+    (tmp_path / FILE_NAME).write_text("[" * 100_000)
+    with pytest.raises(SceneError, match="is damaged"):
+        read_georeference(tmp_path)

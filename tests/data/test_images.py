@@ -205,3 +205,19 @@ def test_without_a_chosen_cache_folder_the_systems_own_is_used(tmp_path: Path, m
         folder = images._cache_folder()
         assert folder.is_relative_to(tmp_path)
         assert "tidefield" in folder.parts
+
+
+def test_without_a_home_folder_photographs_are_held_in_memory(
+    files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    def has_no_home(*_: object, **__: object) -> Path:
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    for folder in (has_no_home, lambda *_, **__: Path("~/.cache/tidefield")):  # of platformdirs from 4.5, and before
+        monkeypatch.setattr(images, "user_cache_path", folder)
+        assert len(open_photographs(files, (1.0, 1.0, 1.0))) == len(files)
+    assert ["no home folder" in record.message for record in caplog.records] == [True, True]
+    assert sorted(tmp_path.iterdir()) == before

@@ -10,7 +10,7 @@ import textured_wall as wall
 from located_surveys import unlocated_photograph
 from PIL import Image
 
-from tidefield.errors import DeviceError
+from tidefield.errors import DeviceError, RunError
 from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, initial_camera, lens_groups
 from tidefield.survey.survey import LensPrior, Photograph
 
@@ -94,3 +94,17 @@ def test_an_unsupported_device_is_an_error():
     assert choose_device("cpu") == pycolmap.Device.cpu
     with pytest.raises(DeviceError, match="expected one of auto, cpu"):
         choose_device("mps")
+
+
+@pytest.mark.parametrize("value", [0, -5, 99, 10**12])
+def test_options_out_of_their_range_are_refused(value: int):
+    with pytest.raises(RunError, match=f"--features is {value}: expected a number from 100 to 50000"):
+        FeatureOptions(count=value)
+    with pytest.raises(RunError, match=f"--feature-width is {value}:"):
+        FeatureOptions(side_px=value)
+
+
+def test_a_strip_of_one_pixel_has_no_features(tmp_path: Path):
+    Image.new("RGB", (20_000, 1)).save(tmp_path / "strip.png")
+    strip = replace(unlocated_photograph(0, None), path=tmp_path / "strip.png", width=20_000, height=1)
+    assert extract([strip], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None) == 0

@@ -149,7 +149,7 @@ def test_another_encoding_and_a_missing_file_are_errors(tmp_path):
     survey_folder(tmp_path)
     (tmp_path / "gcp_list.txt").write_bytes((UTM + "\n" + line(0, (1, 2), "Süd.jpg A")).encode("utf-16"))
     with pytest.raises(SurveyError, match=r"gcp_list.txt is not in UTF-8"):
-        read_survey(tmp_path)
+        read_survey(tmp_path, control=tmp_path / "gcp_list.txt")
     with pytest.raises(SurveyError, match=r"none.txt cannot be read"):
         read_survey(tmp_path, control=tmp_path / "none.txt")
 
@@ -195,3 +195,16 @@ def test_the_system_that_fits_is_named(crs, x, y, expected):
 
 def test_coordinates_outside_of_the_domain_of_a_system_are_refused():
     assert "nowhere near the photographs" in refusal("EPSG:27700", 1e12, 1e12)
+
+
+@pytest.mark.parametrize("text", ["EPSG:27700\n576640 5188050 183 1 2 DJI_0000.JPG A\n", "EPSG:32615\nhello\n", ""])
+def test_control_that_does_not_fit_is_refused_if_it_was_asked_for_and_else_remarked(tmp_path: Path, text: str):
+    survey_folder(tmp_path)
+    (tmp_path / "gcp_list.txt").write_text(text)
+    with pytest.raises(SurveyError):
+        read_survey(tmp_path, control=tmp_path / "gcp_list.txt")
+    survey = read_survey(tmp_path)
+    assert survey.control is None
+    (remark,) = survey.remarks
+    assert "--no-control" in remark
+    assert read_survey(tmp_path, find_control=False).remarks == ()

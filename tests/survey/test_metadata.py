@@ -1,11 +1,15 @@
 """The metadata of cameras and drones is read with its units and signs."""
 
 import math
+import time
 
 import pytest
 from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, survey_folder, xmp
 from PIL.ExifTags import GPS, Base
 
+from tidefield.data.exif import Exif
+from tidefield.survey.io.lens_prior import lens_prior
+from tidefield.survey.io.metadata import PhotographMetadata, read_xmp
 from tidefield.survey.io.photographs import read_survey
 
 
@@ -190,3 +194,32 @@ def test_png_and_tiff_have_exif_too(tmp_path):
         assert (read.camera, read.orientation, read.width) == ("DJI", 8, 48)
         assert read.position is not None
         assert read.position.latitude_deg == pytest.approx(BRIGHTON[0])
+
+
+@pytest.mark.parametrize("value", [1e308, 1e-308, 5e-324])
+def test_extreme_numbers_in_exif_give_no_lens(value: float):
+    """Doubles of a TIFF may be as large as any."""
+    tags = dict.fromkeys((Base.FNumber, Base.ExposureTime, Base.FocalLength, Base.FocalLengthIn35mmFilm), value)
+    resolution = {Base.FocalPlaneXResolution: value, Base.ExifImageWidth: value, Base.ExifImageHeight: value}
+    assert all(map(math.isfinite, Exif(tags, {}).log_exposure_terms[::2]))
+    for exif_tags in (tags, tags | resolution, resolution):
+        prior = lens_prior(PhotographMetadata(Exif(exif_tags, {}), {}), 4000, 3000, 1)
+        assert prior is None or 800 < prior.focal_px < 120_000
+
+
+def test_a_distortion_beyond_all_lenses_is_ignored():
+    dewarp = {"DewarpData": "2023-01-01;3000,3000,0,0,1e300,-1e300,0,0,0"}
+    prior = lens_prior(PhotographMetadata(Exif({}, {}), dewarp), 4000, 3000, 1)
+    assert prior is not None
+    assert (prior.focal_px, prior.distortion) == (3000, None)
+
+
+def test_descriptions_in_descriptions_are_read_in_linear_time():
+    rdf = '<x xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" xmlns:a="a">'
+    deep = "<rdf:Description><a:b>" * 8000 + "</a:b></rdf:Description>" * 8000
+    name = f"a:{'n' * 100_000}"
+    many = f"<{name}><a:c>1</a:c>{'<a:d>1</a:d>' * 20_000}</{name}>"
+    start = time.process_time()
+    read_xmp(f"{rdf}{deep}</x>")
+    assert len(str(read_xmp(f"{rdf}<rdf:Description>{many}</rdf:Description></x>"))) < 1000
+    assert time.process_time() - start < 2

@@ -140,3 +140,20 @@ def test_the_first_of_several_pictures_in_a_file_is_the_photograph(tmp_path):
     pictures = [Image.new("RGB", size) for size in ((80, 60), (40, 30))]
     pictures[0].save(tmp_path / "m.jpg", format="MPO", save_all=True, append_images=pictures[1:])
     assert (named(read_survey(tmp_path), "m.jpg").width) == 80
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_a_pipe_among_photographs_is_left_out_and_not_waited_for(tmp_path):
+    survey_folder(tmp_path, 3)
+    os.mkfifo(tmp_path / "pipe.jpg")
+    assert any("pipe.jpg" in remark and "no regular file" in remark for remark in read_survey(tmp_path).remarks)
+
+
+def test_a_name_that_is_not_utf_8_is_refused_and_shown(tmp_path):
+    survey_folder(tmp_path, 3)
+    try:
+        (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"")
+    except OSError:
+        pytest.skip("this file system has names in Unicode only")
+    with pytest.raises(SurveyError, match=r"not UTF-8, caf\\xe9.jpg: expected .*; rename it"):
+        read_survey(tmp_path)

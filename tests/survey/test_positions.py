@@ -1,7 +1,9 @@
 """Positions are read from tables of several programs and from geo.txt; the priority of two sources holds."""
 
 import math
+import os
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -218,3 +220,31 @@ def test_a_survey_on_the_date_line_is_one_site(tmp_path):
     survey = read_survey(tmp_path)
     assert survey.remarks == ()
     assert all(photograph.position for photograph in survey.photographs)
+
+
+def test_a_stray_quotation_mark_is_an_error_with_its_line(tmp_path):
+    rows = "".join(f"{k}.jpg,54.5,-2.75,1\n" for k in range(9000))
+    text = f'name,lat,lon,height\nDJI_0001.JPG,54.5,-2.75,1\n"{rows}'
+    with pytest.raises(SurveyError, match=r"gps.csv, line 3 cannot be read .*: expected quotation marks in pairs"):
+        read_gps_file(written(tmp_path, text), NAMES)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32600", "EPSG:32700", "WGS84 UTM 0N", "IAU_2015:30100"])
+def test_a_system_without_a_way_to_wgs_84_is_refused(tmp_path, crs):
+    with pytest.raises(SurveyError, match="expected a projected or geographic coordinate reference system"):
+        read_gps_file(written(tmp_path, f"{crs}\nDJI_0001.JPG 500000 5000000 1\n", "geo.txt"), NAMES)
+
+
+def test_long_lines_take_no_longer_than_their_length(tmp_path):
+    text = "EPSG:4326\n" + "word " * 200_000 + "\nDJI_0001.JPG -2.75 54.5 1\n" + "name [" + "[" * 1_000_000
+    start = time.process_time()
+    assert list(read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)) == ["DJI_0001.JPG"]
+    assert time.process_time() - start < 2
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_positions_come_from_regular_files_only(tmp_path):
+    os.mkfifo(tmp_path / "gps.csv")
+    for path in (tmp_path / "gps.csv", Path("/dev/zero")):
+        with pytest.raises(SurveyError, match="is no regular file"):
+            read_gps_file(path, NAMES)

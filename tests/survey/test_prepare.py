@@ -1,7 +1,9 @@
 """`tidefield prepare`, from photograph files to a scene that trains."""
 
 import json
+import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +22,7 @@ from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.features import FeatureOptions
+from tidefield.survey.stages import Stages
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
 OPTIONS = FeatureOptions(count=1500)
@@ -110,6 +113,62 @@ def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends
     assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
 
 
+def test_the_originals_behind_a_linked_images_folder_stay_as_they_are(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path
+):
+    scene, mine = shutil.copytree(made[0], tmp_path / "scene"), shutil.copytree(flight.folder, tmp_path / "mine")
+    (mine / "notes.txt").write_text("mine")
+    shutil.rmtree(scene / "images")
+    (scene / "images").symlink_to(mine)
+    with pytest.raises(RunError, match="is a link to"):
+        run(mine, scene)
+    assert (mine / "notes.txt").exists()
+    assert all((mine / name).read_bytes() == (flight.folder / name).read_bytes() for name in flight.names)
+
+
+DAMAGE = {
+    "an empty database": ("prepare/database.db", "features", lambda _: b""),
+    "a database of garbage": ("prepare/database.db", "features", lambda _: b"garbage" * 999),
+    "half a database": ("prepare/database.db", "features", lambda data: data[: len(data) // 2]),
+    "half a file of frames": ("prepare/model/frames.bin", "poses", lambda data: data[: len(data) // 2]),
+    "frames of garbage": ("prepare/model/frames.bin", "poses", lambda data: data[:8] + b"x" * (len(data) - 8)),
+    "half a file of cameras": ("prepare/model/cameras.bin", "poses", lambda data: data[: len(data) // 2]),
+    "an empty file of rigs": ("prepare/model/rigs.bin", "poses", lambda _: b""),
+    "half a file of the scene's images": ("sparse/0/images.bin", "georeference", lambda data: data[: len(data) // 2]),
+    "a damaged georeference": ("georeference.json", "georeference", lambda _: b"{}"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_stage_whose_files_are_damaged_is_done_again_with_one_warning(
+    damage: str, made: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+):
+    class Again(Exception): ...
+
+    def stop(self: Stages, file: str) -> None:
+        raise Again
+
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    name, stage, change = DAMAGE[damage]
+    (scene / name).write_bytes(change((scene / name).read_bytes()))
+    stages = json.loads((scene / "prepare" / "stages.json").read_text())
+    stages[stage]["files"].append("images/stale.jpg")  # is removed first of all
+    (scene / "prepare" / "stages.json").write_text(json.dumps(stages))
+    monkeypatch.setattr(Stages, "_remove", stop)
+    with pytest.raises(Again):
+        run(made[1].survey.folder, scene)
+    (warning,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert f"what the stage {stage} wrote is damaged" in warning
+
+
+def test_a_damaged_database_makes_the_same_scene_again(made: tuple[Path, Prepared], tmp_path: Path):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    (scene / "prepare" / "database.db").write_bytes(b"")
+    run(made[1].survey.folder, scene)
+    for path in (*made[0].glob("images/*"), *made[0].glob("sparse/0/*")):
+        assert (scene / path.relative_to(made[0])).read_bytes() == path.read_bytes()
+
+
 def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import tidefield.survey.sfm.features as features
 
@@ -129,6 +188,57 @@ def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypa
     assert written == [*flight.names[:7], *flight.names[6:]]
 
 
+def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    folder, scene = shutil.copytree(flight.folder, tmp_path / "card"), shutil.copytree(made[0], tmp_path / "scene")
+    times = {name: (flight.folder / name).stat() for name in flight.names}
+    for name, state in times.items():
+        os.utime(folder / name, ns=(state.st_atime_ns, state.st_mtime_ns))
+    x, y, height = ground_flight.FRAME.to_crs(np.array([[3.0, 4.0, 0.0]]))[0]
+    rng = np.random.default_rng(0)
+    lines = [
+        f"{x + 9 * k} {y - 9 * k % 20} {height} {rng.uniform(1, 399)} {rng.uniform(1, 299)} {name} P{k}"
+        for k in range(5)
+        for name in flight.names[:6]
+    ]
+    (folder / "gcp_list.txt").write_text("\n".join([ground_flight.FRAME.crs, *lines]))
+    survey = read_survey(folder)
+    assert survey.control is not None
+    asked = replace(survey, control_was_found=False)
+    with pytest.raises(SurveyError, match="control"):
+        prepare(asked, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    prepared = prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    assert prepared.georeference.source == "GPS"
+    assert "--no-control" in prepared.georeference.notes[-1]
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 1
+    with pytest.raises(SurveyError, match="control"):
+        prepare(asked, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+
+
+def test_the_report_has_no_paths_and_no_options_that_are_off(made: tuple[Path, Prepared], tmp_path: Path):
+    from tidefield.commands.prepare import Prepare, _shown
+
+    scene, prepared = made
+    folder = prepared.survey.folder
+    survey = replace(prepared.survey, remarks=(f"Left out: {folder / 'a.jpg'} cannot be read.",))
+    options = Prepare(folder, scene, gps=tmp_path / "gps.csv", keep_all=True)
+    shown = _shown(options)
+    assert "None" not in shown.values()
+    assert "False" not in shown.values()
+    assert (shown["gps"], shown["keep all"], shown["photographs"]) == ("gps.csv", "yes", folder.name)
+    page = write_report(collect_findings(replace(prepared, survey=survey), scene, shown), scene)
+    for text in (page.read_text(encoding="utf-8"), (scene / "report.json").read_text(encoding="utf-8")):
+        assert "a.jpg cannot be read" in text
+        assert str(folder.parent) not in text
+
+
+def test_every_stage_says_when_it_starts_and_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level("INFO", "tidefield"):
+        Stages(tmp_path, 0).run("one", 0, [], lambda _: {})
+    assert [record.message for record in caplog.records] == ["one: started", "one: done in 0.0 s"]
+
+
 def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(flight: Flight, tmp_path: Path):
     folder = shutil.copytree(flight.folder, tmp_path / "both")
     other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
@@ -144,7 +254,18 @@ def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(fl
 def test_photographs_without_overlap_are_an_error(tmp_path: Path):
     for k in range(4):
         fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=k)
-    with pytest.raises(SurveyError, match="overlap"):
+    with pytest.raises(SurveyError, match=r"none of the 4 photographs fit together \(4 match no other photograph\)"):
+        run(tmp_path / "card", tmp_path / "scene")
+
+
+def test_two_photographs_that_fit_are_too_few_and_the_others_are_explained(
+    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """pycolmap keeps a model of two where none is larger."""
+    fly(tmp_path / "card", rows=1, columns=2)
+    for k in range(3):
+        fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=10 + k)
+    with pytest.raises(SurveyError, match=r"of the 5 photographs fit together \(3 match no other photograph\)"):
         run(tmp_path / "card", tmp_path / "scene")
 
 
@@ -161,6 +282,24 @@ def test_a_folder_with_other_content_is_left_alone(flight: Flight, tmp_path: Pat
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file"):
         run(flight.folder, tmp_path / "file")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize("part", [".", "prepare", "prepare/stages.json", "sparse", "images", "georeference.json"])
+def test_a_scene_that_may_not_be_read_is_one_error(part: str, made: tuple[Path, Prepared], tmp_path: Path):
+    scene, folder = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey.folder
+    parents = {path: path.stat().st_mode for path in (*folder.parents, *scene.parents) if "pytest" in str(path)}
+    for path in parents:
+        path.chmod(0o755)
+    (scene / part).chmod(0)
+    os.seteuid(54321)
+    try:
+        with pytest.raises(RunError, match=r"cannot be written \(Permission denied\): expected"):
+            run(folder, scene)
+    finally:
+        os.seteuid(0)
+        for path, mode in parents.items():
+            path.chmod(mode)
 
 
 def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: Path):

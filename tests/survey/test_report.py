@@ -3,7 +3,9 @@
 import json
 import math
 import re
+import sqlite3
 import time
+from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -264,7 +266,7 @@ def test_the_json_has_the_names_and_meanings_of_opensfm(table):
         "total_time_human": "1 h 2 min",
         "average_gsd": pytest.approx(100 * GSD),
     }
-    assert table["processing_statistics"]["area"] == pytest.approx(5 * AHEAD * 2 * ASIDE)
+    assert table["processing_statistics"]["area"] == table["tidefield"]["coverage"]["area"]
     assert table["processing_statistics"]["date"] == "04/05/2026 at 12:30:00"
     assert table["processing_statistics"]["steps_times"]["Total Time"] == 3775.0
     lens = table["camera_errors"]["Maker Drone"]
@@ -407,3 +409,42 @@ def test_numbers_become_plain_python_and_durations_are_formatted():
         "1 h 0 min",
         "2 h 3 min",
     ]
+
+
+@pytest.mark.parametrize(("behind_m", "text"), [(0.8, "0.80 m behind"), (-0.8, "0.80 m ahead of"), (0.02, None)])
+def test_residuals_in_two_clusters_are_remarked_with_the_lag_of_the_clocks(tmp_path, behind_m, text):
+    position = flight(4, 6)
+    direction = np.repeat([1.0, -1.0, 1.0, -1.0], 6)
+    error = np.random.default_rng(0).normal((0.3, 0.2, 1.0), 0.05, (24, 3))
+    error[:, 0] += behind_m * direction
+    names = tuple(p.name for p in findings(position).survey.photographs)
+    _, table = report(findings(position, georeference=located(gps=Residuals(names, error))), tmp_path)
+    remarks = [remark for remark in table["tidefield"]["remarks"] if "two clusters" in remark]
+    assert len(remarks) == (text is not None)
+    assert text is None or (text in remarks[0] and "0.1 s" in remarks[0])
+
+
+def test_the_geopackage_has_the_same_features_in_layers_in_the_surveys_own_system(written, folder):
+    features = json.loads((folder / "survey.geojson").read_text(encoding="utf-8"))["features"]
+    with closing(sqlite3.connect(folder / "survey.gpkg")) as db:
+        db.row_factory = sqlite3.Row
+        assert db.execute("PRAGMA application_id").fetchone()[0] == int.from_bytes(b"GPKG", "big")
+        assert db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+        assert not db.execute("PRAGMA foreign_key_check").fetchall()
+        layers = {row["identifier"]: row for row in db.execute("SELECT * FROM gpkg_contents")}
+        assert set(layers) == {feature["properties"]["kind"] for feature in features}
+        for name, contents in layers.items():
+            assert contents["srs_id"] == FRAME.epsg
+            rows = db.execute(f"SELECT * FROM {contents['table_name']}").fetchall()
+            places = [shapely.from_wkb(row["geom"][8:]) for row in rows]
+            assert {row["geom"][:8] for row in rows} == {b"GP\0\x01" + FRAME.epsg.to_bytes(4, "little")}
+            np.testing.assert_allclose(shapely.total_bounds(places), list(contents)[5:9])
+            mine = [feature for feature in features if feature["properties"]["kind"] == name]
+            assert [{"kind": name, **dict(zip(row.keys()[2:], row[2:], strict=True))} for row in rows] == [
+                feature["properties"] for feature in mine
+            ]
+            for place, feature in zip(places, mine, strict=True):
+                xy = shapely.get_coordinates(place)
+                degrees = shapely.get_coordinates(shapely.geometry.shape(feature["geometry"]))
+                world = FRAME.from_geographic(np.c_[degrees, np.zeros(len(degrees))])
+                np.testing.assert_allclose(FRAME.from_crs(np.c_[xy, np.zeros(len(xy))])[:, :2], world[:, :2], atol=2e-3)

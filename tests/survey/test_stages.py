@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.survey.prepare import Facts, Stages
 from tidefield.survey.sfm.matching import interruptible
+from tidefield.survey.stages import Facts, Stages
 
 
 class Pipeline:
@@ -67,9 +67,9 @@ def test_a_stage_can_be_repeated_on_request(pipeline: Pipeline):
     assert pipeline.run(redo="two") == ["two", "three"]
 
 
-def test_a_removed_output_is_made_again(pipeline: Pipeline):
+def test_a_removed_output_is_made_again_with_all_that_follows(pipeline: Pipeline):
     (pipeline.folder / "two.txt").unlink()
-    assert pipeline.run() == ["two"]
+    assert pipeline.run() == ["two", "three"]
 
 
 def test_an_interrupted_stage_continues_and_its_times_add_up(tmp_path: Path):
@@ -87,10 +87,90 @@ def test_an_interrupted_stage_continues_and_its_times_add_up(tmp_path: Path):
 
 
 def test_a_damaged_record_is_an_error(tmp_path: Path):
-    for text in ("{", "[]", json.dumps({"one": 3})):
+    for text in ("{", "[]", "[" * 100_000):
         (tmp_path / "stages.json").write_text(text)
         with pytest.raises(RunError, match="remove"):
             Stages(tmp_path, 0)
+
+
+@pytest.mark.parametrize(
+    "record", [3, {"seconds": "x"}, {"seconds": 1e999}, {"facts": []}, {"done": 1}, {"files": [1]}, {"files": None}]
+)
+def test_a_stage_whose_record_has_another_form_is_done_again_with_one_warning(
+    record: object, pipeline: Pipeline, caplog: pytest.LogCaptureFixture
+):
+    records = json.loads((pipeline.folder / "stages.json").read_text())
+    records["two"] = {**records["two"], **record} if isinstance(record, dict) else record
+    (pipeline.folder / "stages.json").write_text(json.dumps(records))
+    assert pipeline.run() == ["two", "three"]
+    assert len(caplog.records) == 1
+
+
+def test_a_stage_whose_result_cannot_be_read_is_done_again_with_one_warning(
+    pipeline: Pipeline, caplog: pytest.LogCaptureFixture
+):
+    records = json.loads((pipeline.folder / "stages.json").read_text())
+    records["one"]["facts"] = {"colour": 3}
+    (pipeline.folder / "stages.json").write_text(json.dumps(records))
+    resumed: list[bool] = []
+
+    def job(resume: bool) -> Facts:
+        resumed.append(resume)
+        return {"name": "one"}
+
+    stages = Stages(pipeline.folder, "photographs")
+    assert stages.run("one", 0, [], job, lambda facts: facts["name"]) == "one"
+    assert resumed == [False]
+    assert len(caplog.records) == 1
+
+
+def write_some(folder: Path, *names: str) -> None:
+    """Run a stage of another key for other names, which writes files of these names."""
+
+    def job(_: bool) -> Facts:
+        for name in names:
+            (folder.parent / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder.parent / name).write_text("ours")
+        return {}
+
+    Stages(folder, 0).run("one", names, [folder.parent / name for name in names], job)
+
+
+def test_only_files_that_the_stage_wrote_before_are_removed(tmp_path: Path):
+    write_some(tmp_path / "prepare", "images/a.jpg", "images/old/b.jpg")
+    (tmp_path / "images" / "notes.txt").write_text("mine")
+    write_some(tmp_path / "prepare", "images/a.jpg")
+    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["a.jpg", "notes.txt"]
+
+
+@pytest.mark.parametrize("outside", ["../mine.txt", "{}/mine.txt", "link/mine.txt", "prepare/../../mine.txt", "."])
+def test_nothing_outside_of_the_scene_is_removed_whatever_the_record_says(outside: str, tmp_path: Path):
+    scene, mine = tmp_path / "scene", tmp_path / "mine.txt"
+    write_some(scene / "prepare", "images/a.jpg")
+    mine.write_text("mine")
+    (scene / "link").symlink_to(tmp_path)
+    file = scene / "prepare" / "stages.json"
+    file.write_text(file.read_text().replace("images/a.jpg", outside.format(tmp_path.as_posix())))
+    write_some(scene / "prepare", "images/b.jpg")
+    assert mine.read_text() == "mine"
+    assert (scene / "images" / "a.jpg").exists()
+
+
+@pytest.mark.parametrize("link", ["images", "sparse", "prepare", "images/card", "sparse/0", "prepare/database.db"])
+def test_a_link_among_the_folders_of_a_scene_is_refused(link: str, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "scene" / link).parent.mkdir(parents=True)
+    (tmp_path / "scene" / link).symlink_to(tmp_path / "mine")
+    with pytest.raises(RunError, match=r"is a link to .*: expected .*; remove the link"):
+        Stages(tmp_path / "scene" / "prepare", 0)
+    assert not any((tmp_path / "mine").iterdir())
+
+
+def test_a_scene_may_lie_behind_a_link_itself(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "scene").symlink_to(tmp_path / "disk")
+    write_some(tmp_path / "scene" / "prepare", "images/a.jpg")
+    assert (tmp_path / "disk" / "images" / "a.jpg").exists()
 
 
 def test_a_long_job_can_be_interrupted():

@@ -86,13 +86,11 @@ def test_tiffs_stay_tiffs(tmp_path: Path):
         np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
 
 
-def test_files_of_an_earlier_run_are_removed(photographs, tmp_path: Path):
-    (tmp_path / "images" / "old").mkdir(parents=True)
-    (tmp_path / "images" / "old" / "gone.jpg").write_bytes(b"x")
+def test_other_files_in_the_folder_stay(photographs, tmp_path: Path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "notes.txt").write_bytes(b"mine")
     write_images(photographs, tmp_path / "images", None, LENSES, quiet)
-    found = {path.relative_to(tmp_path / "images").as_posix() for path in (tmp_path / "images").rglob("*.*")}
-    assert found == {photograph.name for photograph in photographs}
-    assert not (tmp_path / "images" / "old").exists()
+    assert (tmp_path / "images" / "notes.txt").read_bytes() == b"mine"
 
 
 def test_interpolated_angles_equal_the_lens_model():

@@ -80,9 +80,9 @@ def make_settings(
     from tidefield.compare.run import Settings
     from tidefield.device import choose_device
 
-    budget = budget.checked()
+    budget, seed = budget.checked(), checked_seed(seed)
     return Settings(
-        budget.minutes, budget.steps, width, str(choose_device(device)), checked_seed(seed), preset=preset, from_scratch=from_scratch
+        budget.minutes, budget.steps, width, str(choose_device(device)), seed, preset=preset, from_scratch=from_scratch
     )
 
 

@@ -37,7 +37,9 @@ def import_project(options: Import, console: Console) -> None:
     from tidefield.data.scene import every_eighth
     from tidefield.progress import ProgressBar
     from tidefield.survey import import_project as importing
+    from tidefield.survey.sfm.features import set_up_pycolmap
 
+    set_up_pycolmap(options.verbosity.verbose)
     with ProgressBar(console, "Copying photographs") as bar:
         model, located = importing.import_project(
             options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=bar

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Verbosity
 from tidefield.errors import RunError
+from tidefield.files import writing_to
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,9 +42,9 @@ class Prepare:
     colour: Literal["auto", "on", "off"] = "auto"
     """Correct exposures and the lens' falloff: where it helps, always, or never."""
     features: int = 6000
-    """Most features to find in a photograph."""
+    """Most features to find in a photograph: 100 to 50000."""
     feature_width: int = 2400
-    """Longer side in pixels to which larger photographs are reduced to find features."""
+    """Longer side in pixels to which larger photographs are reduced to find features: 100 to 50000."""
     redo: str | None = None
     """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
@@ -52,34 +53,30 @@ class Prepare:
 
 def prepare(options: Prepare, console: Console) -> None:
     """Run `tidefield prepare`."""
-    import pycolmap
-
     from tidefield.survey.io.photographs import read_survey
     from tidefield.survey.prepare import prepare as prepare_scene
     from tidefield.survey.report import collect_findings, write_report
-    from tidefield.survey.sfm.features import FeatureOptions, choose_device
+    from tidefield.survey.sfm.features import FeatureOptions, choose_device, set_up_pycolmap
 
     if options.control is not None and options.no_control:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
-    survey = read_survey(options.photographs, options.gps, options.control)
-    # pycolmap logs every step of structure from motion.
-    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if options.verbosity.verbose else pycolmap.logging.ERROR)
-    if options.no_control:
-        survey = replace(survey, control=None)
+    set_up_pycolmap(options.verbosity.verbose)
+    features = FeatureOptions(options.feature_width, options.features)
+    survey = read_survey(options.photographs, options.gps, options.control, find_control=not options.no_control)
     for remark in survey.remarks:
         log.warning(remark)
     prepared = prepare_scene(
         survey,
         options.scene,
-        FeatureOptions(options.feature_width, options.features),
+        features,
         choose_device(options.device),
         console,
         keep_all=options.keep_all,
         colour=options.colour,
         redo=options.redo,
     )
-    given = {name: str(value) for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
-    page = write_report(collect_findings(prepared, options.scene, given), options.scene)
+    with writing_to(options.scene):
+        page = write_report(collect_findings(prepared, options.scene, _shown(options)), options.scene)
     missing = len(survey.photographs) - len(prepared.models[0])
     reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
     console.print(
@@ -87,3 +84,17 @@ def prepare(options: Prepare, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _shown(options: Prepare) -> dict[str, str]:
+    """The options that the report shows: those that are on, and of paths their names, as a report is sent on."""
+    given = {name: value for name, value in vars(options).items() if name not in ("scene", "verbosity", "redo")}
+    return {
+        name.replace("_", " "): "yes"
+        if value is True
+        else value.resolve().name
+        if isinstance(value, Path)
+        else str(value)
+        for name, value in given.items()
+        if value is not None and value is not False
+    }

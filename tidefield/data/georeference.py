@@ -177,16 +177,19 @@ def _from_json(values: dict[str, Any], path: Path) -> Georeference:
     if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
     similarity = values["world_from_model"]
+    world_from_model = Similarity(
+        number(similarity, "scale", path),
+        numbers(similarity, "rotation", path, (3, 3)),
+        numbers(similarity, "translation", path, (3,)),
+    )
+    if world_from_model.scale <= 0:
+        raise ValueError("the scale of its similarity is not positive")
     residuals = {kind: Residuals.from_json(values["residuals"][kind]) for kind in ("gps", "control", "check")}
     return Georeference(
         frame=None if values["frame"] is None else LocalFrame.from_json(values["frame"]),
         source=values["source"],
-        world_from_model=Similarity(
-            number(similarity, "scale", path),
-            numbers(similarity, "rotation", path, (3, 3)),
-            numbers(similarity, "translation", path, (3,)),
-        ),
-        left_out=tuple(LeftOut(item["kind"], item["name"], item["reason"]) for item in values["left_out"]),
+        world_from_model=world_from_model,
+        left_out=tuple(LeftOut(item["kind"], str(item["name"]), str(item["reason"])) for item in values["left_out"]),
         notes=tuple(str(note) for note in values["notes"]),
         **residuals,
     )

@@ -122,7 +122,14 @@ def open_photographs(
     Raises:
         SceneError: a photograph cannot be decoded completely, or the disk is full.
     """
-    store = (cache or _cache_folder()) / f"{_key(files, background_rgb)}.photographs"
+    folder = cache or _cache_folder()
+    if folder is None:
+        _log.warning(
+            "this user has no home folder for a cache: photographs are held in memory and decoded again next time; "
+            "set XDG_CACHE_HOME to a writable folder"
+        )
+        return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
+    store = folder / f"{_key(files, background_rgb)}.photographs"
     expected = sum(file.bytes for file in files)
     try:
         store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -155,10 +162,19 @@ def open_photographs(
     return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
 
 
-def _cache_folder() -> Path:
-    """$XDG_CACHE_HOME/tidefield on every system, or else the system's own folder for caches."""
+def _cache_folder() -> Path | None:
+    """$XDG_CACHE_HOME/tidefield on every system, or else the system's own folder for caches.
+
+    None where the system knows no home folder of this user, as in containers.
+    """
     chosen = os.environ.get("XDG_CACHE_HOME")
-    return Path(chosen) / "tidefield" if chosen else user_cache_path("tidefield", appauthor=False)
+    if chosen:
+        return Path(chosen) / "tidefield"
+    try:
+        folder = user_cache_path("tidefield", appauthor=False)
+    except RuntimeError:
+        return None
+    return folder if folder.is_absolute() else None  # platformdirs before 4.5 returns "~/.cache"
 
 
 def _refuse_shared(folder: Path) -> None:

@@ -16,7 +16,7 @@ Longitude, easting and x come before latitude, northing and y, whatever a system
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -125,6 +125,8 @@ class LocalFrame:
     def from_json(cls, values: dict) -> LocalFrame:
         """Read the values of `to_json`. Raises KeyError, TypeError or ValueError if they are incomplete or wrong."""
         origin = [float(values["origin"][key]) for key in _ORIGIN]
+        if not np.isfinite(origin).all() or abs(origin[0]) > 360 or abs(origin[1]) > 90:
+            raise ValueError(f"the origin {origin} is not on the Earth")
         parse_crs(values["crs"])
         return cls(*origin, crs=str(values["crs"]), vertical_datum=str(values["vertical_datum"]))
 
@@ -196,11 +198,12 @@ class LocalFrame:
         return result
 
 
+@lru_cache
 def parse_crs(text: str) -> CRS:
     """Parse a projected or geographic coordinate reference system, with or without a vertical one.
 
     Raises:
-        ValueError: the text is none.
+        ValueError: the text is none, or one that cannot be transformed to WGS 84, such as those of the Moon.
     """
     try:
         crs = CRS.from_user_input(text)
@@ -209,6 +212,10 @@ def parse_crs(text: str) -> CRS:
     base = _base(crs)
     if not (base.is_projected or base.is_geographic) or base.geodetic_crs is None:
         raise ValueError(f"{text!r} ({crs.name}) is neither projected nor geographic")
+    try:
+        Transformer.from_crs(_horizontal(crs), WGS84, always_xy=True)
+    except ProjError as error:
+        raise ValueError(f"{text!r} ({crs.name}) cannot be transformed to WGS 84") from error
     return crs
 
 

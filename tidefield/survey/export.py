@@ -37,7 +37,7 @@ def write_images(
     cameras: Sequence[pycolmap.Camera],
     progress: Progress,
 ) -> None:
-    """Write photographs into a folder under their names, and remove everything else from it.
+    """Write photographs into a folder under their names.
 
     A file that needs no change is copied byte for byte.
 
@@ -46,12 +46,6 @@ def write_images(
         cameras: of each photograph; photographs of one lens share the object.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = {folder / photograph.name for photograph in photographs}
-    for path in sorted(folder.rglob("*"), reverse=True):
-        if path.is_file() and path not in wanted:
-            path.unlink()
-        elif path.is_dir() and not any(path.iterdir()):
-            path.rmdir()
     if correction is not None and not correction.helps:
         correction = None
     has_falloff = correction is not None and correction.sees_falloff

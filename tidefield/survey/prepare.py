@@ -1,20 +1,11 @@
-"""Make a Scene on disk from a survey: one stage after the other, with files between them.
-
-SCENE/prepare contains the intermediate files, and the state of the stages in `stages.json`: the result of each, and a
-key, which is a digest of its options and of the key of the stage before it, so that a changed option repeats that stage
-and all that follow. The names of the stages, their options and the keys of their results are a file format: a change
-makes earlier scenes start again.
-"""
+"""Make a Scene on disk from a survey: one stage after the other, with files between them in SCENE/prepare."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,97 +15,28 @@ from rich.console import Console
 
 from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.load import load_scene
-from tidefield.errors import RunError
-from tidefield.files import write_json, writing_to
+from tidefield.errors import RunError, SurveyError
+from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import write_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
 from tidefield.survey.quality.measures import Measures
-from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract
+from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract, is_database
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
+from tidefield.survey.sfm.model_files import model_files, read_model, write_model
+from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
 
 log = logging.getLogger(__name__)
 
-Facts = dict[str, Any]
-"""Result of a stage, as JSON."""
 COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
 STAGES = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
 """In their order."""
-
-
-class Stages:
-    """The stages of one working folder and their state.
-
-    Args:
-        folder: contains `stages.json` and the stages' files; created if it does not exist.
-        source: what the first stage depends on (any JSON).
-        redo: name of a stage to repeat, with all that follow, even if nothing has changed.
-
-    Attributes:
-        seconds: run time of each stage, including interrupted attempts.
-
-    Raises:
-        RunError: the folder cannot be written to, or `stages.json` is damaged.
-    """
-
-    def __init__(self, folder: Path, source: object, redo: str | None = None) -> None:
-        with writing_to(folder.parent):
-            folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._file = folder, folder / "stages.json"
-        self._records: dict[str, Facts] = {}
-        if self._file.exists():
-            try:
-                self._records = json.loads(self._file.read_text(encoding="utf-8"))
-                if not isinstance(self._records, dict) or not all(isinstance(r, dict) for r in self._records.values()):
-                    raise ValueError("no table of stages")
-            except ValueError as error:
-                raise RunError(
-                    f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {folder} to start "
-                    "again"
-                ) from error
-        self._key, self._redo, self._is_redoing = _digest(source), redo, False
-        self.seconds: dict[str, float] = {}
-
-    def run(self, name: str, options: object, outputs: Sequence[Path], job: Callable[[bool], Facts]) -> Facts:
-        """Run a stage unless it is complete.
-
-        Args:
-            options: everything its result depends on, besides the previous stages (any JSON).
-            outputs: files or folders that must exist for the stage to count as complete.
-            job: runs the stage; called with whether an interrupted attempt with the same key can be continued.
-
-        Returns:
-            The job's result, of this run or of an earlier one.
-        """
-        self._key = _digest([self._key, name, options])
-        self._is_redoing = self._is_redoing or name == self._redo
-        record = self._records.get(name, {})
-        is_same = record.get("key") == self._key and not self._is_redoing
-        if is_same and record.get("done") and all(path.exists() for path in outputs):
-            self.seconds[name] = record["seconds"]
-            log.info(f"{name}: complete already")
-            return record["facts"]
-        earlier = record.get("seconds", 0.0) if is_same else 0.0
-        record = self._records[name] = {"key": self._key, "done": False, "seconds": earlier}
-        write_json(self._file, self._records)
-        start = time.monotonic()
-        try:
-            with writing_to(self._folder.parent):
-                facts = job(is_same)
-            record |= {"done": True, "facts": facts}
-        finally:
-            self.seconds[name] = record["seconds"] = earlier + time.monotonic() - start
-            write_json(self._file, self._records)
-        return facts
-
-
-def _digest(value: object) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -164,7 +86,8 @@ def prepare(
         RunError: the scene's folder contains something else, or cannot be written to.
         SurveyError: too few photographs are good, or fit together.
     """
-    _refuse_foreign(scene, survey)
+    with writing_to(scene):
+        _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
     database, model = work / "database.db", work / "model"
     if redo not in (None, *STAGES):
@@ -175,20 +98,29 @@ def prepare(
         with ProgressBar(console, "Judging photographs") as bar:
             return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
 
-    quality = stages.run("quality", {}, [], judge_quality)
-    verdicts = tuple(_verdict_from_json(verdict) for verdict in quality["verdicts"])
+    verdicts = stages.run("quality", {}, [], judge_quality, _verdicts_from_json)
     good = select_photographs(survey, verdicts, keep_all)
     names = [photograph.name for photograph in good.photographs]
 
     def extract_features(resume: bool) -> Facts:
-        if not resume:
+        if not resume or not is_database(database):
             database.unlink(missing_ok=True)
         with ProgressBar(console, "Extracting features") as bar:
             return {"features": extract(good.photographs, database, features, device, bar)}
 
-    stages.run("features", [names, asdict(features)], [database], extract_features)
-    chosen = stages.run("pairs", {}, [], lambda _: choose_pairs(good.photographs, database, console))
-    pairs = [(first, second) for first, second in chosen["pairs"]]
+    def refuse_damaged(facts: Facts) -> Facts:
+        if not is_database(database):
+            raise ValueError(f"{database.name} is no database of features")
+        return facts
+
+    stages.run("features", [names, asdict(features)], [database], extract_features, refuse_damaged)
+    pairs = stages.run(
+        "pairs",
+        {},
+        [],
+        lambda _: choose_pairs(good.photographs, database, console),
+        lambda facts: _pairs_from_json(facts, names),
+    )
 
     def match_pairs(resume: bool) -> Facts:
         if not resume:
@@ -200,34 +132,43 @@ def prepare(
         return {"agree": agree, "inliers": inliers}
 
     stages.run("matches", {}, [database], match_pairs)
-    poses = stages.run("poses", {}, [model], lambda _: estimate_poses(survey, database, model, console))
-    stages.run(
-        "georeference",
-        {"control": repr(good.control)},
-        [sparse, scene / "georeference.json"],
-        lambda _: georeference_model(good, model, sparse, console),
-    )
-    registered = set(poses["models"][0])
-    placed = [photograph for photograph in good.photographs if photograph.name in registered]
-    written = stages.run(
-        "images",
-        {"colour": colour},
-        [images, scene / "transforms.json"],
-        lambda _: write_scene(placed, scene, colour, console),
+
+    def read_poses(facts: Facts) -> tuple[list[list[str]], LensChoice]:
+        models = [[str(name) for name in model] for model in facts["models"]]
+        if registered_names(read_model(model)) != models[0] or not set(models[0]) <= set(names):
+            raise ValueError("the model has other photographs")
+        return models, _lens_from_json(facts["lens"])
+
+    models, lens = stages.run(
+        "poses", {}, model_files(model), lambda _: estimate_poses(survey, database, model, console), read_poses
     )
 
-    located = read_georeference(scene)
-    assert located is not None, "the stage `georeference` has written it"
-    return Prepared(
-        survey,
-        verdicts,
-        frozenset(names),
-        poses["models"],
-        _lens_from_json(poses["lens"]),
-        located,
-        _correction_from_json(written["evening"]),
-        stages.seconds,
+    def read_located(_: Facts) -> Georeference:
+        located = read_georeference(scene)
+        if located is None or registered_names(read_model(sparse)) != models[0]:
+            raise ValueError("the model has other photographs")
+        return located
+
+    located = stages.run(
+        "georeference",
+        {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
+        [*model_files(sparse), scene / "georeference.json"],
+        lambda _: georeference_model(good, model, sparse, console),
+        read_located,
     )
+    registered = set(models[0])
+    placed = [photograph for photograph in good.photographs if photograph.name in registered]
+    correction = stages.run(
+        "images",
+        {"colour": colour},
+        [
+            *(images / photograph.name for photograph in placed),
+            *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
+        ],
+        lambda _: write_scene(placed, scene, colour, console),
+        lambda facts: _correction_from_json(facts["evening"], len(placed)),
+    )
+    return Prepared(survey, verdicts, frozenset(names), models, lens, located, correction, stages.seconds)
 
 
 def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
@@ -247,18 +188,25 @@ def estimate_poses(survey: Survey, database: Path, folder: Path, console: Consol
     has_prior = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Choosing a lens") as bar:
         choice = choose_lens(models[0], survey.photographs, has_prior, bar)
-    folder.mkdir(exist_ok=True)
-    models[0].write_binary(folder)
+    write_model(models[0], folder)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 
 def georeference_model(good: Survey, model: Path, sparse: Path, console: Console) -> Facts:
     """Georeference the largest model; write it, and `georeference.json`, to the scene."""
-    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction = read_model(model)
     with ProgressBar(console, "Georeferencing") as bar:
-        located = georeference(reconstruction, good, bar)
-    sparse.mkdir(parents=True, exist_ok=True)
-    reconstruction.write_binary(sparse)
+        try:
+            located = georeference(reconstruction, good, bar)
+        except SurveyError as error:
+            if good.control is None or not good.control_was_found:
+                raise
+            remark = control_remark(error)
+            log.warning(remark)
+            reconstruction = read_model(model)
+            located = georeference(reconstruction, replace(good, control=None), bar)
+            located = replace(located, notes=(*located.notes, remark))
+    write_model(reconstruction, sparse)
     located.write(sparse.parents[1])
     return {}
 
@@ -268,7 +216,7 @@ def write_scene(
 ) -> Facts:
     """Write the model's photographs, at a common exposure if that helps, colour its points, write transforms.json."""
     images, sparse = scene / "images", scene / "sparse" / "0"
-    model = pycolmap.Reconstruction(sparse)
+    model = read_model(sparse)
     camera_of = {image.name: model.camera(image.camera_id) for image in map(model.image, model.reg_image_ids())}
     cameras = [camera_of[photograph.name] for photograph in photographs]
     with ProgressBar(console, "Writing photographs") as bar:
@@ -282,7 +230,7 @@ def write_scene(
             with ProgressBar(console, "Correcting exposures") as bar:
                 write_images(photographs, images, correction, cameras, bar)
     model.extract_colors_for_all_images(images)
-    model.write_binary(sparse)
+    write_model(model, sparse)
     write_transforms(scene, model, z_is_up=True, overwrite=True)
     return {"evening": _to_json(correction)}
 
@@ -323,12 +271,26 @@ def _to_json(value: Any) -> Any:
 
 
 def _nan(value: float | None) -> float:
-    return math.nan if value is None else value
+    return math.nan if value is None else float(value)
 
 
-def _verdict_from_json(facts: Facts) -> QualityDecision:
-    measures = facts["measures"] and Measures(**{name: _nan(value) for name, value in facts["measures"].items()})
-    return QualityDecision(facts["name"], measures, facts["left_out"])
+def _verdicts_from_json(facts: Facts) -> tuple[QualityDecision, ...]:
+    return tuple(
+        QualityDecision(
+            str(verdict["name"]),
+            verdict["measures"] and Measures(**{name: _nan(value) for name, value in verdict["measures"].items()}),
+            None if verdict["left_out"] is None else str(verdict["left_out"]),
+        )
+        for verdict in facts["verdicts"]
+    )
+
+
+def _pairs_from_json(facts: Facts, names: Collection[str]) -> list[tuple[str, str]]:
+    pairs = [(first, second) for first, second in facts["pairs"]]
+    unknown = {name for pair in pairs for name in pair} - set(names)
+    if unknown:
+        raise ValueError(f"there is no photograph {min(unknown)}")
+    return pairs
 
 
 def _lens_from_json(facts: Facts) -> LensChoice:
@@ -336,8 +298,8 @@ def _lens_from_json(facts: Facts) -> LensChoice:
     return LensChoice(**{**facts, "trials": trials, "heights": facts["heights"] and Heights(**facts["heights"])})
 
 
-def _correction_from_json(facts: Facts | None) -> ExposureCorrection | None:
+def _correction_from_json(facts: Facts | None, count: int) -> ExposureCorrection | None:
     if facts is None:
         return None
-    arrays = {name: np.array(facts[name], dtype=np.float64) for name in ("gain", "falloff")}
+    arrays = {name: np.array(facts[name], dtype=np.float64).reshape(count, 3) for name in ("gain", "falloff")}
     return ExposureCorrection(**{**facts, **arrays, **{k: _nan(facts[k]) for k in ("before", "gains_alone", "after")}})

@@ -132,6 +132,7 @@ class Survey:
         folder: of the photographs.
         photographs: sorted by name.
         control: ground control, or None.
+        control_was_found: next to the photographs, and not asked for: if it does not fit, there is none.
         remarks: what was skipped or is doubtful, one sentence each, for the report.
     """
 
@@ -139,3 +140,4 @@ class Survey:
     photographs: tuple[Photograph, ...]
     control: Control | None
     remarks: tuple[str, ...] = ()
+    control_was_found: bool = False

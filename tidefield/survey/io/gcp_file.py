@@ -166,7 +166,9 @@ def _fitting(crs: str, x: float, y: float, site: tuple[float, float]) -> list[st
     if f"EPSG:{parse_crs(crs).to_epsg()}" not in systems.values():
         systems[parse_crs(crs).name] = crs
     for first, second, order in ((x, y, ""), (y, x, ", with the two coordinates swapped")):
-        away = {name + order: _distance_m(parse_crs(text), first, second, site) for name, text in systems.items()}
+        away = {
+            name + order: _distance_m(CRS.from_user_input(text), first, second, site) for name, text in systems.items()
+        }
         near = sorted((name for name in away if away[name] < _FITTING_M), key=lambda name: away[name])
         if near:
             return near[:_MAX_SUGGESTIONS]

@@ -58,6 +58,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         SurveyError: the file is empty, not a JPEG, PNG or TIFF, damaged, or has more than `MAX_PIXELS` pixels.
     """
     try:
+        if path.exists() and not path.is_file():  # a named pipe would be waited for
+            raise ValueError("it is no regular file")
         with path.open("rb") as file:
             start = file.read(8)
         reader = next((reader for magic, reader in _READERS.items() if start.startswith(magic)), None)

@@ -35,6 +35,7 @@ _SENSOR_WIDTH_MM = {
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's FocalPlaneResolutionUnit; inches where it is absent
 _SENSOR_MM = (3.0, 60.0)  # longer side, from the smallest of cameras that fly to medium format
 _FOCAL_IN_WIDTHS = (0.2, 30.0)
+_MAX_DISTORTION = 100.0  # of any term; those of real lenses are below ten
 
 
 def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientation: int) -> LensPrior | None:
@@ -66,6 +67,8 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
         return None
     if prior.trusted and design_px > 0:
         prior = replace(prior, design_focal_px=design_px)
+    if prior.distortion and max(map(abs, prior.distortion)) > _MAX_DISTORTION:
+        prior = replace(prior, distortion=None)
     # From the stored image to the upright one.
     principal_px, distortion = prior.principal_px, prior.distortion
     if principal_px is not None:

@@ -26,6 +26,8 @@ _PIX4D = "http://pix4d.com/camera/1.0"
 # Packets of cameras have some kB and two levels; more is not metadata of a camera.
 _MAX_XMP_BYTES = 1_000_000
 _MAX_XMP_LEVELS = 4
+_MAX_XMP_NAME = 200
+_LISTS = tuple(f"{_RDF}{kind}/{_RDF}li" for kind in ("Bag", "Seq", "Alt"))
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,10 @@ def _collect(element: Element, prefix: str, levels: int, found: dict[str, str]) 
         if child.tag.startswith(_RDF):
             continue
         name = prefix + _name(child.tag)
-        items = [item.text or "" for item in child.iter(f"{_RDF}li")]
+        if len(name) > _MAX_XMP_NAME:
+            continue
+        # Not `child.iter`: descriptions in descriptions would be walked again for each of them.
+        items = [item.text or "" for path in _LISTS for item in child.findall(path)]
         text = ",".join(items) if items else (child.text or "")
         if text.strip():
             found.setdefault(name, text.strip())

@@ -36,7 +36,9 @@ _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
 
 
-def read_survey(folder: Path, gps: Path | None = None, control: Path | None = None) -> Survey:
+def read_survey(
+    folder: Path, gps: Path | None = None, control: Path | None = None, *, find_control: bool = True
+) -> Survey:
     """Read all photographs (JPEG, PNG, TIFF) in a folder and its sub-folders, with positions and ground control.
 
     Hidden folders, scenes (folders with a `sparse` folder or a `georeference.json`) and OpenDroneMap's results are
@@ -47,10 +49,11 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
         folder: the photographs.
         gps: a file of positions, which have priority over EXIF.
         control: a file of ground control in the format of ODM's gcp_list.txt.
+        find_control: use such a file in the folder where none is given; one that does not fit is only remarked.
 
     Raises:
         SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
-            positions or ground control cannot be parsed.
+            positions or the given ground control cannot be parsed.
     """
     paths, raws = _list_photographs(folder)
     names = [path.relative_to(folder).as_posix() for path in paths]
@@ -75,20 +78,52 @@ def read_survey(folder: Path, gps: Path | None = None, control: Path | None = No
         if names:
             remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
     located, about_positions = locate_photographs(folder, [photograph for photograph, _ in photographs], gps)
-    control = control or find_file(folder, CONTROL_FILES)
+    found = None if control or not find_control else find_file(folder, CONTROL_FILES)
     survey = Survey(folder, tuple(sorted(located, key=lambda photograph: photograph.name)), None)
-    ground, about_control = read_control(control, survey.photographs) if control else (None, [])
-    return replace(survey, control=ground, remarks=(*remarks, *about_positions, *about_control))
+    ground, about_control = None, []
+    try:
+        if file := control or found:
+            ground, about_control = read_control(file, survey.photographs)
+    except SurveyError as error:
+        if control:
+            raise
+        about_control = [control_remark(error)]
+    return replace(
+        survey,
+        control=ground,
+        control_was_found=found is not None,
+        remarks=(*remarks, *about_positions, *about_control),
+    )
+
+
+def control_remark(error: SurveyError) -> str:
+    """Say why ground control that nobody asked for is not used."""
+    return (
+        f"The ground control next to the photographs was not used: {error}. --no-control leaves it out without this "
+        "remark."
+    )
 
 
 def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
     """List the photographs, and the names of camera raw files."""
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise SurveyError(f"{folder} is {found}: expected a folder of photographs; give one")
+    try:
+        if not folder.is_dir():
+            found = "a file" if folder.exists() else "nothing"
+            raise SurveyError(f"{folder} is {found}: expected a folder of photographs; give one")
+        paths = sorted(_walk(folder))
+    except OSError as error:
+        raise SurveyError(
+            f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one"
+        ) from error
     photographs, raws, others = [], [], []
-    for path in sorted(_walk(folder)):
+    for path in paths:
         suffix = path.suffix.casefold()
+        name = os.fsencode(path.relative_to(folder))
+        if suffix in (*_PHOTOGRAPHS, *_RAWS, *_OTHER_IMAGES) and name.decode(errors="replace").encode() != name:
+            raise SurveyError(
+                f"{folder} has a photograph whose name is not UTF-8, {name.decode(errors='backslashreplace')}: "
+                "expected names that COLMAP models and JSON can hold; rename it"
+            )
         if suffix in _PHOTOGRAPHS:
             photographs.append(path)
         elif suffix in _RAWS or suffix in _OTHER_IMAGES:
@@ -106,7 +141,7 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
 
 def _walk(folder: Path) -> Iterator[Path]:
     def refuse(error: OSError) -> None:
-        raise SurveyError(f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one")
+        raise error
 
     for parent, folders, files in os.walk(folder, onerror=refuse):
         folders[:] = [

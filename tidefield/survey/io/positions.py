@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +31,7 @@ _COLUMNS = {
     "horizontal": ("accuracyhorizontal", "horizontalaccuracy", "hacc", "accuracyxy", "xyaccuracy", "sigmaxy", "stdxy"),
     "vertical": ("accuracyvertical", "verticalaccuracy", "vacc", "accuracyz", "zaccuracy", "sigmaz", "stdz"),
 }
+_MAX_TITLE = 100  # longer is no title; a search for units in megabytes of brackets would take hours
 _REQUIRED = ("name", "latitude", "longitude")
 _EXPECTED_TABLE = (
     "expected a header such as image_name,lat,lon,gps_height and one line per photograph, in degrees (WGS 84) and "
@@ -124,7 +125,7 @@ def _columns(header: str) -> tuple[dict[str, int], str]:
     found: dict[str, int] = {}
     for index, title in enumerate(header.split(separator)):
         # Metashape has "X/Longitude"; units are in brackets.
-        parts = re.sub(r"[\[(].*?[\])]", "", title.casefold()).split("/")
+        parts = re.sub(r"[\[(].*?[\])]", "", title[:_MAX_TITLE].casefold()).split("/")
         plain = [re.sub(r"[^a-z]", "", part) for part in parts]
         meaning = next((key for key, titles in _COLUMNS.items() if any(part in titles for part in plain)), None)
         if meaning is not None:
@@ -135,15 +136,14 @@ def _columns(header: str) -> tuple[dict[str, int], str]:
 def _read_table(path: Path, lines: Sequence[str], header: int, names: PhotographNames) -> dict[str, GpsRecord]:
     columns, separator = _columns(lines[header])
     found: dict[str, GpsRecord] = {}
-    rows = csv.reader(lines[header + 1 :], delimiter=separator, skipinitialspace=True)
-    for row in rows:
+    for number, row in _rows(path, lines, header, separator):
         if not any(cell.strip() for cell in row) or row[0].startswith("#"):
             continue
         cells = {key: row[index].strip() if index < len(row) else "" for key, index in columns.items()}
         name = names.find(cells["name"])
         if name is None:
             continue
-        where = f"{path}, line {header + 1 + rows.line_num}"
+        where = f"{path}, line {number}"
         numbers = {}
         for key in [key for key in columns if key != "name"]:
             # A table separated by semicolons may have decimal commas. An empty cell is unknown.
@@ -162,6 +162,22 @@ def _read_table(path: Path, lines: Sequence[str], header: int, names: Photograph
         position = Position(*degrees, height, *_positive(horizontal, vertical), "unknown", path.name)
         _add(found, name, GpsRecord(position), where)
     return found
+
+
+def _rows(path: Path, lines: Sequence[str], header: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows of a table below its header, each with the number of its last line."""
+    rows = csv.reader(lines[header + 1 :], delimiter=separator, skipinitialspace=True)
+    while True:
+        start = header + 2 + rows.line_num
+        try:
+            row = next(rows, None)
+        except csv.Error as error:
+            raise SurveyError(
+                f"{path}, line {start} cannot be read ({error}): expected quotation marks in pairs; correct the line"
+            ) from error
+        if row is None:
+            return
+        yield header + 1 + rows.line_num, row
 
 
 def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:

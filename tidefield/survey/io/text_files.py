@@ -12,6 +12,8 @@ from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import parse_crs
 
 _MAX_MEGABYTES = 50
+_MAX_WORDS = 64
+"""Of a photograph's name: each further word is one more name to look up, so that long lines would take hours."""
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
 _UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
 
@@ -53,7 +55,7 @@ class PhotographNames:
         """Split a line that begins with a photograph's name, which may have spaces, into the name and further cells."""
         joint = "\t" if "\t" in line else " "
         cells = line.split("\t") if "\t" in line else line.split()
-        for count in range(len(cells), 0, -1):
+        for count in range(min(len(cells), _MAX_WORDS), 0, -1):
             name = self.find(joint.join(cells[:count]))
             if name is not None:
                 return name, cells[count:]
@@ -78,12 +80,15 @@ def read_lines(path: Path) -> list[str]:
         SurveyError: it cannot be read, is far too large, or has another encoding.
     """
     try:
-        megabytes = path.stat().st_size / 1e6
-        if megabytes > _MAX_MEGABYTES:
+        if path.exists() and not path.is_file():
+            raise SurveyError(f"{path} is no regular file: expected a text file; give one")
+        with path.open("rb") as file:
+            content = file.read(_MAX_MEGABYTES * 1_000_000 + 1)
+        if len(content) > _MAX_MEGABYTES * 1_000_000:
             raise SurveyError(
-                f"{path} has {megabytes:.0f} MB: expected a list of at most {_MAX_MEGABYTES} MB; give the right file"
+                f"{path} has more than {_MAX_MEGABYTES} MB: expected a list of photographs; give the right file"
             )
-        return path.read_bytes().decode("utf-8-sig").splitlines()
+        return content.decode("utf-8-sig").splitlines()
     except OSError as error:
         raise SurveyError(f"{path} cannot be read ({error.strerror}): expected a text file; give one") from error
     except UnicodeDecodeError as error:

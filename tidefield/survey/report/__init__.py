@@ -11,7 +11,8 @@ from pathlib import Path
 
 from tidefield.files import completed_file
 from tidefield.survey.report.findings import Findings, UnusedPhotograph, collect_findings
-from tidefield.survey.report.numbers import geojson, numbers
+from tidefield.survey.report.geopackage import write_geopackage
+from tidefield.survey.report.numbers import geojson, numbers, projected
 from tidefield.survey.report.page import page
 from tidefield.survey.report.statistics import measure
 
@@ -19,9 +20,9 @@ __all__ = ["Findings", "UnusedPhotograph", "collect_findings", "write_report"]
 
 
 def write_report(findings: Findings, folder: Path) -> Path:
-    """Write report.html, report.json and survey.geojson into a folder, over those of an earlier run.
+    """Write report.html, report.json, survey.geojson and survey.gpkg into a folder, over those of an earlier run.
 
-    Without a georeference there is no survey.geojson.
+    Without a georeference there are no files for a GIS.
 
     Returns:
         The path of report.html.
@@ -38,8 +39,11 @@ def write_report(findings: Findings, folder: Path) -> Path:
     }
     if findings.frame:
         texts["survey.geojson"] = json.dumps(geojson(findings, statistics), allow_nan=False)
+        with completed_file(folder / "survey.gpkg", overwrite=True) as partial:
+            write_geopackage(partial, projected(findings, statistics), findings.frame, findings.date)
     else:
-        (folder / "survey.geojson").unlink(missing_ok=True)  # of an earlier run with a georeference
+        for name in ("survey.geojson", "survey.gpkg"):
+            (folder / name).unlink(missing_ok=True)  # of an earlier run with a georeference
     for name, text in texts.items():
         with completed_file(folder / name, overwrite=True) as partial:
             partial.write_text(text, encoding="utf-8")

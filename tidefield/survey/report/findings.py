@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,8 @@ from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.sfm.features import decode_name
-from tidefield.survey.sfm.mapping import lens_notes
+from tidefield.survey.sfm.mapping import FEW_FEATURES, lens_notes
+from tidefield.survey.sfm.model_files import read_model
 from tidefield.survey.survey import Survey
 
 MOST_THUMBNAILS = 24  # of each stage
@@ -151,12 +153,15 @@ def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]
     if correction is not None and math.isnan(correction.before):
         correction = None
     return Findings(
-        title=prepared.survey.folder.resolve().name,
+        title=os.fsencode(prepared.survey.folder.resolve().name).decode(errors="replace"),
         date=datetime.now(UTC),
         survey=prepared.survey,
-        reconstruction=pycolmap.Reconstruction(scene / "sparse" / "0"),
+        reconstruction=read_model(scene / "sparse" / "0"),
         georeference=prepared.georeference,
-        left_out=(*_rejected(prepared), *_unregistered(prepared, scene)),
+        left_out=tuple(
+            replace(lost, reason=_without_folder(lost.reason, prepared.survey.folder))
+            for lost in (*_rejected(prepared), *_unregistered(prepared, scene))
+        ),
         models=tuple(len(names) for names in prepared.models),
         colour=correction,
         examples=_examples(prepared, scene, correction) if correction and correction.helps else (),
@@ -167,8 +172,16 @@ def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]
             "pycolmap": pycolmap.__version__,
             "Python": platform.python_version(),
         },
-        remarks=(*prepared.georeference.notes, *lens_notes(prepared.lens), *prepared.survey.remarks),
+        remarks=tuple(
+            _without_folder(remark, prepared.survey.folder)
+            for remark in (*prepared.georeference.notes, *lens_notes(prepared.lens), *prepared.survey.remarks)
+        ),
     )
+
+
+def _without_folder(text: str, folder: Path) -> str:
+    """Shorten paths to names relative to the photographs' folder: a report is sent on."""
+    return text.replace(f"{folder}{os.sep}", "")
 
 
 def _rejected(prepared: Prepared) -> list[UnusedPhotograph]:
@@ -214,7 +227,7 @@ def _why(features: int, matches: list[int], model: list[str] | None) -> str:
     if model:
         where = f"{model[0]} to {model[-1]}"
         return f"matches only {len(model) - 1} others, of a place that nothing connects with the rest ({where})"
-    if features < 500:
+    if features < FEW_FEATURES:
         return f"only {features} features were found: the ground has too little texture, or the photograph is blurred"
     if not matches:
         return f"none of its {features} features match another photograph: expected overlap with at least two others"

@@ -1,4 +1,4 @@
-"""Collect the contents of report.json and of survey.geojson; names are those of OpenSfM's and ODM's stats.json.
+"""Collect the contents of report.json and of the files for a GIS; names are those of OpenSfM's and ODM's stats.json.
 
 https://github.com/mapillary/OpenSfM (opensfm/stats.py) and https://github.com/OpenDroneMap/ODM (stages/odm_report.py)
 define these names. Numbers without one are under "tidefield". Lengths are metres (model units without a georeference),
@@ -8,6 +8,7 @@ null is unknown.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -21,7 +22,8 @@ from shapely.geometry.base import BaseGeometry
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report.findings import Comparison, Findings
-from tidefield.survey.report.statistics import Statistics, unite
+from tidefield.survey.report.geopackage import Layer
+from tidefield.survey.report.statistics import Statistics, headings, unite
 
 Numbers = dict[str, Any]
 
@@ -38,6 +40,7 @@ LOW_FORWARD, LOW_SIDE = 0.6, 0.4  # the least of what flight planning asks for
 LARGE_ERROR_PX = 1.0
 FOCAL_CHANGE = 0.05
 TILT_DEG = 30.0
+FEWEST_CLUSTERED, LAG_M, LAG_SPREADS = 8, 0.1, 2.0  # positions; the least distance along the flight, also in spreads
 
 
 def numbers(findings: Findings, statistics: Statistics) -> Numbers:
@@ -60,7 +63,7 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
             "date": findings.date.strftime(_OPENSFM_TIME),
             "start_date": start,
             "end_date": end,
-            "area": np.ptp(block.position[:, :2], axis=0).prod(),  # OpenSfM's: of the cameras' bounding box
+            "area": statistics.coverage.area(1),  # as on the page; OpenSfM's is that of the cameras' bounding box
         },
         "features_statistics": {
             "detected_features": _spread(block.detected),
@@ -146,69 +149,102 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
     return plain(table)
 
 
-def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
-    """Collect cameras, their footprints, surveyed points and the outline of the area covered as features (RFC 7946).
-
-    Positions are longitude and latitude (WGS 84). They have no third coordinate, as RFC 7946 wants ellipsoidal heights
-    there; heights are properties instead.
-    """
+def layers(findings: Findings, statistics: Statistics) -> list[Layer]:
+    """Collect cameras, their footprints, surveyed points and the outline of the area covered, in the world."""
     frame, block = findings.frame, statistics.block
     assert frame is not None, "a model without a georeference has no map"
-    geographic = frame.to_geographic(block.position)
+    height_m = frame.to_geographic(block.position)[:, 2]
     rank = np.argsort(statistics.order)
-    features: list[dict[str, Any]] = []
-
-    def add(geometry: BaseGeometry, **properties: object) -> None:
-        features.append({"type": "Feature", "geometry": mapping(geometry), "properties": plain(properties)})
-
-    def on_earth(outline: BaseGeometry) -> BaseGeometry:
-        """The same outline in longitude and latitude; its orientation is kept."""
-        return shapely.transform(
-            outline, lambda xy: frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
-        )
-
-    def point(longitude_latitude_height: Float64[np.ndarray, " 3"]) -> shapely.Point:
-        return shapely.Point(longitude_latitude_height[:2].round(DECIMALS))
-
-    area_m2 = round(statistics.coverage.area(1), 2)
-    add(on_earth(unite(statistics.footprints)), kind="area covered", area_m2=area_m2)
-    for name, outline, gsd in zip(block.names, statistics.footprints, statistics.gsd, strict=True):
-        if not outline.is_empty:
-            add(on_earth(outline), kind="footprint", photograph=name, gsd_m=gsd)
-    for i, name in enumerate(block.names):
-        add(
-            point(geographic[i]),
-            kind="camera",
-            photograph=name,
-            flight_order=rank[i] + 1,
-            height_m=geographic[i, 2],
-            height_above_ground_m=statistics.height[i],
-            gsd_m=statistics.gsd[i],
-            points=statistics.observed[i],
-            reprojection_error_px=statistics.mean_px[i],
-        )
+    outlines = zip(block.names, statistics.footprints, statistics.gsd, strict=True)
+    cameras = [
+        {
+            "photograph": name,
+            "flight_order": rank[i] + 1,
+            "height_m": height_m[i],
+            "height_above_ground_m": statistics.height[i],
+            "gsd_m": statistics.gsd[i],
+            "points": statistics.observed[i],
+            "reprojection_error_px": statistics.mean_px[i],
+        }
+        for i, name in enumerate(block.names)
+    ]
+    found: dict[str, tuple[str, Sequence[tuple[BaseGeometry, Numbers]]]] = {
+        "area covered": (
+            "MULTIPOLYGON",
+            [(unite(statistics.footprints), {"area_m2": round(statistics.coverage.area(1), 2)})],
+        ),
+        "footprint": (
+            "POLYGON",
+            [(outline, {"photograph": name, "gsd_m": gsd}) for name, outline, gsd in outlines if not outline.is_empty],
+        ),
+        "camera": ("POINT", list(zip(map(shapely.Point, block.position[:, :2]), cameras, strict=True))),
+    }
     surveyed = findings.control_points()
     for comparison in (c for c in findings.comparisons() if c.kind != "gps"):
         residuals = comparison.residuals
-        for name, used, error_m in zip(residuals.names, comparison.used, residuals.error_m, strict=True):
-            given = frame.to_geographic(surveyed[name][None])[0]
-            add(
-                point(given),
-                kind=f"{comparison.kind} point",
-                name=name,
-                compared=comparison.title,
-                used=used,
-                height_m=given[2],
-                residual_east_m=error_m[0],
-                residual_north_m=error_m[1],
-                residual_up_m=error_m[2],
+        points = [
+            (
+                shapely.Point(surveyed[name][:2]),
+                {
+                    "name": name,
+                    "compared": comparison.title,
+                    "used": used,
+                    "height_m": frame.to_geographic(surveyed[name][None])[0, 2],
+                    "residual_east_m": error_m[0],
+                    "residual_north_m": error_m[1],
+                    "residual_up_m": error_m[2],
+                },
             )
+            for name, used, error_m in zip(residuals.names, comparison.used, residuals.error_m, strict=True)
+        ]
+        found[f"{comparison.kind} point"] = ("POINT", points)
+    return [
+        Layer(name, kind, [(place, plain(properties)) for place, properties in features])
+        for name, (kind, features) in found.items()
+    ]
+
+
+def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
+    """Convert the layers to features of GeoJSON (RFC 7946), in longitude and latitude (WGS 84).
+
+    They have no third coordinate, as RFC 7946 wants ellipsoidal heights there; heights are properties instead.
+    """
+    frame = findings.frame
+    assert frame is not None, "a model without a georeference has no map"
+
+    def degrees(xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        return frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
+
     return {
         "type": "FeatureCollection",
         "title": findings.title,
         "vertical_datum": frame.vertical_datum,
-        "features": features,
+        "features": [
+            {
+                "type": "Feature",
+                "geometry": mapping(shapely.transform(place, degrees)),
+                "properties": {"kind": layer.name, **properties},
+            }
+            for layer in layers(findings, statistics)
+            for place, properties in layer.features
+        ],
     }
+
+
+def projected(findings: Findings, statistics: Statistics) -> list[Layer]:
+    """Convert the layers to the survey's own coordinate reference system."""
+    frame = findings.frame
+    assert frame is not None, "a model without a georeference has no map"
+
+    def to_crs(xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        return frame.to_crs(np.c_[xy, np.zeros(len(xy))])[:, :2]
+
+    return [
+        Layer(
+            layer.name, layer.geometry, [(shapely.transform(place, to_crs), values) for place, values in layer.features]
+        )
+        for layer in layers(findings, statistics)
+    ]
 
 
 def duration(seconds: float) -> str:
@@ -382,6 +418,7 @@ def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers])
         found.append(
             "No check points were held out: the residuals of control points are those of a fit, and flatter it."
         )
+    found += _clock_remark(findings, statistics)
     share = statistics.coverage.area(3) / max(statistics.coverage.area(1), 1e-12)
     if share < THIN_SHARE:
         found.append(
@@ -407,3 +444,32 @@ def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers])
                 "straight down cannot tell focal length from height, so check the flight height."
             )
     return found
+
+
+def _clock_remark(findings: Findings, statistics: Statistics) -> list[str]:
+    """Warn where the clocks of camera and receiver differ: residuals along the flight change their sign with it."""
+    gps = next((comparison for comparison in findings.comparisons() if comparison.kind == "gps"), None)
+    row = {name: i for i, name in enumerate(statistics.block.names)}
+    if gps is None:
+        return []
+    mine = [i for i, name in enumerate(gps.residuals.names) if gps.used[i] and name in row]
+    rows = np.array([row[gps.residuals.names[i]] for i in mine], dtype=int)
+    position = statistics.block.position[:, :2]
+    heading = headings(position, statistics.order)[rows]
+    if len(rows) < FEWEST_CLUSTERED or np.linalg.norm(heading.mean(0)) > 0.5:
+        return []  # with one direction of flight the lag is a common shift
+    error = gps.residuals.error_m[mine, :2]
+    along = ((error - np.median(error, axis=0)) * heading).sum(1)
+    lag_m = float(np.median(along))
+    spread = 1.4826 * float(np.median(np.abs(along - lag_m)))
+    if not abs(lag_m) > max(LAG_M, LAG_SPREADS * spread):
+        return []
+    times = np.array([photograph.time_s for photograph in statistics.photographs])[statistics.order]
+    speed = np.linalg.norm(np.diff(position[statistics.order], axis=0), axis=1) / np.diff(times).clip(1e-9)
+    seconds = abs(lag_m) / float(np.median(speed))
+    clock = f", as if the clocks of camera and receiver differed by about {seconds:.1f} s" if seconds < 60 else ""
+    return [
+        "The residuals of the positions fall into two clusters, one for each direction of flight: the receiver's "
+        f"positions are {abs(lag_m):.2f} m {'behind' if lag_m > 0 else 'ahead of'} the cameras{clock}. Flown there and "
+        "back, the error cancels; on single lines it shifts the survey."
+    ]

@@ -175,7 +175,7 @@ def overlap(
         `Statistics.forward_overlap` and `side_overlap`.
     """
     hulls = shapely.convex_hull(np.array(footprints, dtype=object))
-    heading = _headings(position[:, :2], order)
+    heading = headings(position[:, :2], order)
     forward, side = np.full((2, len(position)), np.nan)
 
     def shared(i: int, distance: Float64[np.ndarray, " N"], among: Bool[np.ndarray, " N"]) -> float:
@@ -198,7 +198,7 @@ def overlap(
     return forward, side
 
 
-def _headings(xy: Float64[np.ndarray, "N 2"], order: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
+def headings(xy: Float64[np.ndarray, "N 2"], order: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
     """Unit vectors of the flight's heading: along the shorter leg, before or after the photograph."""
     if len(xy) < 2:
         return np.tile([[1.0, 0.0]], (len(xy), 1))

@@ -6,8 +6,11 @@ make matching slower) and reports no progress.
 
 from __future__ import annotations
 
+import sqlite3
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -17,7 +20,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
-from tidefield.errors import DeviceError
+from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
 from tidefield.survey.io.image_decoding import upright
@@ -30,14 +33,29 @@ DEFAULT_FOCAL = 1.2
 """Focal length in widths of the photograph where no prior exists: COLMAP's default."""
 
 
+OPTION_RANGE = (100, 50_000)
+"""Of the number of features, and of the side in pixels to which photographs are reduced."""
+
+
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Options of feature extraction."""
+    """Options of feature extraction.
+
+    Raises:
+        RunError: one of them is out of its range.
+    """
 
     side_px: int = 2400
     """Longer side to which larger photographs are reduced."""
     count: int = 6000
     """Maximum number of features per photograph; the largest are kept."""
+
+    def __post_init__(self) -> None:
+        for option, value in (("--features", self.count), ("--feature-width", self.side_px)):
+            if not OPTION_RANGE[0] <= value <= OPTION_RANGE[1]:
+                raise RunError(
+                    f"{option} is {value}: expected a number from {OPTION_RANGE[0]} to {OPTION_RANGE[1]}; give another"
+                )
 
 
 def choose_device(name: str) -> pycolmap.Device:
@@ -64,6 +82,17 @@ def encode_name(name: str) -> str:
 def decode_name(encoded: str) -> str:
     """Decode a photograph's name from the database."""
     return unquote(encoded)
+
+
+def is_database(path: Path) -> bool:
+    """Check that a file is a whole COLMAP database; pycolmap takes an empty file for one."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master")}
+            (verdict,) = db.execute("PRAGMA quick_check(1)").fetchone()
+        return verdict == "ok" and {"cameras", "images", "keypoints", "descriptors"} <= tables
+    except (sqlite3.Error, UnicodeError):
+        return False
 
 
 def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
@@ -117,20 +146,27 @@ def extract(
         workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
         # Only a few photographs are submitted in advance, so that memory use does not grow with their number.
         ahead = 2 * cores() + 1
-        with worker_processes(workers, _silence_pycolmap) as pool:
-            running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
-            for k, (photograph, camera_id) in enumerate(todo):
-                keypoints, descriptors = running.popleft().result()
-                if k + ahead < len(todo):
-                    running.append(pool.submit(_features, todo[k + ahead][0], options, device))
-                _write_features(db, photograph, camera_id, keypoints, descriptors)
-                progress(len(photographs) - len(todo) + k + 1, len(photographs))
+        try:
+            with worker_processes(workers, set_up_pycolmap) as pool:
+                running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
+                for k, (photograph, camera_id) in enumerate(todo):
+                    keypoints, descriptors = running.popleft().result()
+                    if k + ahead < len(todo):
+                        running.append(pool.submit(_features, todo[k + ahead][0], options, device))
+                    _write_features(db, photograph, camera_id, keypoints, descriptors)
+                    progress(len(photographs) - len(todo) + k + 1, len(photographs))
+        except BrokenProcessPool as error:
+            raise RunError(
+                "a process that finds features was killed, which happens when memory runs out: "
+                f"expected memory for {workers} photographs at a time; give fewer --features or a smaller "
+                "--feature-width, and continue with the same command"
+            ) from error
         return db.num_keypoints()
 
 
-def _silence_pycolmap() -> None:
-    """Keep the log of a worker process from mixing with the progress bar."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+def set_up_pycolmap(verbose: bool = False) -> None:
+    """Make pycolmap quiet, unless the user wants its log."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL)
 
 
 def _features(
@@ -140,7 +176,7 @@ def _features(
     grey = cv2.cvtColor(upright(photograph), cv2.COLOR_RGB2GRAY)
     scale = min(1.0, options.side_px / max(grey.shape))
     if scale < 1:
-        size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
+        size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     sift = pycolmap.FeatureExtractionOptions()
     sift.num_threads = 1

@@ -30,6 +30,8 @@ from tidefield.survey.sfm.features import decode_name
 from tidefield.survey.sfm.matching import interruptible
 from tidefield.survey.survey import Photograph, Progress
 
+FEW_FEATURES = 500
+"""Photographs with fewer features show too little texture, or are blurred."""
 MIN_PHOTOGRAPHS = 3
 """Photographs of the smallest model."""
 TERMS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
@@ -138,12 +140,30 @@ def reconstruct(database: Path, folder: Path, progress: Progress) -> list[pycolm
         for image in model.images.values():
             image.name = decode_name(image.name)
     models = sorted(found.values(), key=lambda model: -model.num_reg_images())
-    if not models:
+    large = [model for model in models if model.num_reg_images() >= MIN_PHOTOGRAPHS]
+    if not large:
+        fit = models[0].num_reg_images() if models else 0
         raise SurveyError(
-            f"none of the {count} photographs could be placed: expected photographs that overlap by half or more and "
-            "show ground with some texture; fly with more overlap, or add the photographs in between"
+            f"{fit or 'none'} of the {count} photographs fit together ({_why_so_few(database)}): expected at least "
+            f"{MIN_PHOTOGRAPHS} that overlap by half or more and show ground with some texture; fly with more overlap, "
+            "or add the photographs in between"
         )
-    return models
+    return large
+
+
+def _why_so_few(database: Path) -> str:
+    """Say what the photographs of a database lack to fit together."""
+    with pycolmap.Database.open(database) as db:
+        images = {image.image_id: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
+        pairs = zip(*db.read_two_view_geometry_num_inliers(), strict=True)
+        matched = {number for pair, inliers in pairs if inliers for number in pycolmap.pair_id_to_image_pair(pair)}
+    plain = [number for number, features in images.items() if features < FEW_FEATURES]
+    single = [number for number in images if number not in matched and number not in plain]
+    reasons = [
+        f"{len(plain)} show too little texture, with fewer than {FEW_FEATURES} features" if plain else "",
+        f"{len(single)} match no other photograph" if single else "",
+    ]
+    return " and ".join(filter(None, reasons)) or "their matches are too few, or too close to one line"
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:
