@@ -20,12 +20,13 @@ def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
     torch.testing.assert_close(read_photograph(scene, 0, uv), pixels / scene.cameras.gain[0])
 
 
-def test_reading_between_pixels_is_bilinear_and_stops_at_the_border():
+def test_reading_between_pixels_is_cubic_and_stops_at_the_border():
     scene = wall.scene(wall.cameras(2))
     image = scene.photographs[0].float() / 255
-    between = read_photograph(scene, 0, torch.tensor([[5.75, 8.0]]))[0]
-    expected = (image[7, 5] + image[8, 5]) / 2 * 0.75 + (image[7, 6] + image[8, 6]) / 2 * 0.25
-    torch.testing.assert_close(between, expected)
+    between = read_photograph(scene, 0, torch.tensor([[6.0, 7.5]]))[0]
+    torch.testing.assert_close(between, (9 * (image[7, 5] + image[7, 6]) - image[7, 4] - image[7, 7]) / 16)
+    quarter = read_photograph(scene, 0, torch.tensor([[5.75, 7.5]]))[0]
+    torch.testing.assert_close(quarter, (between + image[7, 5]) / 2)
     torch.testing.assert_close(read_photograph(scene, 0, torch.tensor([[0.1, 0.1]]))[0], image[0, 0])
 
 

@@ -17,6 +17,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras, angle_between
 from tidefield.model.rendering import Render, Rendering, fill_unseen
+from tidefield.model.views import upsample_twice
 
 VIEWS = 4
 """Photographs that `sparse_depth` blends."""
@@ -24,6 +25,8 @@ SOFTNESS_RAD = 0.02
 """Angle at which a photograph's blend weight has halved: differences in angle below it hardly matter."""
 CHUNK = 2**22
 """Photographs x pixels that `sparse_depth` handles at once, which bounds its memory to some 200 MB."""
+CUBIC_REACH_PX = 2
+"""Pixels around a position that its colour depends on."""
 DEPTHS = 64
 """Planes of `plane_sweep`."""
 WINDOW_PX = 5
@@ -35,19 +38,20 @@ USUAL_SPREAD = 0.1
 
 
 def read_photograph(scene: Scene, index: int, uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-    """Read colours of one photograph at pixels inside its frame, bilinearly, at the scene's common exposure."""
+    """Read colours of one photograph at pixels inside its frame, at the scene's common exposure.
+
+    Interpolates as our network does (`upsample_twice`), so that what is better than these baselines is not better for
+    sharper reading.
+    """
     photograph = scene.photographs[index]
-    height, width = photograph.shape[:2]
     # Only the part that is needed is turned into floats: memory follows the caller's chunk, not the photograph.
-    low = (uv_px.amin(0) - 1).long().clamp(min=0)
+    low = (uv_px.amin(0) - CUBIC_REACH_PX).long().clamp(min=0)
     left, top = low.tolist()
-    right, bottom = (uv_px.amax(0) + 2).long().tolist()
-    crop = photograph[top : min(bottom, height), left : min(right, width)].to(uv_px.device)
-    size = uv_px.new_tensor([crop.shape[1], crop.shape[0]])
-    grid = (uv_px - low) / size * 2 - 1
-    colour = F.grid_sample(
-        crop.to(uv_px.dtype).permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
-    )
+    right, bottom = (uv_px.amax(0) + CUBIC_REACH_PX + 1).long().tolist()
+    crop = photograph[top:bottom, left:right].to(uv_px.device, uv_px.dtype).permute(2, 0, 1)[None]
+    texel = 2 * (uv_px - low) - 0.5  # twice as many texels, of which the first is centred on the first pixel
+    grid = texel / uv_px.new_tensor([crop.shape[3], crop.shape[2]]) - 1
+    colour = F.grid_sample(upsample_twice(crop), grid[None, None], padding_mode="border", align_corners=False)
     return colour[0, :, 0].T / 255 / scene.cameras.gain[index].to(uv_px)
 
 
