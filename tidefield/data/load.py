@@ -23,6 +23,7 @@ from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
+from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
@@ -115,13 +116,20 @@ def load_scene(
         new_width = min(width or own.width, own.width)
         new_height = max(1, round(own.height * new_width / own.width))
         files.append(PhotographFile(path, own, new_width, new_height, has_alpha))
+    train, test = every_eighth(len(posed.names))
+    if posed.split is not None:
+        train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+    if posed.points is None or not len(posed.points.uv_px):
+        posed = replace(posed, points=find_points(posed, train, root, progress, cache) or posed.points)
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
     T_world_camera = posed.T_world_camera.copy()
     T_world_camera[:, :, 3] -= origin
     points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
+    if points is not None and len(points.uv_px):
+        points = triangulate_again(points, T_world_camera, posed.lenses, train)
     pinholes = tuple(_pinhole(file) for file in files)
     near_far = posed.near_far
-    if near_far is None:
+    if near_far is None or points is not None:
         near_far = estimate_near_far(T_world_camera, pinholes, points)
     cameras = Cameras(
         T_world_camera=_float32(T_world_camera),
@@ -132,9 +140,6 @@ def load_scene(
         gain=torch.ones(len(pinholes), 3),
     )
     sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
-    train, test = every_eighth(len(posed.names))
-    if posed.split is not None:
-        train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
     photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))

@@ -20,6 +20,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
+from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
@@ -178,16 +179,9 @@ def _features(
     if scale < 1:
         size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    sift = pycolmap.FeatureExtractionOptions()
-    sift.num_threads = 1
-    sift.sift.max_num_features = options.count
-    sift.sift.first_octave = 0
-    found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
-    keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
+    keypoints, descriptors = find_features(grey, options.count, device)
     keypoints[:, :3] *= photograph.width / grey.shape[1]
-    # The largest are the most repeatable; VLFeat returns somewhat more than the maximum.
-    largest = np.argsort(-keypoints[:, 2], kind="stable")[: options.count]
-    return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]
+    return keypoints, descriptors
 
 
 def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:

@@ -1,0 +1,32 @@
+"""SIFT features of a picture, by pycolmap (VLFeat, or its own CUDA implementation)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def find_features(
+    grey: UInt8[np.ndarray, "H W"], count: int, device: pycolmap.Device
+) -> tuple[Float32[np.ndarray, "K 4"], UInt8[np.ndarray, "K 128"]]:
+    """Extract keypoints (u, v, scale, orientation; pixels) and RootSIFT descriptors, the largest first.
+
+    Args:
+        grey: the picture; it is not enlarged first, which finds little more in sharp photographs.
+        count: the largest number of features, of which the largest are kept: they are the most repeatable.
+    """
+    import pycolmap
+
+    sift = pycolmap.FeatureExtractionOptions()
+    sift.num_threads = 1
+    sift.sift.max_num_features = count
+    sift.sift.first_octave = 0
+    found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
+    keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
+    largest = np.argsort(-keypoints[:, 2], kind="stable")[:count]  # VLFeat returns somewhat more than the maximum
+    return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]

@@ -1,0 +1,329 @@
+"""Sparse points from posed photographs: SIFT, matches near epipolar lines, COLMAP's triangulation with poses held.
+
+Photographs are matched with neighbours by position, near ones for many matches and farther ones for wide angles.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from tidefield.data.images import Progress
+from tidefield.data.readers.files import open_picture, quiet_pillow
+from tidefield.data.readers.posed import Observations, PosedPhotographs
+from tidefield.data.sift import find_features
+from tidefield.geometry.lenses import Lens
+from tidefield.machine import cores
+from tidefield.processes import worker_processes
+
+if TYPE_CHECKING:
+    import pycolmap
+
+SIDE_PX = 1600
+"""Photographs are reduced to this longer side before features are found in them."""
+FEATURES = 4096
+"""Largest number of features of a photograph; the largest are kept."""
+RANKS = (0, 1, 2, 3, 5, 7, 11, 15, 23, 31)
+"""Which of the photographs nearest to each it is matched with, by rank."""
+WIDEST_AXES_DEG = 60.0
+"""Between the viewing directions of photographs that are matched."""
+OFF_LINE = 1 / 400
+"""Of a match from its epipolar line, as a share of the longer side: poses of phones are good to some pixels."""
+MAX_RATIO, MAX_ANGLE_RAD = 0.8, 0.7
+"""Limits on the angle between matching descriptors, relative to the second nearest and absolute: COLMAP's values."""
+LEAST_ANGLE_DEG = 0.5
+"""Between the rays of a point, whose depth is otherwise a guess."""
+_STEPS = 5
+"""Of Gauss-Newton, which from the point nearest to the rays has then converged."""
+FEWEST = 100
+"""Fewer points do not tell where a scene's surface is."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Features:
+    """The K features of one photograph.
+
+    Attributes:
+        uv_px: pixels of the photograph at its lens's size.
+        xy: on the plane z = 1 of the camera, without distortion.
+        rgb: colours of the photograph there.
+        descriptors: RootSIFT, of unit length.
+    """
+
+    uv_px: Float64[np.ndarray, "K 2"]
+    xy: Float64[np.ndarray, "K 2"]
+    rgb: UInt8[np.ndarray, "K 3"]
+    descriptors: Float32[np.ndarray, "K 128"]
+
+
+def find_photograph_features(path: Path, lens: Lens) -> Features:
+    """Find the features of a photograph, but for those where it is transparent or its lens images nothing."""
+    import pycolmap
+
+    with quiet_pillow(), open_picture(path) as picture:
+        rgba = np.asarray(picture.convert("RGBA"))
+    scale = min(1.0, SIDE_PX / max(rgba.shape[:2]))
+    if scale < 1:
+        rgba = cv2.resize(rgba, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = rgba.shape[:2]
+    grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY)
+    keypoints, descriptors = find_features(grey, FEATURES, pycolmap.Device.cpu)
+    uv = keypoints[:, :2].astype(np.float64)
+    column, row = np.floor(uv).astype(int).T.clip(0, [[width - 1], [height - 1]])
+    uv *= lens.width / width, lens.height / height
+    xy = lens.unproject(uv)
+    kept = np.isfinite(xy).all(axis=1) & (rgba[row, column, 3] > 0)
+    rows = descriptors[kept].astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-6)
+    return Features(uv[kept], xy[kept], rgba[row[kept], column[kept], :3], rows)
+
+
+def neighbouring_pairs(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> list[tuple[int, int]]:
+    """Choose pairs of photographs to match: each with others near it (`RANKS`) that look in a similar direction."""
+    position, forward = T_world_camera[:, :, 3], T_world_camera[:, :, 2]
+    similar = forward @ forward.T > np.cos(np.deg2rad(WIDEST_AXES_DEG))
+    pairs = set()
+    for i in range(len(position)):
+        distance = np.linalg.norm(position - position[i], axis=1)
+        others = np.flatnonzero(similar[i] & (distance > 0))
+        nearest = others[np.argsort(distance[others], kind="stable")]
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[[rank for rank in RANKS if rank < len(nearest)]].tolist()}
+    return sorted(pairs)
+
+
+def match_along_lines(
+    first: Features,
+    second: Features,
+    T_second_first: Float64[np.ndarray, "3 4"],
+    off_line: float,
+) -> Int64[np.ndarray, "M 2"]:
+    """Match features that are each other's nearest, by Lowe's ratio test, and near the epipolar line.
+
+    With a rotation R and a translation t from the first camera to the second, x2^T [t]x R x1 = 0 (Hartley and
+    Zisserman, Multiple View Geometry, 2nd ed., eq. 9.12). The line only judges matches: looked for along it, many wrong
+    ones would be found, too, and two photographs cannot tell.
+
+    Args:
+        off_line: how far from the line a match may be, on the second camera's plane z = 1.
+    """
+    if not (len(first.xy) and len(second.xy)):
+        return np.zeros((0, 2), dtype=np.int64)
+    cosine = first.descriptors @ second.descriptors.T
+    best, rows = cosine.argmax(axis=1), np.arange(len(first.xy))
+    mutual = cosine.argmax(axis=0)[best] == rows
+    nearest = cosine[rows, best]
+    cosine[rows, best] = -1
+    angle, next_angle = (np.arccos(c.clip(-1, 1)) for c in (nearest, cosine.max(axis=1)))
+    good = mutual & (angle <= MAX_ANGLE_RAD) & (angle < MAX_RATIO * next_angle)
+    rows, best = rows[good], best[good]
+    R, (x, y, z) = T_second_first[:, :3], T_second_first[:, 3]
+    E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    line = np.column_stack([first.xy[rows], np.ones(len(rows))]) @ E.T
+    off = (line[:, :2] * second.xy[best]).sum(axis=1) + line[:, 2]
+    on_line = np.abs(off) <= off_line * np.linalg.norm(line[:, :2], axis=1)
+    return np.column_stack([rows, best])[on_line]
+
+
+def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress | None = None) -> Observations | None:
+    """Find sparse points of posed photographs, whose poses and lenses are held.
+
+    Args:
+        posed: the photographs; their own points are not read.
+        used: the photographs that may contribute.
+        progress: called with (done, all) photographs.
+
+    Returns:
+        The points, observed by the photographs used; None where there are fewer than `FEWEST`.
+    """
+    import pycolmap
+
+    paths, lenses = [posed.paths[i] for i in used], [posed.lenses[i] for i in used]
+    features: list[Features] = []
+    with worker_processes(max(1, min(cores(), len(used))), _quiet) as pool:
+        for found in pool.map(find_photograph_features, paths, lenses):
+            features.append(found)
+            if progress:
+                progress(len(features), len(used))
+    poses = posed.T_world_camera[list(used)]
+    T_camera_world = [_inverse(pose) for pose in poses]
+
+    def match(pair: tuple[int, int]) -> Int64[np.ndarray, "M 2"]:
+        i, j = pair
+        lens = lenses[j]
+        off_line = OFF_LINE * max(lens.width, lens.height) / min(lens.fx, lens.fy)
+        relative = T_camera_world[j][:, :3] @ poses[i] + np.column_stack([np.zeros((3, 3)), T_camera_world[j][:, 3]])
+        return match_along_lines(features[i], features[j], relative, off_line)
+
+    pairs = neighbouring_pairs(poses)
+    with ThreadPoolExecutor(cores()) as pool:
+        matches = list(pool.map(match, pairs))
+    with TemporaryDirectory() as folder:
+        model = _model(lenses, T_camera_world, features)
+        _write_database(Path(folder) / "database.db", model, dict(zip(pairs, matches, strict=True)))
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.extract_colors = (
+            1,
+            False,
+        )  # with one thread the same photographs give the same points
+        with _quiet_pycolmap():
+            model = pycolmap.triangulate_points(model, Path(folder) / "database.db", folder, folder, options=options)
+    points = [model.points3D[key] for key in sorted(model.points3D)]
+    if len(points) < FEWEST:
+        return None
+    seen = [(k, e.image_id - 1, e.point2D_idx) for k, point in enumerate(points) for e in point.track.elements]
+    point, image, keypoint = np.array(seen, dtype=np.int64).T
+    first = np.unique(point, return_index=True)[1]
+    return Observations(
+        xyz_world=np.array([p.xyz for p in points]),
+        point_index=point,
+        photograph_index=np.array(used, dtype=np.int64)[image],
+        uv_px=np.array([features[i].uv_px[k] for i, k in zip(image, keypoint, strict=True)]),
+        rgb=np.array([features[image[o]].rgb[keypoint[o]] for o in first], dtype=np.uint8),
+    )
+
+
+def triangulate_again(
+    points: Observations, T_world_camera: Float64[np.ndarray, "V 3 4"], lenses: Sequence[Lens], used: Sequence[int]
+) -> Observations:
+    """Place points by the observations of some photographs alone, so that nothing of the others is left in them.
+
+    The point nearest to the rays of its observations, then Gauss-Newton steps to the least squares of their
+    reprojection errors. Points with fewer than two observations, or whose rays are nearly parallel, are dropped.
+
+    Args:
+        points: with observations; where they are at first does not matter.
+        used: the photographs whose observations count, such as those that are not held out.
+    """
+    mine = np.isin(points.photograph_index, np.asarray(used))
+    point, photograph, uv = points.point_index[mine], points.photograph_index[mine], points.uv_px[mine]
+    xy, focal = np.full(uv.shape, np.nan), np.ones(len(uv))
+    for i, rows in enumerate(replace(points, photograph_index=photograph).by_photograph(len(lenses))):
+        xy[rows], focal[rows] = lenses[i].unproject(uv[rows]), (lenses[i].fx + lenses[i].fy) / 2
+    good = np.isfinite(xy).all(axis=1)
+    good &= (np.bincount(point[good], minlength=len(points.xyz_world)) >= 2)[point]
+    point, photograph, uv, xy, focal = (values[good] for values in (point, photograph, uv, xy, focal))
+    kept, point = np.unique(point, return_inverse=True)
+    R, centre = T_world_camera[photograph, :, :3], T_world_camera[photograph, :, 3]
+
+    def total(values: Float64[np.ndarray, "O *D"]) -> Float64[np.ndarray, "P *D"]:
+        """Sums over the observations of each point."""
+        flat = values.reshape(len(values), -1)
+        sums = [np.bincount(point, weights=column, minlength=len(kept)) for column in flat.T]
+        return np.stack(sums, axis=1).reshape(len(kept), *values.shape[1:])
+
+    ray = np.einsum("oij,oj->oi", R, np.column_stack([xy, np.ones(len(xy))]))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    normal = total(across)
+    # Of two rays at an angle a, the smallest eigenvalue is 1 - cos a, about a^2 / 2.
+    angle = 2 * np.sqrt(np.linalg.eigvalsh(normal)[:, 0].clip(0) / np.bincount(point, minlength=len(kept)))
+    wide = angle > np.deg2rad(LEAST_ANGLE_DEG)
+    normal[~wide] = np.eye(3)
+    xyz = np.linalg.solve(normal, total(np.einsum("oij,oj->oi", across, centre))[..., None])[..., 0]
+    for _ in range(_STEPS):
+        camera = np.einsum("oij,oi->oj", R, xyz[point] - centre)
+        z = np.where(np.abs(camera[:, 2]) > 1e-9, camera[:, 2], 1e-9)
+        projected = camera[:, :2] / z[:, None]
+        slope = (R[:, :, :2] - R[:, :, 2:] * projected[:, None]) / z[:, None, None] * focal[:, None, None]
+        error = (projected - xy) * focal[:, None]
+        normal = total(slope @ slope.transpose(0, 2, 1))
+        normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        normal[~wide] = np.eye(3)
+        xyz -= np.linalg.solve(normal, total(np.einsum("oij,oj->oi", slope, error))[..., None])[..., 0]
+    wide &= np.isfinite(xyz).all(axis=1)
+    seen = wide[point]
+    return Observations(
+        xyz_world=xyz[wide],
+        point_index=(np.cumsum(wide) - 1)[point[seen]],
+        photograph_index=photograph[seen],
+        uv_px=uv[seen],
+        rgb=None if points.rgb is None else points.rgb[kept][wide],
+    )
+
+
+def _quiet() -> None:
+    """pycolmap's log would mix with the progress bar."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+
+
+@contextmanager
+def _quiet_pycolmap() -> Iterator[None]:
+    """It warns that it finds no photographs to take colours from, which we take from the features."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    _quiet()
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _inverse(pose: Float64[np.ndarray, "3 4"]) -> Float64[np.ndarray, "3 4"]:
+    return np.column_stack([pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]])
+
+
+def _model(
+    lenses: Sequence[Lens], T_camera_world: Sequence[Float64[np.ndarray, "3 4"]], features: Sequence[Features]
+) -> pycolmap.Reconstruction:
+    """A COLMAP model of pinhole cameras, image k + 1 with camera k + 1, whose keypoints are undistorted."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number, (lens, pose, found) in enumerate(zip(lenses, T_camera_world, features, strict=True), start=1):
+        parameters = [lens.fx, lens.fy, lens.cx, lens.cy]
+        size = {"width": lens.width, "height": lens.height}
+        model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=number, model="PINHOLE", params=parameters, **size))
+        uv = found.xy * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+        image = pycolmap.Image(name=str(number), keypoints=uv, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    return model
+
+
+def _write_database(
+    path: Path, model: pycolmap.Reconstruction, matches: Mapping[tuple[int, int], Int64[np.ndarray, "M 2"]]
+) -> None:
+    """Write a model's cameras, images and keypoints, and the matches of pairs of its images, counted from 0."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        for camera in model.cameras.values():
+            db.write_camera(camera, use_camera_id=True)
+        for rig in model.rigs.values():
+            db.write_rig(rig, use_rig_id=True)
+        for number, image in sorted(model.images.items()):
+            db.write_frame(model.frames[image.frame_id], use_frame_id=True)
+            db.write_image(image, use_image_id=True)
+            db.write_keypoints(number, np.array([p.xy for p in image.points2D], dtype=np.float32).reshape(-1, 2))
+        for (i, j), found in matches.items():
+            geometry = pycolmap.TwoViewGeometry(
+                config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=found.astype(np.uint32)
+            )
+            db.write_two_view_geometry(i + 1, j + 1, geometry)
+
+
+def find_points(
+    posed: PosedPhotographs, used: Sequence[int], root: Path, progress: Progress | None, cache: Path | None
+) -> Observations | None:
+    """Triangulate points, or read those that were found before from the cache of photographs.
+
+    Args:
+        posed, used, progress: see `triangulate`.
+        root: of the scene, for messages.
+        cache: folder; the user's if not given.
+    """
+    return triangulate(posed, used, progress)
