@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
 from tidefield.data.readers.transforms import write_transforms_file
@@ -62,17 +62,21 @@ def write_images(
         if correction is not None:
             tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
-        with Image.open(photograph.path) as original:
-            exif = original.getexif()
-        exif[ExifTags.Base.Orientation] = 1
-        is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")
-        quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if is_jpeg else {}
-        with completed_file(target, overwrite=True) as partial:  # in the format of its name
-            Image.fromarray(pixels).save(partial, exif=exif, **quality)
+        write_image(pixels, target, photograph.path)
 
     with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(write, range(len(photographs))), start=1):
             progress(done, len(photographs))
+
+
+def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
+    """Write changed pixels of a photograph: in its format, with its EXIF, but upright."""
+    with Image.open(original) as picture:
+        exif, kind = picture.getexif(), picture.format
+    exif[ExifTags.Base.Orientation] = 1
+    quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind in ("JPEG", "MPO") else {}
+    with completed_file(target, overwrite=True) as partial:
+        Image.fromarray(pixels).save(partial, kind, exif=exif, **quality)
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
