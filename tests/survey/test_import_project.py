@@ -125,6 +125,19 @@ def test_photographs_with_k3_or_all_on_request_are_undistorted_and_others_keep_t
         assert (own.float() - other.float()).abs().mean() < 1.5, "JPEG's loss at quality 95"
 
 
+def test_reduced_photographs_are_written_beside_the_others_on_request(tmp_path: Path) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path / "theirs", truth)
+    import_project(tmp_path / "theirs", tmp_path / "ours", downscale=(2, 4))
+    for folder, size in {"images": (64, 48), "images_2": (32, 24), "images_4": (16, 12)}.items():
+        for name in truth.names:
+            with Image.open(tmp_path / "ours" / folder / name) as picture:
+                assert picture.size == size
+    assert_same(load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs"))
+    with pytest.raises(RunError, match="--downscale is 2 1: expected"):
+        import_project(tmp_path / "theirs", tmp_path / "refused", downscale=(2, 1))
+
+
 def test_observations_of_undistorted_photographs_are_exact_and_inside(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     import_project(tmp_path / "project", tmp_path / "scene")

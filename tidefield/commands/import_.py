@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Verbosity
+from tidefield.commands.common import AllowMissing, Downscale, Verbosity
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,6 +31,7 @@ class Import:
     """Give the photographs a second name (hard links) instead of copying them."""
     undistort: bool = False
     """Undistort all photographs, for programs that open no others: the original 3D Gaussian splatting."""
+    downscale: Downscale = ()
     allow_missing: AllowMissing = False
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
@@ -49,6 +50,7 @@ def import_project(options: Import, console: Console) -> None:
             options.scene,
             link=options.link,
             undistort=options.undistort,
+            downscale=options.downscale,
             allow_missing=options.allow_missing,
             progress=bar,
         )

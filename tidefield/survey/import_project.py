@@ -7,6 +7,7 @@ import logging
 import os
 import posixpath
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import colmap_parameters, rectify
 from tidefield.geometry.similarity import Similarity
 from tidefield.machine import cores
-from tidefield.survey.export import write_image, write_transforms
+from tidefield.survey.export import reduced_folders, write_image, write_reduced_images, write_transforms
 
 _GREY = 128
 _CANNOT_LINK = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -40,6 +41,7 @@ def import_project(
     *,
     link: bool = False,
     undistort: bool = False,
+    downscale: Sequence[int] = (),
     allow_missing: bool = False,
     progress: Progress | None = None,
 ) -> tuple[pycolmap.Reconstruction, Georeference | None]:
@@ -55,6 +57,7 @@ def import_project(
             georeference.json; it appears when it is complete.
         link: make hard links to the photographs instead of copies.
         undistort: undistort all photographs; the original 3D Gaussian splatting opens no others.
+        downscale: factors of reduced photographs to write beside the others.
         allow_missing: continue without photographs that are listed but do not exist.
         progress: called with (written, of how many) photographs.
 
@@ -66,6 +69,7 @@ def import_project(
         RunError: `out` exists already or cannot be written.
     """
     refuse_existing(out, replaceable=False)
+    reduced_folders(downscale)
     original = _at_file_size(read_posed(source, allow_missing))
     posed = _undistorted(original, undistort)
     located = read_georeference(source)
@@ -101,6 +105,8 @@ def import_project(
             for done, _ in enumerate(pool.map(write, range(len(posed.names))), start=1):
                 if progress is not None:
                     progress(done, len(posed.names))
+        if downscale:
+            write_reduced_images(folder, posed.names, downscale, progress or (lambda done, whole: None))
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
