@@ -128,7 +128,11 @@ def test_photographs_with_k3_or_all_on_request_are_undistorted_and_others_keep_t
 def test_reduced_photographs_are_written_beside_the_others_on_request(tmp_path: Path) -> None:
     truth = survey(BARREL)
     write_colmap(tmp_path / "theirs", truth)
-    import_project(tmp_path / "theirs", tmp_path / "ours", downscale=(2, 4))
+    calls: list[tuple[int, int]] = []
+    import_project(
+        tmp_path / "theirs", tmp_path / "ours", downscale=(2, 4), progress=lambda *so_far: calls.append(so_far)
+    )
+    assert calls == [(i, 18) for i in range(1, 19)]
     for folder, size in {"images": (64, 48), "images_2": (32, 24), "images_4": (16, 12)}.items():
         for name in truth.names:
             with Image.open(tmp_path / "ours" / folder / name) as picture:

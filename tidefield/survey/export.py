@@ -112,7 +112,7 @@ def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[in
             height, width = (size // factor for size in pixels.shape[:2])
             if not (width and height):
                 raise RunError(
-                    f"{original} has {pixels.shape[1]} x {pixels.shape[0]} pixels: expected at least {factor} each way "
+                    f"{name} has {pixels.shape[1]} x {pixels.shape[0]} pixels: expected at least {factor} each way "
                     f"for {folder}; choose a smaller --downscale"
                 )
             whole = pixels[: height * factor, : width * factor]

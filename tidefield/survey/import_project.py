@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def import_project(
         undistort: undistort all photographs; the original 3D Gaussian splatting opens no others.
         downscale: factors of reduced photographs to write beside the others.
         allow_missing: continue without photographs that are listed but do not exist.
-        progress: called with (written, of how many) photographs.
+        progress: called with (written, of how many) photographs; reduced ones count once more.
 
     Returns:
         The scene's model, and its georeference if the project states it.
@@ -90,6 +91,12 @@ def import_project(
     if posed.near_far is not None:
         _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
     model = to_colmap(posed)
+    count, rounds = len(posed.names), 2 if downscale else 1
+
+    def show(done: int, _: int, before: int = 0) -> None:
+        if progress is not None:
+            progress(before + done, rounds * count)
+
     with completed_folder(out) as folder:
 
         def write(index: int) -> None:
@@ -102,11 +109,10 @@ def import_project(
                 write_image(rectify(decode(path), lens, lens.width, lens.height), target, path)
 
         with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
-            for done, _ in enumerate(pool.map(write, range(len(posed.names))), start=1):
-                if progress is not None:
-                    progress(done, len(posed.names))
+            for done, _ in enumerate(pool.map(write, range(count)), start=1):
+                show(done, count)
         if downscale:
-            write_reduced_images(folder, posed.names, downscale, progress or (lambda done, whole: None))
+            write_reduced_images(folder, posed.names, downscale, partial(show, before=count))
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
@@ -188,7 +194,7 @@ def _undistorted(posed: PosedPhotographs, every: bool) -> PosedPhotographs:
             lenses.append(lens.pinhole() if every or lens.k3 else lens)
     changed = sum(lens != own for lens, own in zip(lenses, posed.lenses, strict=True))
     if changed:
-        _log.info(f"{changed} of {len(lenses)} photographs are undistorted; the others keep their files")
+        _log.info(f"{changed} of {len(lenses)} photographs are undistorted and encoded again")
     points = posed.points
     if points is not None:
         uv_px = points.uv_px.copy()

@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 Facts = dict[str, Any]
 """Result of a stage, as JSON."""
 
-_OWN_FOLDERS = ("prepare", "sparse", "images", "images_*")
+_OWN_FOLDERS = ("prepare", "sparse", "images")
 _DAMAGE = (
     ValueError,
     LookupError,
@@ -163,7 +163,7 @@ class Stages:
 def _refuse_links(scene: Path) -> None:
     """Raise a RunError if one of the folders that are written to is a link or contains one."""
     real = os.path.realpath(scene)
-    for folder in (folder for pattern in _OWN_FOLDERS for folder in scene.glob(pattern)):
+    for folder in (*(scene / name for name in _OWN_FOLDERS), *scene.glob("images_*")):
         for path in (folder, *folder.rglob("*")):
             if os.path.realpath(path) != os.path.join(real, path.relative_to(scene)):
                 raise RunError(
