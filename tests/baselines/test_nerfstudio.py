@@ -187,6 +187,10 @@ if "pip" in sys.argv:
     assert "nvcc and a C++ compiler" in lines[0]
     assert [line[:6] for line in lines[1:] if not line.startswith("Collecting")] == [f"{k} of 4" for k in (1, 2, 3, 4)]
     assert lines.index("Collecting nerfstudio==1.1.5") == 5
+    pip = pip.replace("flush=True)", "flush=True)\n    sys.exit(1)")
+    with pytest.raises(RunError, match=r"pip could not install what nerfstudio needs into .*read what it says above"):
+        environment.install(True, Console(quiet=True))
+    assert not environment._complete().exists()
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,10 @@ def _pip(words: list[str], console: Console) -> None:
     """Install packages; what pip prints meanwhile is the progress."""
     command = [str(_interpreter()), "-m", "pip", "install", "--disable-pip-version-check", *["--quiet"] * console.quiet]
     if subprocess.run([*command, *words], check=False).returncode:
-        raise RunError(f"pip could not install {words[-1]} into {home()}: expected it to; read what it says above")
+        raise RunError(
+            f"pip could not install what nerfstudio needs into {home()}: expected it to; read what it says above, and "
+            "run the same command again"
+        )
 
 
 def _vision(torch: str) -> str:
