@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 Preset = Literal["swift", "paper"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
+Downscale = Annotated[
+    tuple[int, ...],
+    arg(
+        metavar="[N [N ...]]",
+        help="Also write the photographs at an Nth of their size, as images_N, which nerfstudio and gsplat open.",
+    ),
+]
 
 
 if TYPE_CHECKING:

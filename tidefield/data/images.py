@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 from platformdirs import user_cache_path
 from torch import Tensor
 
@@ -101,7 +102,21 @@ def read_header(path: Path) -> tuple[int, int, bool]:
     with open_picture(path) as picture:
         if picture.mode not in _MODES:
             raise SceneError(f"{path} has pixels of the mode {picture.mode}: expected 8 bits per colour; convert it")
-        return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
+        return *picture.size, _has_alpha(picture)
+
+
+def decode(path: Path) -> UInt8[np.ndarray, "H W C"]:
+    """Decode a photograph as it is stored: RGB, or RGBA if it has alpha; EXIF orientation is not applied.
+
+    Raises:
+        SceneError: it cannot be decoded completely.
+    """
+    with open_picture(path) as picture:
+        return np.asarray(picture.convert("RGBA" if _has_alpha(picture) else "RGB"))
+
+
+def _has_alpha(picture: Image.Image) -> bool:
+    return picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
 
 
 @quiet_pillow()
@@ -240,8 +255,7 @@ def _decoded(
 
 
 def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
-    with open_picture(file.path) as picture:
-        pixels = np.asarray(picture.convert("RGBA" if file.has_alpha else "RGB"))
+    pixels = decode(file.path)
     if not file.has_alpha:
         return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
     # Composited before it is resampled: the colour of a transparent pixel is arbitrary.

@@ -258,12 +258,10 @@ def _sparse_points(
     observations = points.by_photograph(len(pinholes))
     for lens, pinhole, pose, mine in zip(lenses, pinholes, T_world_camera, observations, strict=True):
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
-        xy = lens.unproject(points.uv_px[mine])
-        uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+        uv = lens.to_pinhole(points.uv_px[mine], pinhole)
         with np.errstate(all="ignore"):  # points in the camera's plane, which are left out
             off = np.linalg.norm(pinhole.project(xyz) - uv, axis=1)
-        inside = (uv >= 0).all(axis=1) & (uv < (pinhole.width, pinhole.height)).all(axis=1)
-        good = inside & (xyz[:, 2] > 0) & np.isfinite(off)
+        good = (xyz[:, 2] > 0) & np.isfinite(off)
         uv_px[mine[good]], off_px[mine[good]] = uv[good], off[good]
     good = np.isfinite(off_px)
     seen, point_index = np.unique(points.point_index[good], return_inverse=True)
