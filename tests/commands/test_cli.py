@@ -83,6 +83,21 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     assert video.stat().st_size > 0
 
 
+@pytest.mark.parametrize("source", ["run", "scene"])
+def test_the_view_of_a_training_photograph_is_made_from_the_others_unless_asked(
+    source: str, scene: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    own = [request.getfixturevalue(source), *(["--zero-shot"] if source == "scene" else [])]
+    for options in ([], ["--with-itself"]):
+        out = tmp_path / f"{len(options)}.png"
+        call("render", *own, out, "--camera", "vegetation_0005", *options, "--device", "cpu", "-q")
+    truth, made, with_itself = (
+        np.asarray(Image.open(path).convert("RGB"), np.float32)
+        for path in (scene / "images" / "vegetation_0005.png", tmp_path / "0.png", tmp_path / "1.png")
+    )
+    assert np.square(made - truth).mean() > 2 * np.square(with_itself - truth).mean()
+
+
 def test_resume_goes_on_from_the_last_step(scene: Path, run: Path) -> None:
     from tidefield.model.network import make_network
     from tidefield.train.checkpoint import load_network, read_run
@@ -132,6 +147,7 @@ def test_users_mistakes_are_one_clear_message(
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
+    assert "--camera" in fails(capsys, "render", run, tmp_path / "a.mp4", "--with-itself")
     assert not (tmp_path / "new").exists()
 
 

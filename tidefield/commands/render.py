@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +32,9 @@ class Render:
     (JSON)."""
     camera: str | None = None
     """Name of a photograph whose camera is rendered instead of a path."""
+    with_itself: bool = False
+    """With --camera, let a training photograph serve as a neighbour of its own view, which then hardly differs from it;
+    without, its view is made from the others, as that of a held-out photograph."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     frames: int = 240
     """Frames of the video, 24 a second."""
@@ -58,6 +61,8 @@ def render(options: Render, console: Console) -> None:
     if out.suffix.lower() != suffix:
         what = "a video" if camera is None else "one view (--camera)"
         raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
+    if options.with_itself and camera is None:
+        raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
     device = choose_device(options.device)
     with ExitStack() as stack:
@@ -69,6 +74,8 @@ def render(options: Render, console: Console) -> None:
             scene, view, _ = stack.enter_context(opened)
         if camera is not None:
             own = scene.cameras[scene.index(camera)]
+            if options.with_itself:
+                own = replace(own, names=())
             size = _size(own, options.width, options.height)
             for file in write_still(view(own.resized(*size)), out, overwrite=overwrite):
                 console.print(str(file), highlight=False, soft_wrap=True)
