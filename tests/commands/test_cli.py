@@ -77,6 +77,8 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     call("render", run, still, "--camera", "vegetation_0001", "--width", 40, "-q")
     with Image.open(still) as picture:
         assert picture.size == (40, 30)
+        assert picture.text["Title"] == "scene, vegetation_0001.png"
+        assert json.loads(picture.text["Camera"])["width"] == 40
     assert np.load(tmp_path / "view_depth.npy").shape == (30, 40)
     video = tmp_path / "flight.mp4"
     call("render", run, video, "--path", "strip", "--frames", 2, "--width", 32, "-q")
