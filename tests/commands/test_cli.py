@@ -149,6 +149,13 @@ def test_users_mistakes_are_one_clear_message(
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
+    for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):
+        message = fails(capsys, *command)
+        assert "add --zero-shot" in message
+        assert f"`tidefield train {scene} RUN`" in message
+    assert "--zero-shot" not in fails(capsys, "render", tmp_path, tmp_path / "a.mp4")
+    photographs = scene / "images"
+    assert f"`tidefield prepare {photographs} SCENE`" in fails(capsys, "train", photographs, tmp_path / "new")
     assert "--camera" in fails(capsys, "render", run, tmp_path / "a.mp4", "--with-itself")
     assert not (tmp_path / "new").exists()
 
