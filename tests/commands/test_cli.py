@@ -187,6 +187,23 @@ def test_a_video_needs_a_frame(frames: int, run: Path, tmp_path: Path, capsys: p
     assert not (tmp_path / "a.mp4").exists()
 
 
+def test_the_cache_of_photographs_is_shown_and_emptied(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    call("cache")
+    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 0 files, 0 MB of at most 20,000 MB\n"
+    for width in (32, 48):
+        call("evaluate", scene, tmp_path / str(width), "--method", "nearest", "--width", width, "-q")
+    (tmp_path / "tidefield" / "thesis.tex").touch()
+    monkeypatch.setenv("TIDEFIELD_CACHE_GB", "0.5")
+    call("cache")
+    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 2 files, 0 MB of at most 500 MB\n"
+    call("cache", "--clear")
+    assert capsys.readouterr().out.startswith("deleted: 2 files, 0 MB\n")
+    assert [path.name for path in (tmp_path / "tidefield").iterdir()] == ["thesis.tex"]
+
+
 def test_the_demonstration_makes_all_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
