@@ -21,6 +21,19 @@ from tidefield.files import (
 )
 
 
+@pytest.mark.skipif(os.name != "posix", reason="other systems have no such files")
+def test_json_that_is_no_file_or_too_large_is_refused_unread(tmp_path: Path):
+    assert read_json(tmp_path / "none.json") is None
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "device.json").symlink_to("/dev/zero")
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "large.json").touch()
+    os.truncate(tmp_path / "large.json", 1 << 27)
+    for name in ("pipe", "device", "folder", "large"):
+        with pytest.raises(RunError, match=rf"{name}\.json is not what this program wrote"):
+            read_json(tmp_path / f"{name}.json")
+
+
 def test_a_file_appears_when_it_is_complete(tmp_path: Path):
     path = tmp_path / "a" / "b" / "map.tif"
     with completed_file(path) as partial:
