@@ -152,6 +152,16 @@ def test_a_check_of_a_place_makes_nothing(tmp_path: Path):
     require_writable(tmp_path / "map.tif", overwrite=True)
 
 
+def test_a_message_names_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Path, "touch", refuse)
+    with pytest.raises(RunError, match=r"^map\.tif cannot be written \(Read-only file system\): "):
+        require_writable(Path("map.tif"))
+
+
 def test_json_nested_too_deeply_is_damaged(tmp_path: Path):
     (tmp_path / "a.json").write_text("[" * 100_000)
     with pytest.raises(RunError, match="is not valid JSON"):

@@ -69,8 +69,9 @@ def writing_to(path: Path) -> Iterator[None]:
         if not user_can_mend(error):
             raise
         reason = error.strerror or str(error)
-        if isinstance(error.filename, str) and Path(error.filename).parent != path.parent:
-            reason += f": {error.filename}"  # not the temporary name
+        name = Path(error.filename) if isinstance(error.filename, str) else path
+        if name.parent != path.parent and ".partial" not in name.suffixes:  # not the temporary name
+            reason += f": {name}"
         raise RunError(
             f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
             "another place"
