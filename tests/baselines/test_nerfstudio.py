@@ -135,7 +135,7 @@ def test_a_home_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest
 def test_without_a_home_folder_the_message_says_what_to_set(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("XDG_DATA_HOME", raising=False)
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as of a user that the system does not know
-    with pytest.raises(RunError, match="no home folder.*XDG_DATA_HOME"):
+    with pytest.raises(RunError, match=r"no home folder.*XDG_DATA_HOME"):
         environment.python()
 
 
