@@ -59,7 +59,8 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=Path(job["data"]), downscale_factor=1)
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
-        # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
+        # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled, which torch 2.5 must be told.
+        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
         numbers = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int64)]
         torch.serialization.add_safe_globals([np.core.multiarray.scalar, np.dtype, *numbers])
     torch.manual_seed(job["seed"])
