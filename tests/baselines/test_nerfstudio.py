@@ -1,6 +1,7 @@
 """nerfstudio's methods: the scene that they get, their configuration, and the way back of what they render."""
 
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -131,6 +132,13 @@ def test_a_home_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(environment, "_NEWEST_PYTHON", sys.version_info[:2])
     with pytest.raises(RunError, match=r"file/tidefield/nerfstudio-.* cannot be written \(Not a directory"):
         environment.install(False, Console(quiet=True))
+
+
+def test_without_a_home_folder_the_message_says_what_to_set(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as of a user that the system does not know
+    with pytest.raises(RunError, match=r"no home folder.*XDG_DATA_HOME"):
+        environment.python()
 
 
 def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -64,9 +64,15 @@ clients, mesh tools), some of it without wheels for new Pythons."""
 
 
 def home() -> Path:
-    """$XDG_DATA_HOME/tidefield/nerfstudio-1.1.5."""
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(data) / "tidefield" / f"nerfstudio-{VERSION}"
+    """$XDG_DATA_HOME/tidefield/nerfstudio-1.1.5.
+
+    Raises:
+        RunError: that is not set, and the system knows no home folder of this user, as in containers.
+    """
+    data = Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share"))
+    if data.parts[0] == "~":
+        raise RunError("this user has no home folder for nerfstudio: expected one; set XDG_DATA_HOME to a folder")
+    return data / "tidefield" / f"nerfstudio-{VERSION}"
 
 
 def python() -> Path:
