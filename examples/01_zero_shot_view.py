@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 import tidefield as tf
-from tidefield.render.stills import write_still
+from tidefield.render.stills import describe_view, write_still
 from tidefield.synthetic import make_survey, write_survey
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
@@ -20,8 +20,9 @@ scene = tf.load_scene(folder / "scene")
 print(scene)
 
 render = tf.zero_shot(scene)
-view = render(scene.cameras[scene.names[scene.test[0]]])
+camera = scene.cameras[scene.names[scene.test[0]]]
+view = render(camera)
 print("colour", tuple(view.colour.shape), "depth", tuple(view.depth.shape))
 
-for file in write_still(view, folder / "view.png", overwrite=True):
+for file in write_still(view, folder / "view.png", about=describe_view(scene, camera), overwrite=True):
     print(file)

@@ -110,7 +110,7 @@ def write_transforms(root: Path, truth: Truth, **more: object) -> Path:
             "h": lens.height,
         }
         frame |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-        frame |= {"k1": lens.k1, "k2": lens.k2, "p1": lens.p1, "p2": lens.p2}
+        frame |= {"k1": lens.k1, "k2": lens.k2, "p1": lens.p1, "p2": lens.p2} | ({"k3": lens.k3} if lens.k3 else {})
         frames.append(frame)
     root.mkdir(parents=True, exist_ok=True)
     file = root / "transforms.json"

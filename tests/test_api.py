@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import textured_wall as wall
 import torch
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
@@ -12,7 +14,11 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 import tidefield
 from tidefield.commands.train import Train, train
 from tidefield.config import Budget
-from tidefield.errors import RunError
+from tidefield.data.images import Photographs
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError, SceneError
+from tidefield.geometry.cameras import Cameras
+from tidefield.methods import untrained
 
 
 @pytest.fixture
@@ -32,6 +38,25 @@ def test_trained_weights_render_a_scene_by_photograph_name(folder: Path) -> None
         tidefield.zero_shot(scene, "quick")
     with pytest.raises(RunError, match="not a weights file"):
         tidefield.zero_shot(scene, weights=str(folder / "none.safetensors"))
+    alone = replace(scene, train=(0,))
+    with pytest.raises(SceneError, match="no training photograph besides"):
+        tidefield.zero_shot(alone, device="cpu")(camera)
+
+
+@pytest.mark.parametrize("method", ["swift", "nearest", "sparse-depth", "plane-sweep"])
+def test_the_view_of_a_photograph_is_made_without_its_pixels_unless_it_has_no_name(method: str) -> None:
+    def render(scene: Scene, camera: Cameras) -> torch.Tensor:
+        own = tidefield.zero_shot(scene, method, device="cpu") if method == "swift" else untrained(method, scene)
+        return own(camera).colour
+
+    scene = wall.scene(wall.cameras(6, 64, 48, step=0.4), test=(0,))
+    pictures = list(scene.photographs.colours)
+    pictures[3] = 255 - pictures[3]
+    other = replace(scene, photographs=Photographs(tuple(pictures)))
+    camera = scene.cameras["03"]
+    assert torch.equal(render(scene, camera), render(other, camera))
+    nameless = replace(camera, names=())
+    assert not torch.equal(render(scene, nameless), render(other, nameless))
 
 
 def test_a_run_is_opened_with_its_scene_and_renders_as_it_was_trained(folder: Path) -> None:

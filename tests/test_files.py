@@ -21,6 +21,19 @@ from tidefield.files import (
 )
 
 
+@pytest.mark.skipif(os.name != "posix", reason="other systems have no such files")
+def test_json_that_is_no_file_or_too_large_is_refused_unread(tmp_path: Path):
+    assert read_json(tmp_path / "none.json") is None
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "device.json").symlink_to("/dev/zero")
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "large.json").touch()
+    os.truncate(tmp_path / "large.json", 1 << 27)
+    for name in ("pipe", "device", "folder", "large"):
+        with pytest.raises(RunError, match=rf"{name}\.json is not what this program wrote"):
+            read_json(tmp_path / f"{name}.json")
+
+
 def test_a_file_appears_when_it_is_complete(tmp_path: Path):
     path = tmp_path / "a" / "b" / "map.tif"
     with completed_file(path) as partial:
@@ -137,6 +150,16 @@ def test_a_check_of_a_place_makes_nothing(tmp_path: Path):
     with pytest.raises(RunError, match="is there already"):
         require_writable(tmp_path / "map.tif")
     require_writable(tmp_path / "map.tif", overwrite=True)
+
+
+def test_a_message_names_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Path, "touch", refuse)
+    with pytest.raises(RunError, match=r"^map\.tif cannot be written \(Read-only file system\): "):
+        require_writable(Path("map.tif"))
 
 
 def test_json_nested_too_deeply_is_damaged(tmp_path: Path):

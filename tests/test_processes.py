@@ -74,8 +74,10 @@ def test_children_end_with_the_process_that_started_them(number: signal.Signals,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_command_with_its_exit_status(number: signal.Signals):
-    code = "import time; from tidefield import cli; cli._run = lambda _: (print('x', flush=True), time.sleep(60))"
-    command = [sys.executable, "-c", f"{code}; cli.main()"]
+    # What runs in a shell's background, as the tests may, ignores SIGINT; its children do, too.
+    code = "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler); from tidefield import cli"
+    run = "cli._run = lambda _: (print('x', flush=True), time.sleep(60)); cli.main()"
+    command = [sys.executable, "-c", f"{code}; {run}"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "x\n"

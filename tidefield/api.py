@@ -21,7 +21,8 @@ def zero_shot(scene: Scene, preset: str = "swift", weights: str | Path | None = 
     """Render a scene with trained weights, without training on it.
 
     Args:
-        scene: from `load_scene`; its training photographs serve as neighbouring views.
+        scene: from `load_scene`; its training photographs serve as neighbouring views, except for their own cameras'
+            (`Cameras.names`).
         preset: "swift" or "paper".
         weights: a file of `tidefield pretrain`; the installed weights of the preset if None.
         device: "auto", "cpu", "cuda", "cuda:N" or "mps".

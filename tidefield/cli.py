@@ -18,7 +18,19 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import tyro
 
 from tidefield import __version__
-from tidefield.commands import ablate, baselines, compare, demo, evaluate, import_, prepare, pretrain, render, train
+from tidefield.commands import (
+    ablate,
+    baselines,
+    cache,
+    compare,
+    demo,
+    evaluate,
+    import_,
+    prepare,
+    pretrain,
+    render,
+    train,
+)
 from tidefield.errors import TidefieldError
 from tidefield.files import user_can_mend
 from tidefield.machine import tune_process
@@ -40,6 +52,7 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
     "baselines": (baselines, baselines.Baselines, "baselines"),
     "pretrain": (pretrain, pretrain.Pretrain, "pretrain"),
     "demo": (demo, demo.Demo, "demo"),
+    "cache": (cache, cache.Cache, "cache"),
 }
 """By name: module, options and function."""
 

@@ -9,6 +9,7 @@ import logging
 import os
 import secrets
 import shutil
+import stat
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -68,8 +69,9 @@ def writing_to(path: Path) -> Iterator[None]:
         if not user_can_mend(error):
             raise
         reason = error.strerror or str(error)
-        if isinstance(error.filename, str) and Path(error.filename).parent != path.parent:
-            reason += f": {error.filename}"  # not the temporary name
+        name = Path(error.filename) if isinstance(error.filename, str) else path
+        if name.parent != path.parent and ".partial" not in name.suffixes:  # not the temporary name
+            reason += f": {name}"
         raise RunError(
             f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
             "another place"
@@ -271,12 +273,18 @@ def read_json(path: Path) -> Any:
     """The content of a JSON file that this program wrote, or None where there is none.
 
     Raises:
-        RunError: when it is damaged.
+        RunError: when it is damaged, or no file of a sane size.
     """
     with reading_from(path):
-        if not path.is_file():
+        if not path.exists():
             return None
-        content = path.read_bytes() if path.stat().st_size <= _LARGEST_JSON else b""
+        status = path.stat()  # before it is opened: opening a pipe waits for who writes to it
+        if not (stat.S_ISREG(status.st_mode) and status.st_size <= _LARGEST_JSON):
+            raise RunError(
+                f"{path} is not what this program wrote: expected a file of at most {_LARGEST_JSON / 1e6:.0f} MB; "
+                "restore it, or delete it and repeat"
+            )
+        content = path.read_bytes() if status.st_size else b""  # the system's own files have no size, some no end
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:

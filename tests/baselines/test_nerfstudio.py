@@ -1,9 +1,11 @@
 """nerfstudio's methods: the scene that they get, their configuration, and the way back of what they render."""
 
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from pickle import UnpicklingError
 from subprocess import CompletedProcess
 from types import SimpleNamespace
 
@@ -12,6 +14,7 @@ import pytest
 import textured_wall as wall
 import torch
 from rich.console import Console
+from torch.torch_version import TorchVersion
 
 from tidefield.baselines.nerfstudio import driver, environment, worker
 from tidefield.config import Budget
@@ -131,6 +134,13 @@ def test_a_home_that_cannot_be_made_is_named(tmp_path: Path, monkeypatch: pytest
         environment.install(False, Console(quiet=True))
 
 
+def test_without_a_home_folder_the_message_says_what_to_set(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as of a user that the system does not know
+    with pytest.raises(RunError, match=r"no home folder.*XDG_DATA_HOME"):
+        environment.python()
+
+
 def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     asked, starts = [], False
@@ -151,12 +161,91 @@ def test_an_installation_is_complete_only_when_nerfstudio_starts(tmp_path: Path,
     assert environment.python().is_relative_to(tmp_path)
     packages = [word for words in asked for word in words]
     assert "nerfstudio==1.1.5" in packages
-    assert any(word.startswith("torchvision==0.") for word in packages)
+    assert any(word.startswith("torchvision<0.") for word in packages)
+    assert "--quiet" in packages
     with pytest.raises(RunError, match="--overwrite"):
         environment.install(False, quiet)
     monkeypatch.setattr(environment.sys, "version_info", (3, 14, 0))
     with pytest.raises(RunError, match=r"Python 3\.14: expected 3\.12 or older"):
         environment.install(True, quiet)
+
+
+def test_an_installation_says_what_it_needs_and_what_it_does_and_lets_pip_talk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    pip = """
+import sys
+if "pip" in sys.argv:
+    print("Collecting", sys.argv[-1], flush=True)
+"""
+
+    def create(folder: Path, with_pip: bool) -> None:
+        (folder / "bin").mkdir(parents=True)
+        interpreter = folder / "bin" / "python"
+        interpreter.write_text(f"#!{sys.executable}{pip}")
+        interpreter.chmod(0o755)
+
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr(environment, "_NEWEST_PYTHON", sys.version_info[:2])
+    monkeypatch.setattr(environment, "_interpreter", lambda: environment.home() / "bin" / "python")
+    monkeypatch.setattr(environment.venv, "create", create)
+    environment.install(False, Console(width=500))
+    lines = capfd.readouterr().out.splitlines()
+    assert "gigabytes" in lines[0]
+    assert "nvcc and a C++ compiler" in lines[0]
+    assert [line[:6] for line in lines[1:] if not line.startswith("Collecting")] == [f"{k} of 4" for k in (1, 2, 3, 4)]
+    assert lines.index("Collecting nerfstudio==1.1.5") == 5
+    pip = pip.replace("flush=True)", "flush=True)\n    sys.exit(1)")
+    with pytest.raises(RunError, match=r"pip could not install what nerfstudio needs into .*read what it says above"):
+        environment.install(True, Console(quiet=True))
+    assert not environment._complete().exists()
+
+
+@pytest.mark.parametrize(
+    ("torch", "vision"),
+    [("2.6.0", "<0.22"), ("2.7.1", "<0.23"), ("2.13.0", "<0.29"), ("2.15.0.post1", "<0.31"), ("2.15.0a0", "<0.31")],
+)
+def test_torchvision_is_the_newest_that_there_is_for_the_torch(torch: str, vision: str):
+    assert environment._vision(torch) == f"torchvision{vision}"
+
+
+@pytest.mark.parametrize(
+    ("torch", "message"),
+    [("2.5.1", r"2\.5\.1 is here.*not safe: expected 2\.6 or newer"), ("3.0.0", "3.0.0 is new .*expected 2.x")],
+)
+def test_nothing_is_installed_for_a_torch_that_is_too_old_or_too_new(
+    torch: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr(environment, "_NEWEST_PYTHON", sys.version_info[:2])
+    monkeypatch.setattr(environment, "version", lambda _: f"{torch}+cpu")
+    with pytest.raises(RunError, match=message):
+        environment.install(False, Console(quiet=True))
+    assert list(tmp_path.iterdir()) == []
+
+
+class Pickled:
+    """Runs code when it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return exec, ("raise SystemExit('code of a checkpoint ran')",)
+
+
+def test_a_checkpoint_cannot_run_code_in_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
+    monkeypatch.setenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "0")
+    torch.save({"step": 1, "pipeline": Pickled()}, tmp_path / "step-1.ckpt")
+    with pytest.warns(UserWarning, match="forcing weights_only=False"), pytest.raises(SystemExit, match="ran"):
+        torch.load(tmp_path / "step-1.ckpt", map_location="cpu")
+    worker.load_only_weights()
+    with pytest.raises(UnpicklingError, match="Weights only load failed"):
+        torch.load(tmp_path / "step-1.ckpt", map_location="cpu")
+
+
+def test_the_worker_refuses_a_torch_whose_loading_is_not_safe(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(worker.torch, "__version__", TorchVersion("2.5.1+cpu"))
+    with pytest.raises(SystemExit, match=r"torch 2\.5\.1\+cpu .*expected 2\.6 or newer.*install nerfacto --overwrite"):
+        worker.load_only_weights()
 
 
 def test_a_pose_is_converted_into_the_frame_of_the_model():

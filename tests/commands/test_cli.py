@@ -77,10 +77,27 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     call("render", run, still, "--camera", "vegetation_0001", "--width", 40, "-q")
     with Image.open(still) as picture:
         assert picture.size == (40, 30)
+        assert picture.text["Title"] == "scene, vegetation_0001.png"
+        assert json.loads(picture.text["Camera"])["width"] == 40
     assert np.load(tmp_path / "view_depth.npy").shape == (30, 40)
     video = tmp_path / "flight.mp4"
     call("render", run, video, "--path", "strip", "--frames", 2, "--width", 32, "-q")
     assert video.stat().st_size > 0
+
+
+@pytest.mark.parametrize("source", ["run", "scene"])
+def test_the_view_of_a_training_photograph_is_made_from_the_others_unless_asked(
+    source: str, scene: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    own = [request.getfixturevalue(source), *(["--zero-shot"] if source == "scene" else [])]
+    for options in ([], ["--with-itself"]):
+        out = tmp_path / f"{len(options)}.png"
+        call("render", *own, out, "--camera", "vegetation_0005", *options, "--device", "cpu", "-q")
+    truth, made, with_itself = (
+        np.asarray(Image.open(path).convert("RGB"), np.float32)
+        for path in (scene / "images" / "vegetation_0005.png", tmp_path / "0.png", tmp_path / "1.png")
+    )
+    assert np.square(made - truth).mean() > 2 * np.square(with_itself - truth).mean()
 
 
 def test_resume_goes_on_from_the_last_step(scene: Path, run: Path) -> None:
@@ -132,6 +149,14 @@ def test_users_mistakes_are_one_clear_message(
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
+    for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):
+        message = fails(capsys, *command)
+        assert "add --zero-shot" in message
+        assert f"`tidefield train {scene} RUN`" in message
+    assert "--zero-shot" not in fails(capsys, "render", tmp_path, tmp_path / "a.mp4")
+    photographs = scene / "images"
+    assert f"`tidefield prepare {photographs} SCENE`" in fails(capsys, "train", photographs, tmp_path / "new")
+    assert "--camera" in fails(capsys, "render", run, tmp_path / "a.mp4", "--with-itself")
     assert not (tmp_path / "new").exists()
 
 
@@ -160,6 +185,23 @@ def test_a_video_needs_a_frame(frames: int, run: Path, tmp_path: Path, capsys: p
     message = fails(capsys, "render", run, tmp_path / "a.mp4", "--frames", frames, "--width", 32, "-q")
     assert "expected at least one" in message
     assert not (tmp_path / "a.mp4").exists()
+
+
+def test_the_cache_of_photographs_is_shown_and_emptied(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    call("cache")
+    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 0 files, 0 MB of at most 20,000 MB\n"
+    for width in (32, 48):
+        call("evaluate", scene, tmp_path / str(width), "--method", "nearest", "--width", width, "-q")
+    (tmp_path / "tidefield" / "thesis.tex").touch()
+    monkeypatch.setenv("TIDEFIELD_CACHE_GB", "0.5")
+    call("cache")
+    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 2 files, 0 MB of at most 500 MB\n"
+    call("cache", "--clear")
+    assert capsys.readouterr().out.startswith("deleted: 2 files, 0 MB\n")
+    assert [path.name for path in (tmp_path / "tidefield").iterdir()] == ["thesis.tex"]
 
 
 def test_the_demonstration_makes_all_that_it_names(

@@ -128,6 +128,15 @@ def test_a_run_that_starts_again_needs_the_weights_it_started_from(
     start(scene, tmp_path / "run", resume=True, weights=other)
 
 
+@pytest.mark.parametrize("options", [{"variant": "no-neighbours"}, {"method": "nerf"}, {"from_scratch": True}])
+def test_weights_for_a_training_that_starts_without_are_one_clear_error(
+    scene: Path, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    with pytest.raises(RunError, match=r"--weights is given for a training that starts without .*leave one out$"):
+        start(scene, tmp_path / "run", weights=checkpoint.SHIPPED / "swift.safetensors", **options)
+    assert not (tmp_path / "run" / RUN_FILE).exists()
+
+
 def test_a_folder_is_trained_into_by_one_process_at_a_time(scene: Path, tmp_path: Path) -> None:
     start(scene, tmp_path / "run")
     for options in ({"resume": True}, {"overwrite": True}):

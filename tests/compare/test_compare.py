@@ -273,6 +273,22 @@ def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest
     assert called == list(asked)
 
 
+@pytest.mark.parametrize("is_quiet", [False, True])
+def test_what_a_comparison_runs_is_as_quiet_as_itself(
+    is_quiet: bool, disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    def stop(command: list[str], _: object) -> None:
+        asked.append(command)
+        raise KeyboardInterrupt
+
+    asked: list[list[str]] = []
+    monkeypatch.setattr("tidefield.compare.run.run_measured", stop)
+    options = Compare((disk,), methods=("nearest",), out=tmp_path / "out", device="cpu")
+    with pytest.raises(KeyboardInterrupt):
+        compare_command(options, Console(quiet=is_quiet))
+    assert [words[-1] == "--quiet" for words in asked] == [is_quiet]
+
+
 def test_missing_software_is_reported_before_anything_is_trained(
     disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):

@@ -163,14 +163,14 @@ def test_without_points_the_surface_is_between_near_and_far():
 def test_neighbours_of_a_view_are_training_photographs(strategy: str):
     own = scene()
 
-    def neighbours(target: int, count: int, excluded: int | None = None) -> Neighbours:
+    def neighbours(target: int, count: int) -> Neighbours:
         prior = DepthPriors(own)[target]
-        return choose_neighbours(own.cameras[target], prior, torch.zeros(2), (3, 2), 16, own, count, strategy, excluded)
+        return choose_neighbours(own.cameras[target], prior, torch.zeros(2), (3, 2), 16, own, count, strategy)
 
     every = neighbours(1, 100)
     assert every.index.shape == (6, 5)
     assert all(sorted(chosen) == list(own.train) for chosen in every.index.tolist())
-    assert sorted(neighbours(2, 100, 2).index[0].tolist()) == [0, 3, 5, 6]
+    assert sorted(neighbours(2, 100).index[0].tolist()) == [0, 3, 5, 6]
     if strategy == "seen":
         assert set(neighbours(1, 2).index[0, :2].tolist()) == {0, 2}
 

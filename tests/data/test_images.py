@@ -9,7 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tidefield.data import cache as user_cache
 from tidefield.data import images
+from tidefield.data.cache import cache_folder
 from tidefield.data.images import PhotographFile, open_photographs, read_header
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
@@ -184,14 +186,60 @@ def test_unused_stores_are_deleted(cache: Path, files: tuple[PhotographFile, ...
     open_photographs(files, WHITE)
     open_photographs(files[:2], WHITE)
     old, young = sorted(cache.iterdir(), key=lambda store: -store.stat().st_size)
-    (cache / "killed.partial").write_bytes(b"half")
-    long_ago = time.time() - 100 * 86400
-    os.utime(old, (long_ago, long_ago))
-    os.utime(cache / "killed.partial", (long_ago, long_ago))
+    used(old, 100)
     open_photographs(files[:3], WHITE)
     assert young.exists()
     assert not old.exists()
-    assert not (cache / "killed.partial").exists()
+
+
+def used(store: Path, days_ago: float) -> None:
+    then = time.time() - days_ago * 86400
+    os.utime(store, (then, then))
+
+
+def test_what_was_used_first_is_deleted_when_the_cache_is_full(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TIDEFIELD_CACHE_GB", str(sum(file.bytes for file in files[:3]) / 1e9))
+    stores = []
+    for days, file in zip((3, 2, 1), files, strict=False):
+        photograph = open_photographs([file], WHITE)[0].clone()
+        (store,) = set(cache.iterdir()) - set(stores)
+        used(store, days)
+        stores.append(store)
+    mapped = open_photographs([files[1]], WHITE)[0]
+    used(stores[1], 2)
+    open_photographs([files[0]], WHITE)  # is now the last one used
+    open_photographs([files[3]], WHITE)
+    assert [store.exists() for store in stores] == [True, False, False]  # the fourth is larger than the third
+    assert torch.equal(mapped, torch.from_numpy(np.asarray(Image.open(files[1].path)).copy()))
+    photographs = open_photographs(files, WHITE)  # larger than the limit: kept alone
+    assert len(list(cache.iterdir())) == 1
+    assert torch.equal(photographs[2], photograph)
+
+
+def test_a_file_that_is_being_written_is_not_deleted(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TIDEFIELD_CACHE_GB", "0")
+    cache.mkdir(mode=0o700, parents=True)
+    written, killed = (cache / f".{name}-01234567.partial.photographs" for name in ("written", "killed"))
+    for partial, days in ((written, 0), (killed, 1)):
+        partial.write_bytes(b"half")
+        used(partial, days)
+    open_photographs(files, WHITE)
+    assert written.exists()
+    assert not killed.exists()
+    assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize("limit", ["much", "-1", "nan"])
+def test_a_limit_of_the_cache_that_is_no_number_is_refused(
+    limit: str, cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TIDEFIELD_CACHE_GB", limit)
+    with pytest.raises(SceneError, match="TIDEFIELD_CACHE_GB is"):
+        open_photographs(files, WHITE)
 
 
 def test_without_a_chosen_cache_folder_the_systems_own_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +250,7 @@ def test_without_a_chosen_cache_folder_the_systems_own_is_used(tmp_path: Path, m
             monkeypatch.delenv("XDG_CACHE_HOME")
         else:
             monkeypatch.setenv("XDG_CACHE_HOME", value)
-        folder = images._cache_folder()
+        folder = cache_folder()
         assert folder.is_relative_to(tmp_path)
         assert "tidefield" in folder.parts
 
@@ -217,7 +265,7 @@ def test_without_a_home_folder_photographs_are_held_in_memory(
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())
     for folder in (has_no_home, lambda *_, **__: Path("~/.cache/tidefield")):  # of platformdirs from 4.5, and before
-        monkeypatch.setattr(images, "user_cache_path", folder)
+        monkeypatch.setattr(user_cache, "user_cache_path", folder)
         assert len(open_photographs(files, (1.0, 1.0, 1.0))) == len(files)
     assert ["no home folder" in record.message for record in caplog.records] == [True, True]
     assert sorted(tmp_path.iterdir()) == before

@@ -59,14 +59,10 @@ def tilted(angle: float) -> Tensor:
     return torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ NADIR
 
 
-def none_excluded(count: int) -> Tensor:
-    return torch.zeros(1, count, dtype=torch.bool)
-
-
 def test_above_flat_ground_the_nearest_photograph_comes_first():
     own = nadir_grid()
     target = flight(torch.tensor([[1.0, 0.3, HEIGHT]]))
-    chosen = select_best(rank_by_view(target, ground(target), own), none_excluded(25), 9)[0][0]
+    chosen = select_best(rank_by_view(target, ground(target), own), 9)[0][0]
     distance = (own.position_world - target.position_world).norm(dim=-1)
     assert chosen[0] == distance.argmin()
     assert distance[chosen[:3]].tolist() == pytest.approx(distance.sort().values[:3].tolist())
@@ -74,12 +70,22 @@ def test_above_flat_ground_the_nearest_photograph_comes_first():
 
 
 def test_a_photograph_of_the_grid_has_its_four_neighbours_and_never_itself():
-    own, middle = nadir_grid(), 12
-    target = own[middle]
-    chosen = select_best(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 4)[0][0]
-    assert set(chosen.tolist()) == {7, 11, 13, 17}
-    every = select_best(rank_by_view(target, ground(target), own), torch.arange(25)[None] == middle, 100)[0][0]
-    assert sorted(every.tolist()) == [i for i in range(25) if i != middle]
+    scene, middle = wall.scene(nadir_grid(), test=()), 12
+    target = scene.cameras[middle]
+    others = scene.sources(target)
+    assert others == tuple(i for i in range(25) if i != middle)
+    rank = rank_by_view(target, ground(target), scene.cameras[list(others)])
+    assert {others[i] for i in select_best(rank, 4)[0][0].tolist()} == {7, 11, 13, 17}
+
+
+def test_only_a_camera_with_the_name_and_the_pose_of_a_photograph_has_one_of_its_own():
+    scene = wall.scene(wall.cameras(5))
+    own = scene.cameras[2]
+    assert scene.sources(own) == scene.sources(own.resized(24, 18)) == (0, 3, 4)
+    assert scene.sources(replace(own, names=())) == scene.train
+    assert scene.sources(replace(own, T_world_camera=own.T_world_camera + 0.1)) == scene.train
+    assert scene.sources(replace(own, names=("of-another-survey.jpg",))) == scene.train
+    assert scene.sources(scene.cameras[1]) == scene.train  # held out: no source of any view
 
 
 def test_rank_is_share_in_frame_times_angle_weight():
@@ -110,7 +116,7 @@ def test_each_tile_has_its_own_neighbours():
     own = nadir_grid()
     targets = flight(torch.tensor([[-7.0, -7.0, HEIGHT], [7.0, 7.0, HEIGHT]]))
     surface = torch.cat([ground(targets[0]), ground(targets[1])])
-    first, _ = select_best(rank_by_view(targets, surface, own), torch.zeros(2, 25, dtype=torch.bool), 1)
+    first, _ = select_best(rank_by_view(targets, surface, own), 1)
     assert first.flatten().tolist() == [0, 24]
 
 
@@ -122,26 +128,20 @@ def test_direction_strategy_ranks_by_angle_between_viewing_directions():
     target = flight(torch.tensor([[0.0, 0.0, HEIGHT]]))
     rank = rank_by_direction(target, own)
     torch.testing.assert_close(rank[0], (angles.cos() + 1) / 2)
-    assert select_best(rank, none_excluded(5), 5)[0][0].tolist() == [1, 4, 2, 0, 3]
-
-
-def test_excluded_photographs_are_not_selected_even_if_all_others_have_rank_zero():
-    rank = torch.tensor([[0.9, 0.0, 0.0, 0.8]])
-    excluded = torch.tensor([[True, False, False, True]])
-    assert set(select_best(rank, excluded, 3)[0][0].tolist()) == {1, 2}
+    assert select_best(rank, 5)[0][0].tolist() == [1, 4, 2, 0, 3]
 
 
 def test_blend_weight_falls_to_zero_before_a_view_is_replaced():
     """As the last view's rank falls to that of the first one left out, its blend weight falls linearly to 0."""
     rank = torch.tensor([[0.5, 0.9, better, 0.8] for better in (0.7, 0.5 + FADE * 0.5 / 2, 0.5, 0.3)])
-    chosen, blend_weight = select_best(rank, torch.zeros(4, 4, dtype=torch.bool), 3)
+    chosen, blend_weight = select_best(rank, 3)
     assert chosen[:, :2].tolist() == [[1, 3]] * 4
     assert blend_weight[:, :2].tolist() == [[1, 1]] * 4
     assert blend_weight[:, 2].tolist() == pytest.approx([1, 0.5 / (1 + FADE / 2), 0, 1], abs=1e-4)
 
 
 def test_all_weights_are_one_if_no_view_is_left_out():
-    chosen, blend_weight = select_best(torch.tensor([[0.5, 0.2]]), torch.zeros(1, 2, dtype=torch.bool), 3)
+    chosen, blend_weight = select_best(torch.tensor([[0.5, 0.2]]), 3)
     assert (chosen.tolist(), blend_weight.tolist()) == ([[0, 1]], [[1, 1]])
 
 

@@ -79,6 +79,25 @@ def test_a_perfect_method_scores_the_best_values(scene, tmp_path):
     assert mean["flip"] == pytest.approx(0, abs=1e-6)
 
 
+def test_an_evaluation_that_dies_leaves_no_older_report_beside_its_pictures(tmp_path):
+    scene = wall.scene(wall.cameras(5), test=(1, 3))
+    settings = {"configuration": {}, "console": quiet(), "overwrite": True}
+    evaluate(darker, scene, tmp_path, **settings)
+
+    def die(camera: Cameras) -> Rendering:
+        raise KeyboardInterrupt
+
+    def die_at_the_second(camera: Cameras) -> Rendering:
+        return die(camera) if camera.names == ("03.jpg",) else perfect(camera)
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(die, scene, tmp_path, **settings)
+    assert (tmp_path / "evaluation.json").exists(), "before the first new picture"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(die_at_the_second, scene, tmp_path, **settings)
+    assert not list(tmp_path.glob("*evaluation*"))
+
+
 def test_renderings_and_labelled_pictures_are_written(scene, tmp_path):
     evaluate(darker, scene, tmp_path, configuration={}, console=quiet())
     with Image.open(tmp_path / "renderings" / "01.png") as picture:
@@ -113,14 +132,6 @@ def test_an_evaluation_is_only_overwritten_on_request(scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["evaluation.json"]
     evaluate(perfect, scene, tmp_path, configuration={}, overwrite=True, console=quiet())
     assert json.loads((tmp_path / "evaluation.json").read_text())["version"] == __version__
-
-
-def test_a_failed_evaluation_leaves_the_old_report(scene, tmp_path):
-    (tmp_path / "evaluation.json").write_text("precious")
-    with pytest.raises(TypeError):
-        evaluate(perfect, scene, tmp_path, configuration={"not json": {1, 2}}, overwrite=True, console=quiet())
-    assert (tmp_path / "evaluation.json").read_text() == "precious"
-    assert not list(tmp_path.glob("*.partial"))
 
 
 def test_a_rendering_that_is_not_finite_is_named(scene, tmp_path):

@@ -1,3 +1,4 @@
+import os
 import shutil
 
 import pytest
@@ -60,11 +61,18 @@ def test_without_weights_the_reason_names_the_file_and_the_commands(checkpoints,
 
 def test_the_reason_does_not_name_the_home_folder(checkpoints, monkeypatch):
     monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
-    monkeypatch.setattr(lpips.Path, "home", lambda: checkpoints.parent)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", str(checkpoints.parent)))
     reason = lpips.load_lpips()["lpips_vgg"]
     assert isinstance(reason, str)
     assert f'--output "$HOME/{checkpoints.name}/vgg16-397923af.pth"' in reason
     assert str(checkpoints) not in reason
+
+
+def test_without_a_home_folder_the_reason_is_given_all_the_same(monkeypatch):
+    monkeypatch.setattr(lpips, "prepare_torchvision", lambda: None)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as of a user that the system does not know
+    monkeypatch.delenv("TORCH_HOME", raising=False)
+    assert all("--download-lpips" in reason for reason in lpips.load_lpips().values())
 
 
 def test_a_missing_network_leaves_nulls_with_its_reason_and_all_other_metrics():

@@ -141,10 +141,15 @@ def test_an_exported_path_is_read_back_unchanged(tmp_path: Path, poses: np.ndarr
     assert torch.equal(found.cameras.principal_px[0], torch.tensor([80.0, 45.0]))
 
 
-def test_matrices_stored_by_columns_are_transposed(tmp_path: Path, poses: np.ndarray):
+@pytest.mark.parametrize("shape", [(16,), (4, 4)], ids=["flat", "rows"])
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_matrices_are_read_flat_or_as_rows_and_transposed_where_stored_by_columns(
+    tmp_path: Path, poses: np.ndarray, shape: tuple[int, ...], by_columns: bool
+):
     content = exported(poses)
     for frame in content["camera_path"]:
-        frame["camera_to_world"] = np.array(frame["camera_to_world"]).reshape(4, 4).T.flatten().tolist()
+        matrix = np.array(frame["camera_to_world"]).reshape(4, 4)
+        frame["camera_to_world"] = (matrix.T if by_columns else matrix).reshape(shape).tolist()
     found = load(tmp_path, content)
     assert torch.allclose(found.cameras.T_world_camera.double(), torch.tensor(poses[:, :3]), atol=1e-4)
 
@@ -202,6 +207,7 @@ def mirrored(content: dict) -> None:
         (lambda c: c["camera_path"][2]["camera_to_world"].__setitem__(3, 1e299), "frame 2 has .* = 1e\\+299"),
         (lambda c: c["camera_path"][2]["camera_to_world"].__setitem__(3, 10**400), "frame 2 has .* = 1000"),
         (lambda c: c["camera_path"][2].update(camera_to_world=[[1.0, 2.0], [3.0]]), "frame 2 has .* 16 numbers"),
+        (lambda c: c["camera_path"][2].update(camera_to_world=[[1.0] * 4] * 3 + [[]]), "frame 2 has .* 4 x 4 numbers"),
         (lambda c: c["camera_path"][3].update(fov=1e-300), "frame 3 has fov = 1e-300"),
         (lambda c: c.update(fps=None, seconds=1e-300), "seconds = 1e-300"),
         (broken_rotation, "frame 2: camera_to_world is no rotation"),

@@ -1,6 +1,7 @@
 """Videos and stills: decoded frames are those that were written, and no partial file has the final name."""
 
 import itertools
+import json
 import os
 import tracemalloc
 from dataclasses import replace
@@ -9,12 +10,14 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import textured_wall as wall
 import torch
 from PIL import Image
 
+from tidefield import __version__
 from tidefield.errors import RunError
 from tidefield.model.rendering import Rendering
-from tidefield.render.stills import colour_picture, depth_picture, depth_range, write_still
+from tidefield.render.stills import colour_picture, depth_picture, depth_range, describe_view, title, write_still
 from tidefield.render.video import write_video
 
 COLOURS = [(200, 30, 40), (30, 180, 60), (40, 60, 210), (128, 128, 128), (250, 240, 230)]
@@ -140,6 +143,34 @@ def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
         assert 7.0 < float(picture.text["far"]) <= 8.0
         assert picture.size == (32, 24)
     assert sorted(os.listdir(tmp_path)) == ["DJI_0001.png", "DJI_0001_depth.npy", "DJI_0001_depth.png"]
+
+
+def test_a_still_tells_what_made_it_of_which_scene_and_from_where(tmp_path: Path):
+    scene = wall.scene(wall.cameras(3))
+    scene = replace(scene, root=tmp_path / "Königshafen", origin_world=torch.tensor([4e5, 6e6, 0.1]).double())
+    camera = scene.cameras["02"].resized(24, 18)
+    write_still(rendering(), tmp_path / "view.png", about=describe_view(scene, camera))
+    for name in ("view.png", "view_depth.png"):
+        with Image.open(tmp_path / name) as picture:
+            text = picture.text
+        assert text["Software"] == f"tidefield {__version__}"
+        assert text["Title"] == "Königshafen, 02.jpg"
+        own = json.loads(text["Camera"])
+        assert [own[key] for key in ("scene", "photograph", "width", "height")] == ["Königshafen", "02.jpg", 24, 18]
+        assert (own["focal_px"], own["principal_px"]) == ([24, 24], [12, 9])
+        expected = np.hstack([np.eye(3), [[4e5 + 0.3], [6e6], [0.1]]])
+        np.testing.assert_allclose(own["T_world_camera"], expected, rtol=0, atol=1e-6)
+        assert "OpenCV" in own["convention"]
+        assert str(tmp_path) not in str(text)
+    assert title(replace(scene, root=Path("caf\udce9")), None) == "caf?"  # a name that is no UTF-8
+
+
+def test_a_video_tells_its_title_and_what_made_it(tmp_path: Path):
+    scene = replace(wall.scene(wall.cameras(3)), root=tmp_path / "Königshafen")
+    write_video([rendering()], tmp_path / "a.mp4", 24.0, title=title(scene, "orbit"))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        metadata = container.metadata
+    assert (metadata["title"], metadata["comment"]) == ("Königshafen, orbit", f"tidefield {__version__}")
 
 
 def test_depth_goes_from_red_to_blue_and_empty_pixels_are_black():

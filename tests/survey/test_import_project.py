@@ -4,12 +4,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import camera_files
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from opensfm_projects import reconstruction, tracks_of, write_opensfm, write_tracks
 from PIL import Image
+from PIL.ExifTags import Base
 from scenes_on_disk import (
     BARREL,
     PINHOLE,
@@ -84,13 +86,77 @@ def test_an_opensfm_project_becomes_a_consistent_colmap_model(tmp_path: Path, ki
     assert model.num_reg_images() == made.num_images() == 9
     assert model.compute_num_observations() == made.compute_num_observations() > 1000
     assert max(point.error for point in model.points3D.values()) < 1e-6
-    expected = "FULL_OPENCV" if kind == "brown" else "OPENCV"  # only brown has a sixth order
+    expected = "PINHOLE" if kind == "brown" else "OPENCV"  # only brown has a sixth order
     assert {camera.model_name for camera in model.cameras.values()} == {expected}
     colours = [point["color"] for point in reconstruction(kind)["points"].values()]
     assert [point.color.tolist() for _, point in sorted(model.points3D.items())] == colours
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < 1e-6
     assert_same(load_scene(tmp_path / "scene"), load_scene(tmp_path / "project"))
+
+
+@pytest.mark.parametrize("undistort", [False, True])
+def test_photographs_with_k3_or_all_on_request_are_undistorted_and_others_keep_their_files(
+    tmp_path: Path, undistort: bool
+) -> None:
+    truth = survey(replace(BARREL, k3=-0.01))
+    lenses = (*truth.lenses[:2], BARREL, PINHOLE, *truth.lenses[4:])
+    truth = replace(truth, lenses=lenses, names=tuple(name.replace("png", "jpg") for name in truth.names))
+    write_transforms(tmp_path / "theirs", truth)
+    for name, picture in zip(truth.names, truth.pictures, strict=True):
+        camera_files.photograph(
+            tmp_path / "theirs" / "images" / name, table=camera_files.exif({Base.Orientation: 6}), pixels=picture
+        )
+    import_project(tmp_path / "theirs", tmp_path / "ours", undistort=undistort)
+    model = pycolmap.Reconstruction(str(tmp_path / "ours" / "sparse" / "0"))
+    kinds = {"PINHOLE"} if undistort else {"PINHOLE", "OPENCV"}
+    assert {camera.model_name for camera in model.cameras.values()} == kinds
+    for name, lens in zip(truth.names, lenses, strict=True):
+        own, other = (tmp_path / folder / "images" / name for folder in ("ours", "theirs"))
+        is_new = bool(lens.k3) or (undistort and lens.is_distorted)
+        assert (own.read_bytes() != other.read_bytes()) == is_new
+        with Image.open(own) as picture:
+            assert (picture.format, picture.size) == ("JPEG", (64, 48))
+            assert picture.getexif()[Base.Orientation] == (1 if is_new else 6), "the pixels are not turned"
+    ours, theirs = load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs")
+    for part in ("T_world_camera", "focal_px", "principal_px", "size_px"):
+        torch.testing.assert_close(getattr(ours.cameras, part), getattr(theirs.cameras, part))
+    for own, other in zip(ours.photographs.colours, theirs.photographs.colours, strict=True):
+        assert (own.float() - other.float()).abs().mean() < 1.5, "JPEG's loss at quality 95"
+
+
+def test_reduced_photographs_are_written_beside_the_others_on_request(tmp_path: Path) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path / "theirs", truth)
+    calls: list[tuple[int, int]] = []
+    import_project(
+        tmp_path / "theirs", tmp_path / "ours", downscale=(2, 4), progress=lambda *so_far: calls.append(so_far)
+    )
+    assert calls == [(i, 18) for i in range(1, 19)]
+    for folder, size in {"images": (64, 48), "images_2": (32, 24), "images_4": (16, 12)}.items():
+        for name in truth.names:
+            with Image.open(tmp_path / "ours" / folder / name) as picture:
+                assert picture.size == size
+    assert_same(load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs"))
+    with pytest.raises(RunError, match="--downscale is 2 1: expected"):
+        import_project(tmp_path / "theirs", tmp_path / "refused", downscale=(2, 1))
+
+
+def test_observations_of_undistorted_photographs_are_exact_and_inside(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    import_project(tmp_path / "project", tmp_path / "scene")
+    theirs, ours = (read_posed(tmp_path / name, False) for name in ("project", "scene"))
+    assert theirs.points is not None
+    assert ours.points is not None
+    moved = theirs.lenses[0].unproject(theirs.points.uv_px) * (ours.lenses[0].fx, ours.lenses[0].fy)
+    moved += (ours.lenses[0].cx, ours.lenses[0].cy)
+    moved = moved[((moved >= 0) & (moved < (64, 48))).all(axis=1)]
+    assert 0.7 * len(theirs.points.uv_px) < len(moved) < len(theirs.points.uv_px)
+    np.testing.assert_allclose(np.sort(ours.points.uv_px, axis=0), np.sort(moved, axis=0), atol=1e-6)
+    for pose, lens, mine in zip(ours.T_world_camera, ours.lenses, ours.points.by_photograph(9), strict=True):
+        xyz_camera = (ours.points.xyz_world[ours.points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
+        off_px = np.linalg.norm(lens.project(xyz_camera) - ours.points.uv_px[mine], axis=1)
+        assert off_px.max() < 1e-6
 
 
 def test_points_without_observations_are_kept(tmp_path: Path) -> None:
@@ -208,7 +274,7 @@ def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_failed_import_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_project(tmp_path / "project")
+    write_project(tmp_path / "project", "radial")
 
     def stumble(*_: object) -> None:
         raise KeyboardInterrupt

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from ground_flight import ABOVE, FOCAL, Flight, fly
+from PIL import Image
 from rich.console import Console
 
 from tidefield.data.georeference import read_georeference
@@ -28,8 +29,11 @@ GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
 OPTIONS = FeatureOptions(count=1500)
 
 
-def run(folder: Path, scene: Path, colour: Literal["auto", "off"] = "auto") -> Prepared:
-    return prepare(read_survey(folder), scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), colour=colour)
+def run(
+    folder: Path, scene: Path, colour: Literal["auto", "off"] = "auto", downscale: tuple[int, ...] = ()
+) -> Prepared:
+    survey, console = read_survey(folder), Console(quiet=True)
+    return prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, console, colour=colour, downscale=downscale)
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +115,27 @@ def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends
     name = flight.names[0]
     assert (scene / "images" / name).read_bytes() == (flight.folder / name).read_bytes()
     assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
+
+
+def test_reduced_photographs_are_written_on_request_and_removed_without(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path
+):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    images = {path: path.stat().st_mtime_ns for path in (scene / "images").iterdir()}
+    run(flight.folder, scene, downscale=(2, 4))
+    (scene / "images_4" / "notes.txt").write_text("mine")
+    for factor in (2, 4):
+        for name in flight.names:
+            with Image.open(scene / "images" / name) as whole, Image.open(scene / f"images_{factor}" / name) as small:
+                assert small.size == (whole.width // factor, whole.height // factor)
+    run(flight.folder, scene, downscale=(2,))
+    assert os.listdir(scene / "images_4") == ["notes.txt"]
+    run(flight.folder, scene)
+    assert not (scene / "images_2").exists()
+    assert {path: path.stat().st_mtime_ns for path in (scene / "images").iterdir()} == images
+    (scene / "images_2").symlink_to(flight.folder)
+    with pytest.raises(RunError, match="images_2 is a link to"):
+        run(flight.folder, scene, downscale=(2,))
 
 
 def test_the_originals_behind_a_linked_images_folder_stay_as_they_are(
@@ -294,7 +319,7 @@ def test_a_scene_that_may_not_be_read_is_one_error(part: str, made: tuple[Path, 
     (scene / part).chmod(0)
     os.seteuid(54321)
     try:
-        with pytest.raises(RunError, match=r"cannot be written \(Permission denied\): expected"):
+        with pytest.raises(RunError, match=r"cannot be written \(Permission denied.*\): expected"):
             run(folder, scene)
     finally:
         os.seteuid(0)

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import Base
 
+from tidefield.errors import RunError
 from tidefield.survey.colour import ExposureCorrection
-from tidefield.survey.export import tangent_map, write_images
+from tidefield.survey.export import reduced_folders, tangent_map, write_images, write_reduced_images
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.survey import Photograph
@@ -84,6 +85,32 @@ def test_tiffs_stay_tiffs(tmp_path: Path):
     with Image.open(tmp_path / "images" / "0.tif") as picture:
         assert picture.format == "TIFF"
         np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
+
+
+def test_reduced_photographs_are_means_of_whole_blocks_in_the_format_of_the_others(tmp_path: Path):
+    pixels = np.random.default_rng(0).integers(0, 256, (11, 14, 4), dtype=np.uint8)
+    (tmp_path / "images" / "a").mkdir(parents=True)
+    Image.fromarray(pixels).save(tmp_path / "images" / "a" / "alpha.png")
+    camera_files.photograph(tmp_path / "images" / "b.jpg", (14, 11), camera_files.exif({Base.Model: "M1"}))
+    write_reduced_images(tmp_path, ["a/alpha.png", "b.jpg"], (2, 4), quiet)
+    for factor, (width, height) in {2: (7, 5), 4: (3, 2)}.items():
+        blocks = pixels[: height * factor, : width * factor].reshape(height, factor, width, factor, 4)
+        with Image.open(tmp_path / f"images_{factor}" / "a" / "alpha.png") as picture:
+            np.testing.assert_allclose(np.asarray(picture), blocks.mean(axis=(1, 3)), atol=0.51)
+        with Image.open(tmp_path / f"images_{factor}" / "b.jpg") as picture:
+            assert (picture.format, picture.size, picture.getexif()[Base.Model]) == ("JPEG", (width, height), "M1")
+
+
+@pytest.mark.parametrize("factors", [(1,), (0,), (-2,), (2, 2), (65,)])
+def test_factors_that_do_not_reduce_are_one_clear_error(factors: tuple[int, ...]):
+    with pytest.raises(RunError, match=r"--downscale is .*expected different whole numbers from 2 to 64"):
+        reduced_folders(factors)
+
+
+def test_a_photograph_that_is_too_small_to_reduce_is_named(tmp_path: Path):
+    camera_files.photograph(tmp_path / "images" / "b.jpg", (14, 3))
+    with pytest.raises(RunError, match=r"b\.jpg has 14 x 3 pixels: expected at least 4 each way for images_4"):
+        write_reduced_images(tmp_path, ["b.jpg"], (4,), quiet)
 
 
 def test_other_files_in_the_folder_stay(photographs, tmp_path: Path):

@@ -60,9 +60,10 @@ def nearest(scene: Scene) -> Render:
 
     Only photographs that see at least half as much of that surface as the best of them are candidates.
     """
-    sources = scene.cameras[list(scene.train)]
 
     def render(camera: Cameras) -> Rendering:
+        indices = scene.sources(camera)
+        sources = scene.cameras[list(indices)]
         depth = surface_depth(camera, scene.points, scene.cameras)
         points_world = surface_points(camera, depth)
         uv, z = sources.project(points_world)
@@ -72,7 +73,7 @@ def nearest(scene: Scene) -> Render:
         best = int(distance.masked_fill(overlap < overlap.max() / 2, torch.inf).argmin())
         colour = torch.zeros_like(points_world)
         if seen[best].any():
-            colour[seen[best]] = read_photograph(scene, scene.train[best], uv[best, seen[best]])
+            colour[seen[best]] = read_photograph(scene, indices[best], uv[best, seen[best]])
         return _filled(camera, colour, depth, seen[best])
 
     return render
@@ -84,12 +85,12 @@ def sparse_depth(scene: Scene) -> Render:
     The weights are those of unstructured lumigraph rendering (Buehler et al., 2001). On plain ground with dense overlap
     this scores high for nearly no work.
     """
-    sources = scene.cameras[list(scene.train)]
 
     def render(camera: Cameras) -> Rendering:
+        indices = scene.sources(camera)
         depth = surface_depth(camera, scene.points, scene.cameras)
-        chunks = surface_points(camera, depth).split(max(1, CHUNK // len(sources)))
-        blended = torch.cat([_blend(scene, sources, camera, chunk) for chunk in chunks])
+        chunks = surface_points(camera, depth).split(max(1, CHUNK // len(indices)))
+        blended = torch.cat([_blend(scene, indices, camera, chunk) for chunk in chunks])
         return _filled(camera, blended[:, :3], depth, blended[:, 3] > 0)
 
     return render
@@ -119,11 +120,12 @@ def nearest_photographs(scene: Scene, camera: Cameras, count: int) -> list[int]:
     """
     small = camera.resized(16, 16)
     points_world = surface_points(small, surface_depth(small, None, scene.cameras))
-    sources = scene.cameras[list(scene.train)]
+    indices = scene.sources(camera)
+    sources = scene.cameras[list(indices)]
     uv, z = sources.project(points_world)
     angle = _angles(camera, sources, points_world)
     angle = torch.where(in_frame(sources, uv, z), angle, torch.pi / 2).mean(1)
-    return [scene.train[i] for i in angle.argsort()[:count].tolist()]
+    return [indices[i] for i in angle.argsort()[:count].tolist()]
 
 
 def _filled(
@@ -142,8 +144,11 @@ def _angles(camera: Cameras, sources: Cameras, points_world: Float[Tensor, "P 3"
     return angle_between(ours, theirs)
 
 
-def _blend(scene: Scene, sources: Cameras, camera: Cameras, points_world: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4"]:
+def _blend(
+    scene: Scene, indices: tuple[int, ...], camera: Cameras, points_world: Float[Tensor, "P 3"]
+) -> Float[Tensor, "P 4"]:
     """Weighted mean colour of each surface point, and the sum of its weights: 0 where no photograph sees it."""
+    sources = scene.cameras[list(indices)]
     uv, z = sources.project(points_world)
     angle = _angles(camera, sources, points_world)
     angle = angle.masked_fill(~in_frame(sources, uv, z), torch.inf)
@@ -153,7 +158,7 @@ def _blend(scene: Scene, sources: Cameras, camera: Cameras, points_world: Float[
     weight = (1 - smallest[:VIEWS] / limit).clamp(min=1e-3) / (smallest[:VIEWS] + SOFTNESS_RAD)
     weight = torch.where(smallest[:VIEWS].isfinite(), weight, torch.zeros_like(weight))
     total = points_world.new_zeros(len(points_world), 3)
-    for source, index in enumerate(scene.train):
+    for source, index in enumerate(indices):
         rank, point = torch.nonzero((which[:VIEWS] == source) & (weight > 0), as_tuple=True)
         if len(point):
             total[point] += weight[rank, point, None] * read_photograph(scene, index, uv[source, point])

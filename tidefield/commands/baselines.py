@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Baselines:
-    """Install methods of other projects, in environments of their own."""
+    """Install methods of other projects, in environments of their own.
+
+    They get the PyTorch that Tidefield runs on, which must be 2.6 or newer.
+    """
 
     action: Positional[Literal["install"]]
     """What to do."""

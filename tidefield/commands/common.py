@@ -12,6 +12,7 @@ from tyro.conf import arg
 from tyro.extras import literal_type_from_choices
 
 from tidefield.config import PRESETS, config_to_json
+from tidefield.errors import RunError
 from tidefield.methods import names
 
 if TYPE_CHECKING:
@@ -24,6 +25,13 @@ if TYPE_CHECKING:
 Preset = Literal["swift", "paper"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
+Downscale = Annotated[
+    tuple[int, ...],
+    arg(
+        metavar="[N [N ...]]",
+        help="Also write the photographs at an Nth of their size, as images_N, which nerfstudio and gsplat open.",
+    ),
+]
 
 
 if TYPE_CHECKING:
@@ -80,9 +88,15 @@ def open_trained(
     folder: Path, device: torch.device, allow_missing: bool, console: Console
 ) -> Iterator[tuple[Scene, Render, dict[str, Any]]]:
     """The scene and the method of a run, while the block lasts, and its record."""
+    from tidefield.data.load import is_scene
     from tidefield.methods import trained
-    from tidefield.train.checkpoint import read_run
+    from tidefield.train.checkpoint import RUN_FILE, read_run
 
+    if not (folder / RUN_FILE).exists() and is_scene(folder):
+        raise RunError(
+            f"{folder} is a scene, not a run: expected a folder that `tidefield train` wrote; add --zero-shot to use "
+            f"the scene without training, or train first: `tidefield train {folder} RUN`"
+        )
     run = read_run(folder)
     scene = load(run.scene, run.width, allow_missing, console)
     with trained(folder, run, scene, device) as (render, progress):

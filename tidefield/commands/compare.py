@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tidefield.compare.results import Results
-    from tidefield.compare.run import Settings
+    from tidefield.compare.run import Settings, Usage
 
 SYNTHETIC_WIDTH = 400
 
@@ -98,7 +98,12 @@ def run_all(
     with worker_processes(1) as pool:
         for scene in scenes.values():
             pool.submit(check_scene, scene, settings.width).result()
-    compare(scenes, methods, settings, out, run_measured, lambda text: print_lines(console, [text]))
+    quiet = ["--quiet"] if console.quiet else []
+
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        return run_measured([*command, *quiet], environment)
+
+    compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]))
     return read_results(out, list(scenes), methods)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Verbosity
+from tidefield.commands.common import AllowMissing, Downscale, Verbosity
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 class Import:
     """Make a scene of a project of ODM or OpenSfM, of a COLMAP model, or of nerfstudio's transforms.json.
 
-    Poses and photographs stay as they are. The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio,
-    gsplat and OpenSplat open it, too.
+    Poses and photographs stay as they are; only photographs whose lens has k3 are undistorted, because other programs
+    do not read it. The scene has a COLMAP model and a transforms.json: COLMAP, nerfstudio, gsplat and OpenSplat open
+    it, too.
     """
 
     project: Annotated[Positional[Path], arg(metavar="PROJECT")]
@@ -28,6 +29,9 @@ class Import:
     """Folder for the scene; must be new."""
     link: bool = False
     """Give the photographs a second name (hard links) instead of copying them."""
+    undistort: bool = False
+    """Undistort all photographs, for programs that open no others: the original 3D Gaussian splatting."""
+    downscale: Downscale = ()
     allow_missing: AllowMissing = False
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
@@ -42,7 +46,13 @@ def import_project(options: Import, console: Console) -> None:
     set_up_pycolmap(options.verbosity.verbose)
     with ProgressBar(console, "Copying photographs") as bar:
         model, located = importing.import_project(
-            options.project, options.scene, link=options.link, allow_missing=options.allow_missing, progress=bar
+            options.project,
+            options.scene,
+            link=options.link,
+            undistort=options.undistort,
+            downscale=options.downscale,
+            allow_missing=options.allow_missing,
+            progress=bar,
         )
     photographs, cameras, observations = model.num_images(), model.num_cameras(), model.compute_num_observations()
     observed = f", observed {observations:,} times" if observations else ""

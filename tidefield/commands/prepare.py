@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import Verbosity
+from tidefield.commands.common import Downscale, Verbosity
 from tidefield.errors import RunError
 from tidefield.files import writing_to
 
@@ -45,6 +45,7 @@ class Prepare:
     """Most features to find in a photograph: 100 to 50000."""
     feature_width: int = 2400
     """Longer side in pixels to which larger photographs are reduced to find features: 100 to 50000."""
+    downscale: Downscale = ()
     redo: str | None = None
     """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
@@ -73,6 +74,7 @@ def prepare(options: Prepare, console: Console) -> None:
         console,
         keep_all=options.keep_all,
         colour=options.colour,
+        downscale=options.downscale,
         redo=options.redo,
     )
     with writing_to(options.scene):
@@ -94,7 +96,9 @@ def _shown(options: Prepare) -> dict[str, str]:
         if value is True
         else value.resolve().name
         if isinstance(value, Path)
+        else " ".join(map(str, value))
+        if isinstance(value, tuple)
         else str(value)
         for name, value in given.items()
-        if value is not None and value is not False
+        if value is not None and value is not False and value != ()
     }

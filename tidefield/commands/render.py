@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a video along a camera path (OUT.mp4), or the view of one photograph's camera with its depth (OUT.png)."""
+    """Render a video along a camera path (OUT.mp4), or the view of one photograph's camera (OUT.png).
+
+    A view comes with its depth: OUT_depth.npy has the z-depth of each pixel, float32, in the scene's units (metres
+    where it is georeferenced), and NaN where no surface is; OUT_depth.png shows it, red near and blue far. The text
+    fields of both PNGs tell the software, the scene's name, the photograph, and the camera with its pose.
+    """
 
     source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
     """A trained run, or with --zero-shot a scene."""
@@ -32,6 +37,9 @@ class Render:
     (JSON)."""
     camera: str | None = None
     """Name of a photograph whose camera is rendered instead of a path."""
+    with_itself: bool = False
+    """With --camera, let a training photograph serve as a neighbour of its own view, which then hardly differs from it;
+    without, its view is made from the others, as that of a held-out photograph."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     frames: int = 240
     """Frames of the video, 24 a second."""
@@ -51,13 +59,15 @@ def render(options: Render, console: Console) -> None:
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
     from tidefield.render.camera_paths import make_trajectory
-    from tidefield.render.stills import still_files, write_still
+    from tidefield.render.stills import describe_view, still_files, title, write_still
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
     suffix = ".mp4" if camera is None else ".png"
     if out.suffix.lower() != suffix:
         what = "a video" if camera is None else "one view (--camera)"
         raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
+    if options.with_itself and camera is None:
+        raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
     device = choose_device(options.device)
     with ExitStack() as stack:
@@ -69,8 +79,9 @@ def render(options: Render, console: Console) -> None:
             scene, view, _ = stack.enter_context(opened)
         if camera is not None:
             own = scene.cameras[scene.index(camera)]
-            size = _size(own, options.width, options.height)
-            for file in write_still(view(own.resized(*size)), out, overwrite=overwrite):
+            own = own.resized(*_size(own, options.width, options.height))
+            made = view(replace(own, names=()) if options.with_itself else own)
+            for file in write_still(made, out, about=describe_view(scene, own), overwrite=overwrite):
                 console.print(str(file), highlight=False, soft_wrap=True)
             return
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
@@ -83,6 +94,7 @@ def render(options: Render, console: Console) -> None:
                 (view(cameras[k]) for k in range(len(cameras))),
                 out,
                 trajectory.frames_per_second,
+                title=title(scene, Path(options.path).name),
                 overwrite=overwrite,
                 progress=lambda done: bar(done, len(cameras)),
             )

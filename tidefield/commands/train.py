@@ -176,17 +176,18 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
-    weights, from_random = options.weights, options.from_scratch or options.method != "tidefield"
-    if weights is not None and from_random:
-        raise RunError(
-            "--weights is given for a training that starts without: expected one or the other; leave one out"
-        )
-    config = configuration(options.method, options.preset)
+    weights, config = options.weights, configuration(options.method, options.preset)
     if options.variant is not None:
         if not isinstance(config, Config):
             raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
         config = vary(config, options.variant)
-    elif weights is None and not from_random:
+    from_random = options.from_scratch or not isinstance(config, Config)
+    if weights is not None and from_random:
+        raise RunError(
+            "--weights is given for a training that starts without (--from-scratch, another method, or a variant that "
+            "is one): expected one or the other; leave one out"
+        )
+    if options.variant is None and weights is None and not from_random:
         weights = shipped_weights(options.preset)
     digest = None
     if weights is not None:

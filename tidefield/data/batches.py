@@ -117,7 +117,7 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], priors[target]
         middle_world = unproject_to_surface(camera, prior, at[None] + side / 2)[0]
-        found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours, target)
+        found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours)
         colours, inside = _tile(scene, target, at.long(), side)
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:

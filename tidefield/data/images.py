@@ -1,7 +1,7 @@
 """Read photographs: undistorted and resized once, then cached as raw bytes in one memory-mapped file.
 
-The file lies in the user's cache folder, named by a hash of everything that its pixels depend on, so a scene that is
-opened again at the same width is not decoded again.
+The file lies in the user's cache folder (see `data.cache`), named by a hash of everything that its pixels depend on, so
+a scene that is opened again at the same width is not decoded again.
 """
 
 from __future__ import annotations
@@ -11,21 +11,19 @@ import hashlib
 import json
 import logging
 import os
-import stat
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from platformdirs import user_cache_path
+from PIL import Image
 from torch import Tensor
 
+from tidefield.data.cache import SUFFIX, cache_folder, make_room, refuse_shared
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
@@ -37,7 +35,6 @@ Progress = Callable[[int, int], None]
 
 # Part of every key: to be raised when the same photograph would give other pixels.
 _PIXELS_VERSION = 1
-_DAYS_KEPT_UNUSED = 60
 _MODES_WITH_ALPHA = ("RGBA", "LA", "PA")
 _MODES = ("1", "L", "P", "RGB", "CMYK", "YCbCr", *_MODES_WITH_ALPHA)
 
@@ -101,7 +98,21 @@ def read_header(path: Path) -> tuple[int, int, bool]:
     with open_picture(path) as picture:
         if picture.mode not in _MODES:
             raise SceneError(f"{path} has pixels of the mode {picture.mode}: expected 8 bits per colour; convert it")
-        return *picture.size, picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
+        return *picture.size, _has_alpha(picture)
+
+
+def decode(path: Path) -> UInt8[np.ndarray, "H W C"]:
+    """Decode a photograph as it is stored: RGB, or RGBA if it has alpha; EXIF orientation is not applied.
+
+    Raises:
+        SceneError: it cannot be decoded completely.
+    """
+    with open_picture(path) as picture:
+        return np.asarray(picture.convert("RGBA" if _has_alpha(picture) else "RGB"))
+
+
+def _has_alpha(picture: Image.Image) -> bool:
+    return picture.mode in _MODES_WITH_ALPHA or "transparency" in picture.info
 
 
 @quiet_pillow()
@@ -120,24 +131,24 @@ def open_photographs(
         cache: a folder; the user's if not given.
 
     Raises:
-        SceneError: a photograph cannot be decoded completely, or the disk is full.
+        SceneError: a photograph cannot be decoded completely, the disk is full, or the cache's limit is no number.
     """
-    folder = cache or _cache_folder()
+    folder = cache or cache_folder()
     if folder is None:
         _log.warning(
             "this user has no home folder for a cache: photographs are held in memory and decoded again next time; "
             "set XDG_CACHE_HOME to a writable folder"
         )
         return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
-    store = folder / f"{_key(files, background_rgb)}.photographs"
+    store = folder / f"{_key(files, background_rgb)}{SUFFIX}"
     expected = sum(file.bytes for file in files)
     try:
         store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        _refuse_shared(store.parent)
+        refuse_shared(store.parent)
         if store.is_file() and store.stat().st_size == expected:
             os.utime(store)
         else:
-            _delete_unused(store.parent)
+            make_room(store.parent, expected)
             with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
                 for picture in _decoded(files, background_rgb, progress):
                     file.write(picture.data)
@@ -149,7 +160,8 @@ def open_photographs(
         if cause.errno in (errno.ENOSPC, errno.EDQUOT):
             raise SceneError(
                 f"the disk of {store.parent} is full: {expected / 1e6:.0f} MB are needed there for the photographs; "
-                "free some space, choose a smaller --width, or set XDG_CACHE_HOME to a folder on another disk"
+                "free some space (`tidefield cache --clear`), choose a smaller --width, or set XDG_CACHE_HOME to a "
+                "folder on another disk"
             ) from error
         if cause.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
             raise
@@ -162,29 +174,6 @@ def open_photographs(
     return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
 
 
-def _cache_folder() -> Path | None:
-    """$XDG_CACHE_HOME/tidefield on every system, or else the system's own folder for caches.
-
-    None where the system knows no home folder of this user, as in containers.
-    """
-    chosen = os.environ.get("XDG_CACHE_HOME")
-    if chosen:
-        return Path(chosen) / "tidefield"
-    try:
-        folder = user_cache_path("tidefield", appauthor=False)
-    except RuntimeError:
-        return None
-    return folder if folder.is_absolute() else None  # platformdirs before 4.5 returns "~/.cache"
-
-
-def _refuse_shared(folder: Path) -> None:
-    """Raise a PermissionError for a cache folder in which others can put pixels: only a file's size is checked."""
-    status = folder.stat()
-    # Windows has no such bits; there the folder belongs to the user's profile.
-    if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & stat.S_IWOTH):
-        raise PermissionError(errno.EPERM, "others own it or can write to it")
-
-
 def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
     parts = []
     for file in files:
@@ -193,16 +182,6 @@ def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, fl
         parts.append([about, status.st_size, status.st_mtime_ns])
     text = json.dumps([_PIXELS_VERSION, background_rgb, parts], sort_keys=True)
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
-
-
-def _delete_unused(folder: Path) -> None:
-    """Delete stores, and partial files of killed programs, that were not opened for `_DAYS_KEPT_UNUSED` days."""
-    limit = time.time() - _DAYS_KEPT_UNUSED * 86400
-    for store in [*folder.glob("*.photographs"), *folder.glob("*.partial")]:
-        # Another program may have deleted it, or (on Windows) have it open: then it stays until the next time.
-        with suppress(FileNotFoundError, PermissionError):
-            if store.stat().st_mtime < limit:
-                store.unlink()
 
 
 def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
@@ -240,8 +219,7 @@ def _decoded(
 
 
 def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
-    with open_picture(file.path) as picture:
-        pixels = np.asarray(picture.convert("RGBA" if file.has_alpha else "RGB"))
+    pixels = decode(file.path)
     if not file.has_alpha:
         return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
     # Composited before it is resampled: the colour of a transparent pixel is arbitrary.

@@ -18,7 +18,7 @@ from tidefield.data.images import PhotographFile, Progress, open_photographs, re
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.files import naming, reading
-from tidefield.data.readers.llff import read_llff
+from tidefield.data.readers.llff import SUFFIXES, read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
@@ -215,12 +215,24 @@ def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
 def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Read the layout that the folder's files show."""
     if not root.is_dir():
-        raise SceneError(f"{root} is {'a file' if root.exists() else 'missing'}: {_expected()}")
+        raise SceneError(f"{root} is {'a file' if root.exists() else 'missing'}: {_expected('PHOTOGRAPHS')}")
     for layout in LAYOUTS:
         if (found := layout.find(root)) is not None:
             return layout.read(root, found, allow_missing)
-    names = sorted(path.name + "/" * path.is_dir() for path in root.iterdir())
-    raise SceneError(f"{root} has no posed photographs (found: {list_names(names, 8) or 'nothing'}): {_expected()}")
+    paths = sorted(root.iterdir())
+    if any(path.suffix.lower() in SUFFIXES for path in paths):
+        raise SceneError(
+            f"{root} has photographs without poses: expected a scene; make one with `tidefield prepare {root} SCENE`, "
+            "and name SCENE instead"
+        )
+    names = [path.name + "/" * path.is_dir() for path in paths]
+    raise SceneError(f"{root} has no posed photographs (found: {list_names(names, 8) or 'nothing'}): {_expected(root)}")
+
+
+def is_scene(root: Path) -> bool:
+    """Whether a folder has the files of one of `LAYOUTS`."""
+    with reading(root):
+        return any(layout.find(root) is not None for layout in LAYOUTS)
 
 
 def _refuse_repeated(posed: PosedPhotographs, root: Path) -> None:
@@ -237,11 +249,11 @@ def _refuse_repeated(posed: PosedPhotographs, root: Path) -> None:
         names[file] = name
 
 
-def _expected() -> str:
+def _expected(photographs: Path | str) -> str:
     lines = "\n".join(f"  {layout.files:<70} {layout.program}" for layout in LAYOUTS)
     return (
-        f"expected one of\n{lines}\n; estimate poses of the photographs first (`tidefield prepare` or COLMAP), or give "
-        "the folder that holds these"
+        f"expected one of\n{lines}\n; estimate poses of the photographs first (`tidefield prepare {photographs} "
+        "SCENE`, or COLMAP), or give the folder that holds these"
     )
 
 
@@ -263,12 +275,10 @@ def _sparse_points(
     observations = points.by_photograph(len(pinholes))
     for lens, pinhole, pose, mine in zip(lenses, pinholes, T_world_camera, observations, strict=True):
         xyz = (points.xyz_world[points.point_index[mine]] - pose[:, 3]) @ pose[:, :3]
-        xy = lens.unproject(points.uv_px[mine])
-        uv = xy * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+        uv = lens.to_pinhole(points.uv_px[mine], pinhole)
         with np.errstate(all="ignore"):  # points in the camera's plane, which are left out
             off = np.linalg.norm(pinhole.project(xyz) - uv, axis=1)
-        inside = (uv >= 0).all(axis=1) & (uv < (pinhole.width, pinhole.height)).all(axis=1)
-        good = inside & (xyz[:, 2] > 0) & np.isfinite(off)
+        good = (xyz[:, 2] > 0) & np.isfinite(off)
         uv_px[mine[good]], off_px[mine[good]] = uv[good], off[good]
     good = np.isfinite(off_px)
     seen, point_index = np.unique(points.point_index[good], return_inverse=True)

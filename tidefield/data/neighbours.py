@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -83,12 +83,11 @@ def rank_by_direction(targets: Cameras, candidates: Cameras) -> Float[Tensor, "K
 
 
 def select_best(
-    rank: Float[Tensor, "K V"], excluded: Bool[Tensor, "K V"], count: int, spare: int = 0
+    rank: Float[Tensor, "K V"], count: int, spare: int = 0
 ) -> tuple[Int[Tensor, "K N"], Float[Tensor, "K N"]]:
     """Select the best-ranked candidates at each corner, best first; fewer where there are not as many.
 
     Args:
-        excluded: candidates that must not serve, such as the target photograph itself.
         count: of candidates with a weight above 0.
         spare: how many more follow with the weight 0.
 
@@ -96,9 +95,9 @@ def select_best(
         The candidates and their blend weights, 0 to 1. The weight of a candidate falls to 0 before a better one takes
         its place, so that the views change continuously.
     """
-    allowed = int((~excluded).sum(1).min())
-    found = rank.masked_fill(excluded, -1.0).topk(min(count + max(spare, 1), allowed), dim=1)
-    if allowed <= count:
+    candidates = rank.shape[1]
+    found = rank.topk(min(count + max(spare, 1), candidates), dim=1)
+    if candidates <= count:
         return found.indices, torch.ones_like(found.values)
     chosen, best, left_out = found.indices[:, : count + spare], found.values[:, : count + spare], found.values[:, count]
     blend_weight = (best - left_out[:, None].clamp(min=0)) / (FADE * best).clamp(min=1e-9)
@@ -114,9 +113,8 @@ def choose_neighbours(
     scene: Scene,
     count: int,
     strategy: str,
-    excluded: int | None = None,
 ) -> Neighbours:
-    """Choose training photographs as the neighbouring views of a grid of tiles, row by row.
+    """Choose among the sources of a camera's view (`Scene.sources`) the neighbours of a grid of tiles, row by row.
 
     Args:
         camera: of the tiles.
@@ -127,7 +125,6 @@ def choose_neighbours(
         scene: of the photographs.
         count: of views at each corner; the tiles have `EXTRA_VIEWS` more, unless all corners have the same.
         strategy: `TrainConfig.neighbours`.
-        excluded: a photograph that must not serve.
     """
     columns, rows = grid
     corners_px = corner_px + (pixel_grid(columns + 1, rows + 1) - 0.5) * side_px
@@ -135,20 +132,19 @@ def choose_neighbours(
     surface = unproject_to_surface(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
     by_direction = strategy == "direction"
     spare = EXTRA_VIEWS if count and not by_direction else 0
-    train = torch.tensor(scene.train)
-    if not by_direction and len(train) > PRESELECT_ABOVE and len(surface) > PRESELECT_STEP:
+    sources = torch.tensor(scene.sources(camera), dtype=torch.long)
+    if not by_direction and len(sources) > PRESELECT_ABOVE and len(surface) > PRESELECT_STEP:
         # The best at some corners are the best at those in between: the cost stays bounded in large scenes.
-        some = rank_by_view(camera, surface[::PRESELECT_STEP], scene.cameras[train])
-        train = train[some.topk(min(2 * (count + spare), len(train)), dim=1).indices.unique()]
-    candidates = scene.cameras[train]
+        some = rank_by_view(camera, surface[::PRESELECT_STEP], scene.cameras[sources])
+        sources = sources[some.topk(min(2 * (count + spare), len(sources)), dim=1).indices.unique()]
+    candidates = scene.cameras[sources]
     if by_direction:
         rank = rank_by_direction(camera, candidates).expand(len(surface), -1)
     else:
         rank = rank_by_view(camera, surface, candidates)
-    out = (train == (-1 if excluded is None else excluded)).expand(len(rank), -1)
-    chosen, blend_weight = select_best(rank, out, count, spare)
+    chosen, blend_weight = select_best(rank, count, spare)
     first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
-    return _combine_corners(train[chosen], blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))
+    return _combine_corners(sources[chosen], blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))
 
 
 def _combine_corners(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -90,6 +91,16 @@ class Scene:
             SceneError: no photograph has this name.
         """
         return find_name(name, self.names, str(self.root))
+
+    def sources(self, camera: Cameras) -> tuple[int, ...]:
+        """List the photographs that one camera's view may be made from: the training photographs, but not its own.
+
+        A camera's own photograph has its name and its pose. A camera without a name has none.
+        """
+        own = self.names.index(camera.names[0]) if camera.names and camera.names[0] in self.names else None
+        if own is None or not torch.equal(self.cameras.T_world_camera[own], camera.T_world_camera[0]):
+            return self.train
+        return tuple(i for i in self.train if i != own)
 
 
 def every_eighth(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -89,6 +89,7 @@ def evaluate(
             if not memory:
                 # Measured before LPIPS's networks are loaded, which are no part of the method.
                 memory, networks = _peak_memory(), load_lpips()
+                delete_files(out, [path])  # an older one is not of the pictures that follow
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
             seen = doubly_seen(scene, scene.cameras[index])
             scores = score(image, truth, seen, networks)

@@ -7,6 +7,7 @@ optional extra), their weights from two files in torch hub's folder. Nothing is 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -86,7 +87,7 @@ def load_lpips() -> dict[str, Lpips | str]:
 
 def _load(backbone: Literal["alex", "vgg"], path: Path) -> Lpips | str:
     # Results are kept and passed on, and should not contain the name of a home folder.
-    home = Path.home()
+    home = Path(os.path.expanduser("~"))  # "~" itself where the system knows none
     shown = f"$HOME/{path.relative_to(home).as_posix()}" if path.is_relative_to(home) else path
     how_to_get = (
         "run `tidefield evaluate` once with --download-lpips, or: "

@@ -35,7 +35,9 @@ class Cameras:
         near_far: nearest and farthest z-depth (along +z) of the scene for this camera, world units.
         gain: colour gain of the photograph, per channel, relative to the scene's common exposure; 1 where unknown.
             A photograph divided by its gain is at the common exposure (docs/method.md, section 12).
-        names: of the photographs, to index by; empty where the cameras have none.
+        names: of the photographs, to index by; empty where the cameras have none. The view of a scene's own photograph
+            is rendered without that photograph, as if it were held out; with `dataclasses.replace(camera, names=())` it
+            serves as any other.
     """
 
     T_world_camera: Float[Tensor, "V 3 4"]

@@ -155,6 +155,12 @@ class Lens:
         fx, fy = self.width / (x1 - x0), self.height / (y1 - y0)
         return Lens(self.width, self.height, fx, fy, -x0 * fx, -y0 * fy)
 
+    def to_pinhole(self, uv_px: Points, pinhole: Lens) -> Points:
+        """Move pixels of a photograph to the undistorted one; NaN outside of it."""
+        uv = self.unproject(uv_px) * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+        inside = (uv >= 0) & (uv < (pinhole.width, pinhole.height))
+        return np.where(inside.all(axis=1, keepdims=True), uv, np.nan)
+
     def _jacobian(self, xy: Points) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y

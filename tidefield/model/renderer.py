@@ -17,6 +17,7 @@ from tidefield.data.depth_prior import surface_prior, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
+from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.cache import CacheFull, FeatureCache
 from tidefield.model.network import Network
@@ -41,7 +42,7 @@ class Renderer:
 
     Args:
         network: in evaluation mode, on `device`.
-        scene: whose training photographs serve as neighbours.
+        scene: whose training photographs serve as neighbours, except for their own cameras' views.
         config: the run's.
         device: where to compute.
     """
@@ -57,12 +58,18 @@ class Renderer:
         self.fills_unseen = network.fills_unseen and scene.background_rgb is None
         few = scene.train[:: -(-len(scene.train) // BEHIND_PHOTOGRAPHS)]
         lines = slice(None, None, BEHIND_STEP)
-        self.mean_colour = torch.stack([to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few]).mean(0)
+        self.mean_colours = {i: to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few}
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras) -> Rendering:
-        """Render the view of one camera, at its own gain."""
+        """Render the view of one camera, at its own gain, from its sources (`Scene.sources`)."""
         scene = self.scene
+        sources = scene.sources(camera)
+        if not sources:
+            raise SceneError(
+                f"{scene.root} has no training photograph besides the camera's own: expected another to render its "
+                "view from; add photographs"
+            )
         prior = surface_prior(camera, scene.points, scene.cameras, scene.hull)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
         picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
@@ -75,7 +82,8 @@ class Renderer:
                 picture[at[0] : at[0] + height, at[1] : at[1] + width] = block
         colour, opacity, depth, visibility = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
         white = scene.background_rgb
-        behind = self.mean_colour * camera.gain[0] if white is None else torch.tensor(white)
+        mean_colour = torch.stack([colour for i, colour in self.mean_colours.items() if i in sources]).mean(0)
+        behind = mean_colour * camera.gain[0] if white is None else torch.tensor(white)
         colour = colour * camera.gain[0] + (1 - opacity) * behind
         if self.fills_unseen:
             colour = fill_unseen(colour, visibility[..., 0] > 0.5)

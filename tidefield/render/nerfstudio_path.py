@@ -1,7 +1,8 @@
 """Read camera paths that nerfstudio's viewer exports ("Generate Command" writes camera_paths/NAME.json).
 
-The file holds render_width, render_height, fps, seconds, camera_type and camera_path: per frame a camera_to_world of 16
-numbers, row by row, with OpenGL's axes (+x right, +y up, -z forward), and fov, the vertical field of view in degrees.
+The file holds render_width, render_height, fps, seconds, camera_type and camera_path: per frame a camera_to_world, 16
+numbers row by row or a list of 4 rows, with OpenGL's axes (+x right, +y up, -z forward), and fov, the vertical field of
+view in degrees.
 (nerfstudio/viewer/render_panel.py writes it, nerfstudio/cameras/camera_paths.py get_path_from_json reads it.)
 
 nerfstudio rotates, shifts and scales a scene before training: p_viewer = scale * (transform [p; 1]). It writes both to
@@ -83,7 +84,9 @@ def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
 
 
 def _pose(frame: Mapping[str, Any], place: str) -> Float64[np.ndarray, "4 4"]:
-    matrix = numbers(frame, "camera_to_world", place, (16,)).reshape(4, 4)
+    value = frame.get("camera_to_world")
+    shape = (4, 4) if isinstance(value, list) and len(value) == 4 else (16,)
+    matrix = numbers(frame, "camera_to_world", place, shape).reshape(4, 4)
     last = np.array([0.0, 0.0, 0.0, 1.0])
     if not np.allclose(matrix[3], last) and np.allclose(matrix[:, 3], last):
         matrix = matrix.T  # three.js itself stores matrices column by column

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.model.rendering import Rendering
-from tidefield.render.stills import colour_picture
+from tidefield.render.stills import SOFTWARE, colour_picture
 
 QUALITY = {"crf": "18", "preset": "medium"}
 """x264's constant rate factor; 0 is lossless, and at 18 differences become invisible (FFmpeg's H.264 guide)."""
@@ -28,6 +28,7 @@ def write_video(
     path: Path,
     frames_per_second: float,
     *,
+    title: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
@@ -40,6 +41,7 @@ def write_video(
         frames: renderings (of which the colour is shown) or 8-bit pictures, all of one size.
         path: of the MP4.
         frames_per_second: of the video.
+        title: for the file's metadata, which also name this program.
         overwrite: replace an existing file.
         progress: called after each frame with the number of frames that are done.
 
@@ -56,6 +58,7 @@ def write_video(
         completed_file(path, overwrite=overwrite) as partial,
         av.open(str(partial), "w", format="mp4", options={"movflags": "+faststart"}) as container,
     ):
+        container.metadata.update({"comment": SOFTWARE, **({"title": title} if title else {})})
         for count, frame in enumerate(frames, start=1):
             picture = colour_picture(frame) if isinstance(frame, Rendering) else frame
             height, width = picture.shape[:2]

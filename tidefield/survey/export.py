@@ -1,4 +1,4 @@
-"""Write the files of a scene: photographs, upright and at the common exposure, and nerfstudio's `transforms.json`."""
+"""Write the files of a scene: photographs, upright and at the common exposure, reduced ones, and `transforms.json`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
+from tidefield.data.images import decode
+from tidefield.data.readers.files import quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
+from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import lens_from_colmap
 from tidefield.machine import cores
@@ -26,6 +29,7 @@ from tidefield.survey.survey import Photograph, Progress
 GRID_PX = 8
 """Spacing of the pixels whose viewing angles are computed; between them they are interpolated."""
 JPEG_QUALITY = 95
+MOST_REDUCED = 64
 MAX_COORDINATE_M = 10_000.0
 """nerfstudio computes in float32, which resolves 1 mm up to this distance from the origin."""
 
@@ -62,17 +66,62 @@ def write_images(
         if correction is not None:
             tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
-        with Image.open(photograph.path) as original:
-            exif = original.getexif()
-        exif[ExifTags.Base.Orientation] = 1
-        is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")
-        quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if is_jpeg else {}
-        with completed_file(target, overwrite=True) as partial:  # in the format of its name
-            Image.fromarray(pixels).save(partial, exif=exif, **quality)
+        write_image(pixels, target, photograph.path)
 
     with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(write, range(len(photographs))), start=1):
             progress(done, len(photographs))
+
+
+def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
+    """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright."""
+    with Image.open(original) as picture:
+        exif, kind = picture.getexif(), picture.format
+    exif[ExifTags.Base.Orientation] = 1
+    quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind in ("JPEG", "MPO") else {}
+    with completed_file(target, overwrite=True) as partial:
+        Image.fromarray(pixels).save(partial, kind, exif=exif, **quality)
+
+
+def reduced_folders(factors: Sequence[int]) -> list[str]:
+    """Name the folders of reduced photographs as nerfstudio and gsplat do: images_2, images_4.
+
+    Raises:
+        RunError: a factor does not reduce, or is given twice.
+    """
+    if len(set(factors)) < len(factors) or not all(2 <= factor <= MOST_REDUCED for factor in factors):
+        raise RunError(
+            f"--downscale is {' '.join(map(str, factors))}: expected different whole numbers from 2 to "
+            f"{MOST_REDUCED}; correct them"
+        )
+    return [f"images_{factor}" for factor in factors]
+
+
+def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[int], progress: Progress) -> None:
+    """Write images_N beside images: the photographs at an Nth of their size, under their names.
+
+    Each pixel is the mean of N x N. Columns and rows that are left over at the right and at the bottom are dropped: the
+    size is rounded down, as nerfstudio and gsplat do with their cameras, and the calibration is exactly an Nth.
+    """
+    folders = reduced_folders(factors)
+
+    def write(name: str) -> None:
+        original = scene / "images" / name
+        pixels = decode(original)
+        for folder, factor in zip(folders, factors, strict=True):
+            height, width = (size // factor for size in pixels.shape[:2])
+            if not (width and height):
+                raise RunError(
+                    f"{name} has {pixels.shape[1]} x {pixels.shape[0]} pixels: expected at least {factor} each way "
+                    f"for {folder}; choose a smaller --downscale"
+                )
+            whole = pixels[: height * factor, : width * factor]
+            reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+            write_image(reduced, scene / folder / name, original)
+
+    with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
+        for done, _ in enumerate(pool.map(write, names), start=1):
+            progress(done, len(names))
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:

@@ -7,7 +7,10 @@ import logging
 import os
 import posixpath
 import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +18,17 @@ import pycolmap
 from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
-from tidefield.data.images import Progress
+from tidefield.data.images import Progress, decode
 from tidefield.data.load import own_lens, read_posed
+from tidefield.data.readers.files import naming, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
-from tidefield.geometry.lenses import colmap_parameters
+from tidefield.geometry.lenses import colmap_parameters, rectify
 from tidefield.geometry.similarity import Similarity
-from tidefield.survey.export import write_transforms
+from tidefield.machine import cores
+from tidefield.survey.export import reduced_folders, write_image, write_reduced_images, write_transforms
 
 _GREY = 128
 _CANNOT_LINK = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -36,18 +41,26 @@ def import_project(
     out: Path,
     *,
     link: bool = False,
+    undistort: bool = False,
+    downscale: Sequence[int] = (),
     allow_missing: bool = False,
     progress: Progress | None = None,
 ) -> tuple[pycolmap.Reconstruction, Georeference | None]:
-    """Make a Scene of anything that `load_scene` reads; photographs (undecoded) and poses (float64) stay unchanged.
+    """Make a Scene of anything that `load_scene` reads; poses (float64) and photographs (undecoded) stay unchanged.
+
+    Only photographs with k3 are undistorted: of COLMAP's models, FULL_OPENCV alone has it, which nerfstudio and gsplat
+    do not open. An OPENCV camera fitted to such a lens would keep the photograph's file, but not its geometry; the
+    pinhole camera does, whatever the lens, and is what `load_scene` makes of the photograph anyway.
 
     Args:
         source: the project or scene.
         out: the new folder, with images/, sparse/0/, transforms.json and, if the project is georeferenced,
             georeference.json; it appears when it is complete.
         link: make hard links to the photographs instead of copies.
+        undistort: undistort all photographs; the original 3D Gaussian splatting opens no others.
+        downscale: factors of reduced photographs to write beside the others.
         allow_missing: continue without photographs that are listed but do not exist.
-        progress: called with (written, of how many) photographs.
+        progress: called with (written, of how many) photographs; reduced ones count once more.
 
     Returns:
         The scene's model, and its georeference if the project states it.
@@ -57,7 +70,9 @@ def import_project(
         RunError: `out` exists already or cannot be written.
     """
     refuse_existing(out, replaceable=False)
-    posed = _at_file_size(read_posed(source, allow_missing))
+    reduced_folders(downscale)
+    original = _at_file_size(read_posed(source, allow_missing))
+    posed = _undistorted(original, undistort)
     located = read_georeference(source)
     if located is None and posed.reference is not None:
         place = posed.reference
@@ -76,13 +91,28 @@ def import_project(
     if posed.near_far is not None:
         _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
     model = to_colmap(posed)
+    count, rounds = len(posed.names), 2 if downscale else 1
+
+    def show(done: int, _: int, before: int = 0) -> None:
+        if progress is not None:
+            progress(before + done, rounds * count)
+
     with completed_folder(out) as folder:
-        for done, (path, name) in enumerate(zip(posed.paths, posed.names, strict=True), start=1):
-            target = folder / "images" / name
+
+        def write(index: int) -> None:
+            path, lens = posed.paths[index], original.lenses[index]
+            target = folder / "images" / posed.names[index]
             target.parent.mkdir(parents=True, exist_ok=True)
-            (_link if link else shutil.copyfile)(path, target)
-            if progress is not None:
-                progress(done, len(posed.names))
+            if posed.lenses[index] == lens:
+                (_link if link else shutil.copyfile)(path, target)
+            else:
+                write_image(rectify(decode(path), lens, lens.width, lens.height), target, path)
+
+        with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
+            for done, _ in enumerate(pool.map(write, range(count)), start=1):
+                show(done, count)
+        if downscale:
+            write_reduced_images(folder, posed.names, downscale, partial(show, before=count))
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
@@ -151,6 +181,30 @@ def _at_file_size(posed: PosedPhotographs) -> PosedPhotographs:
         )
         points = replace(points, uv_px=points.uv_px * scale[points.photograph_index])
     return replace(posed, names=names, lenses=lenses, points=points)
+
+
+def _undistorted(posed: PosedPhotographs, every: bool) -> PosedPhotographs:
+    """Replace lenses with k3, or every lens, by their pinhole cameras, and move the observations.
+
+    Observations that lie outside the undistorted photographs are left out.
+    """
+    lenses = []
+    for path, lens in zip(posed.paths, posed.lenses, strict=True):
+        with naming(path):
+            lenses.append(lens.pinhole() if every or lens.k3 else lens)
+    changed = sum(lens != own for lens, own in zip(lenses, posed.lenses, strict=True))
+    if changed:
+        _log.info(f"{changed} of {len(lenses)} photographs are undistorted and encoded again")
+    points = posed.points
+    if points is not None:
+        uv_px = points.uv_px.copy()
+        for own, lens, mine in zip(posed.lenses, lenses, points.by_photograph(len(lenses)), strict=True):
+            if lens != own:
+                uv_px[mine] = own.to_pinhole(uv_px[mine], lens)
+        good = np.isfinite(uv_px).all(axis=1)
+        parts = {name: getattr(points, name)[good] for name in ("point_index", "photograph_index")}
+        points = replace(points, uv_px=uv_px[good], **parts)
+    return replace(posed, lenses=tuple(lenses), points=points)
 
 
 def _link(path: Path, target: Path) -> None:

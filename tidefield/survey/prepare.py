@@ -19,7 +19,7 @@ from tidefield.errors import RunError, SurveyError
 from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
-from tidefield.survey.export import write_images, write_transforms
+from tidefield.survey.export import reduced_folders, write_images, write_reduced_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 COLOUR_WIDTH = 400
 """Width of the photographs on which exposure differences are measured."""
 STAGES = ("quality", "features", "pairs", "matches", "poses", "georeference", "images")
-"""In their order."""
+"""In their order; on request, "downscale" follows."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,7 @@ def prepare(
     *,
     keep_all: bool = False,
     colour: Literal["auto", "on", "off"] = "auto",
+    downscale: Sequence[int] = (),
     redo: str | None = None,
 ) -> Prepared:
     """Make a scene of a survey, or continue an interrupted run.
@@ -80,12 +81,14 @@ def prepare(
     Args:
         keep_all: use photographs of low quality too.
         colour: correct exposures and lens falloff: where it helps, always, or never.
+        downscale: factors of reduced photographs to write beside the others.
         redo: a stage to repeat, with all that follow.
 
     Raises:
         RunError: the scene's folder contains something else, or cannot be written to.
         SurveyError: too few photographs are good, or fit together.
     """
+    reduced = reduced_folders(downscale)
     with writing_to(scene):
         _refuse_foreign(scene, survey)
     work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
@@ -168,6 +171,16 @@ def prepare(
         lambda _: write_scene(placed, scene, colour, console),
         lambda facts: _correction_from_json(facts["evening"], len(placed)),
     )
+
+    def reduce(_: bool) -> Facts:
+        if downscale:
+            with ProgressBar(console, "Reducing photographs") as bar:
+                write_reduced_images(scene, models[0], downscale, bar)
+        return {}
+
+    if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
+        files = [scene / folder / name for folder in reduced for name in models[0]]
+        stages.run("downscale", {"factors": list(downscale)}, files, reduce)
     return Prepared(survey, verdicts, frozenset(names), models, lens, located, correction, stages.seconds)
 
 

@@ -124,6 +124,10 @@ class Stages:
             write_json(self._file, self._records)
         return read(facts)
 
+    def has_run(self, name: str) -> bool:
+        """Whether a stage was started, in this run or in an earlier one."""
+        return name in self._records
+
     def _read(self) -> dict[str, Facts]:
         try:
             # One more is read than allowed, so that a device without an end is refused, too.
@@ -159,8 +163,8 @@ class Stages:
 def _refuse_links(scene: Path) -> None:
     """Raise a RunError if one of the folders that are written to is a link or contains one."""
     real = os.path.realpath(scene)
-    for folder in _OWN_FOLDERS:
-        for path in (scene / folder, *(scene / folder).rglob("*")):
+    for folder in (*(scene / name for name in _OWN_FOLDERS), *scene.glob("images_*")):
+        for path in (folder, *folder.rglob("*")):
             if os.path.realpath(path) != os.path.join(real, path.relative_to(scene)):
                 raise RunError(
                     f"{path} is a link to {os.path.realpath(path)}: expected a folder or file of the scene itself, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,8 @@ VERSION = "1.1.5"
 WORKER = Path(__file__).with_name("worker.py")
 _NEWEST_PYTHON = (3, 12)
 """The newest that NumPy 1, which nerfstudio needs, has wheels for."""
+OLDEST_TORCH = (2, 6)
+"""Before it, loading a checkpoint can run code that is in it, even with weights_only (CVE-2025-32434)."""
 _NEEDED = (
     "appdirs",
     "av",
@@ -61,9 +64,15 @@ clients, mesh tools), some of it without wheels for new Pythons."""
 
 
 def home() -> Path:
-    """$XDG_DATA_HOME/tidefield/nerfstudio-1.1.5."""
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(data) / "tidefield" / f"nerfstudio-{VERSION}"
+    """$XDG_DATA_HOME/tidefield/nerfstudio-1.1.5.
+
+    Raises:
+        RunError: that is not set, and the system knows no home folder of this user, as in containers.
+    """
+    data = Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share"))
+    if data.parts[0] == "~":
+        raise RunError("this user has no home folder for nerfstudio: expected one; set XDG_DATA_HOME to a folder")
+    return data / "tidefield" / f"nerfstudio-{VERSION}"
 
 
 def python() -> Path:
@@ -83,7 +92,7 @@ def install(overwrite: bool, console: Console) -> None:
     """Make the environment: nerfstudio with the PyTorch that we run on, so that speeds compare.
 
     Raises:
-        RunError: it is there already, this Python is too new for it, or pip fails.
+        RunError: it is there already, this Python is too new for it, this PyTorch too old or too new, or pip fails.
     """
     folder = home()
     if _complete().exists() and not overwrite:
@@ -93,16 +102,28 @@ def install(overwrite: bool, console: Console) -> None:
             f"nerfstudio {VERSION} does not install on Python {'.'.join(map(str, sys.version_info[:2]))}: "
             f"expected {'.'.join(map(str, _NEWEST_PYTHON))} or older; install Tidefield there"
         )
+    torch = version("torch").partition("+")[0]
+    vision = _vision(torch)
+
+    def stage(number: int, what: str) -> None:
+        console.print(f"{number} of 4: {what}", soft_wrap=True)
+
+    console.print(
+        f"Making {folder}: some gigabytes to download, minutes to hours. Nothing is compiled where pip finds wheels. "
+        "splatfacto compiles its CUDA kernels when it first runs, with CUDA's nvcc and a C++ compiler; nerfacto needs "
+        "neither.",
+        soft_wrap=True,
+    )
     shutil.rmtree(folder, ignore_errors=True)
-    console.print(f"Making {folder} (gigabytes; minutes) ...", soft_wrap=True)
+    stage(1, "an empty environment")
     with writing_to(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         venv.create(folder, with_pip=True)
-    torch = version("torch").partition("+")[0]
-    # torchvision's wheel may be for a PyTorch of other hardware; what is needed of it is Python.
-    for words in ([f"torch=={torch}", *_NEEDED], ["--no-deps", f"torchvision=={_vision(torch)}"]):
-        _pip(words)
-    _pip(["--no-deps", f"nerfstudio=={VERSION}"])
+    stage(2, f"PyTorch {torch} and {len(_NEEDED)} packages that nerfstudio imports")
+    _pip([f"torch=={torch}", *_NEEDED], console)
+    stage(3, f"torchvision and nerfstudio {VERSION}")
+    _pip(["--no-deps", vision, f"nerfstudio=={VERSION}"], console)
+    stage(4, "a test that nerfstudio starts")
     checked = subprocess.run([str(_interpreter()), str(WORKER), "check"], capture_output=True, text=True, check=False)
     if checked.returncode:
         why = checked.stderr.strip().splitlines()[-1:] or ["no message"]
@@ -112,17 +133,35 @@ def install(overwrite: bool, console: Console) -> None:
     _complete().touch()
 
 
-def _pip(words: list[str]) -> None:
-    if subprocess.run([str(_interpreter()), "-m", "pip", "install", "--quiet", *words], check=False).returncode:
-        raise RunError(f"pip could not install {words[-1]} into {home()}: expected it to; read what it says above")
+def _pip(words: list[str], console: Console) -> None:
+    """Install packages; what pip prints meanwhile is the progress."""
+    command = [str(_interpreter()), "-m", "pip", "install", "--disable-pip-version-check", *["--quiet"] * console.quiet]
+    if subprocess.run([*command, *words], check=False).returncode:
+        raise RunError(
+            f"pip could not install what nerfstudio needs into {home()}: expected it to; read what it says above, and "
+            "run the same command again"
+        )
 
 
 def _vision(torch: str) -> str:
-    """The release of torchvision that belongs to one of torch: 0.15 came with 2.0, and so on."""
-    major, minor, patch = torch.split(".")
-    if major != "2":
+    """The newest torchvision that there is for a release of PyTorch, as pip writes it: 0.15 came with 2.0, and so on.
+
+    The third numbers of the two differ, and torchvision may come later, so an older one is taken where there is no
+    other: what is needed of it is its Python half.
+
+    Raises:
+        RunError: the PyTorch is too old or too new.
+    """
+    release = tuple(map(int, re.findall(r"\d+", torch)[:2]))
+    if release < OLDEST_TORCH:
+        raise RunError(
+            f"torch {torch} is here, with which loading nerfstudio's checkpoints is not safe: expected "
+            f"{'.'.join(map(str, OLDEST_TORCH))} or newer, as nerfstudio gets the same; update it with pip install "
+            "--upgrade torch"
+        )
+    if release[0] != 2:
         raise RunError(f"torch {torch} is new to this version of Tidefield: expected 2.x; update Tidefield")
-    return f"0.{int(minor) + 15}.{patch}"
+    return f"torchvision<0.{release[1] + 16}"
 
 
 def _complete() -> Path:

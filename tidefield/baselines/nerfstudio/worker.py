@@ -19,6 +19,20 @@ import numpy as np
 import torch
 
 
+def load_only_weights() -> None:
+    """Make `torch.load`, which nerfstudio calls without weights_only, refuse to unpickle anything but weights.
+
+    PyTorch reads these variables at each call. Before 2.6, even weights_only runs code (CVE-2025-32434).
+    """
+    if torch.__version__ < (2, 6):
+        sys.exit(
+            f"torch {torch.__version__} is in nerfstudio's environment: expected 2.6 or newer, as loading a checkpoint "
+            "with an older one can run code that is in it; run `tidefield baselines install nerfacto --overwrite`"
+        )
+    os.environ.pop("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", None)
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+
+
 def without_compiled_torchvision() -> None:
     """Declare the operators whose Python half torchvision registers, where its compiled half does not load."""
     try:
@@ -59,7 +73,7 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=Path(job["data"]), downscale_factor=1)
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
-        # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled.
+        # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled (see `load_only_weights`).
         numbers = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int64)]
         torch.serialization.add_safe_globals([np.core.multiarray.scalar, np.dtype, *numbers])
     torch.manual_seed(job["seed"])
@@ -233,6 +247,7 @@ def check(_: dict[str, Any]) -> None:
 def main() -> None:
     kind, *files = sys.argv[1:]
     job = json.loads(Path(files[0]).read_text(encoding="utf-8")) if files else {}
+    load_only_weights()
     without_compiled_torchvision()
     import torchmetrics.image.lpip
 

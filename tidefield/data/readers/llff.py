@@ -18,7 +18,7 @@ from tidefield.geometry.lenses import Lens
 
 _FOLDERS = ("images", "images_4", "images_8")
 _MEGABYTES = 64
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 # The bounds are the 0.1th and 99.9th percentile of the sparse points' depths; the margins are for surfaces without.
 _NEAREST, _FARTHEST = 0.75, 1.25
 
@@ -36,7 +36,7 @@ def read_llff(root: Path) -> PosedPhotographs:
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} of shape {rows.shape}: expected N x 17 numbers; export it again")
     folder = next((root / name for name in _FOLDERS if (root / name).is_dir()), root / "images")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if len(paths) != len(rows):
         raise SceneError(
             f"{folder} has {len(paths)} photographs, but {file} has {len(rows)} poses: expected one photograph per "
