@@ -59,8 +59,14 @@ def write_pictures(folder: Path, truth: Truth) -> None:
         Image.fromarray(picture).save(folder / name)
 
 
-def write_colmap(root: Path, truth: Truth, text: bool = False, place: str = "sparse/0") -> Path:
-    """A COLMAP model, by pycolmap; OPENCV cameras where there is distortion."""
+def write_colmap(
+    root: Path, truth: Truth, text: bool = False, place: str = "sparse/0", wrong: frozenset[str] = frozenset()
+) -> Path:
+    """A COLMAP model, by pycolmap; OPENCV cameras where there is distortion.
+
+    Args:
+        wrong: photographs whose observations are all in the wrong place.
+    """
     model = pycolmap.Reconstruction()
     numbers = {lens: i for i, lens in enumerate(dict.fromkeys(truth.lenses), start=1)}
     for lens, number in numbers.items():
@@ -73,7 +79,8 @@ def write_colmap(root: Path, truth: Truth, text: bool = False, place: str = "spa
     tracks = [pycolmap.Track() for _ in truth.ground]
     for i, (name, lens, pose) in enumerate(zip(truth.names, truth.lenses, truth.T_world_camera, strict=True), start=1):
         uv, seen = observe(lens, pose, truth.ground)
-        image = pycolmap.Image(name=name, keypoints=uv[seen], camera_id=numbers[lens], image_id=i)
+        keypoints = uv[seen][::-1] if name in wrong else uv[seen]
+        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=numbers[lens], image_id=i)
         rotation = pose[:, :3].T
         rigid = pycolmap.Rigid3d(np.concatenate([rotation, -rotation @ pose[:, 3:]], axis=1))
         model.add_image_with_trivial_frame(image, rigid)

@@ -1,6 +1,7 @@
-"""The user's cache of decoded photographs: its folder, its size, and what is deleted from it.
+"""The user's cache of decoded photographs and triangulated points: its folder, its size, and what is deleted from it.
 
-Each file of it (see `data.images`) holds the photographs of one scene at one width, and is touched when it is used.
+Each file of it holds the photographs of one scene at one width (`data.images`) or its points (`data.triangulate`), and
+is touched when it is used.
 Before another is written, the files that were not used for the longest time are deleted until it fits.
 """
 
@@ -18,7 +19,7 @@ from platformdirs import user_cache_path
 
 from tidefield.errors import SceneError
 
-SUFFIX = ".photographs"
+SUFFIX, POINTS_SUFFIX = ".photographs", ".points"
 LIMIT_VARIABLE, USUAL_LIMIT_GB = "TIDEFIELD_CACHE_GB", 20.0
 _DAYS_KEPT_UNUSED = 60
 _WRITERS_HOUR_SECONDS = 3600
@@ -83,7 +84,7 @@ def limit_bytes() -> float:
 def stored(folder: Path) -> list[Stored]:
     """List the files of the cache, least recently used first."""
     found = []
-    for path in folder.glob(f"*{SUFFIX}"):
+    for path in (path for suffix in (SUFFIX, POINTS_SUFFIX) for path in folder.glob(f"*{suffix}")):
         with suppress(FileNotFoundError):  # another program has deleted it
             status = path.stat()
             found.append(Stored(path, status.st_size, status.st_mtime))

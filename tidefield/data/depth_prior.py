@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -50,20 +50,45 @@ def surface_prior(
     """Estimate the expected, nearest and farthest inverse z-depth of one camera's pixels, on cells of `STRIDE` pixels.
 
     The expected surface interpolates the sparse points; the interval spans the nearest points, with a margin that grows
-    where they are sparse. Without points the interval is where the ray passes the visual hull, and the surface is
-    expected near the hull's front. Without either, the expected depth is NaN and the interval is the camera's near to
-    far.
+    where they are sparse. A visual hull limits both to where the ray passes it; without points the surface is expected
+    near the hull's front, and rays that miss the hull have no expected depth (NaN). Without either, no ray has one, and
+    the interval is the camera's near to far.
     """
     width, height = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
     near, far = 1 / camera.near_far[0]
     # The cells of a grid of ceil(W / 4) columns are 4 pixels wide only if the camera is widened to match.
     cells = camera.cropped(width * STRIDE, height * STRIDE).resized(width, height)
-    if points is None:
-        if hull is None:
-            return torch.stack([torch.full_like(near, torch.nan), near, far])[:, None, None].expand(3, height, width)
-        shallow, deep, meets = hull_range(cells, hull)
-        front = torch.lerp(shallow, deep, HULL_DEPTH)
-        return 1 / torch.stack([torch.where(meets, front, torch.nan), shallow, deep])
+    if points is not None:
+        prior = _from_points(cells, points, cameras)
+    else:
+        prior = torch.stack([torch.full_like(near, torch.nan), near, far])[:, None, None].expand(3, height, width)
+    return prior if hull is None else _within(prior, *hull_range(cells, hull))
+
+
+def _within(
+    prior: Float[Tensor, "3 h w"], shallow: Float[Tensor, "h w"], deep: Float[Tensor, "h w"], meets: Bool[Tensor, "h w"]
+) -> Float[Tensor, "3 h w"]:
+    """Limit a prior to the depths at which rays pass the hull; those that miss it are searched in all of their depths.
+
+    Args:
+        shallow, deep, meets: from `hull_range`.
+    """
+    expected, nearest, farthest = prior
+    front = torch.where(expected.isnan(), 1 / torch.lerp(shallow, deep, HULL_DEPTH), expected)
+    inside = torch.minimum(torch.maximum(front, 1 / deep), 1 / shallow)
+    limited = torch.stack(
+        [torch.where(meets, inside, torch.nan), torch.minimum(nearest, 1 / shallow), torch.maximum(farthest, 1 / deep)]
+    )
+    # Points may lie outside of the hull, by which their interval would be empty.
+    apart = ~meets | (limited[1] <= limited[2] * (1 + LEAST_MARGIN))
+    limited[1:] = torch.where(apart, torch.stack([1 / shallow, 1 / deep]), limited[1:])
+    return limited
+
+
+def _from_points(cells: Cameras, points: SparsePoints, cameras: Cameras) -> Float[Tensor, "3 h w"]:
+    """The prior of cells from the sparse points that their camera sees."""
+    width, height = cells.width, cells.height
+    near, far = 1 / cells.near_far[0]
     uv, inverse = trusted_points(cells, points, cameras)
     expected = 1 / depth_through(cells, uv, inverse)
     if len(uv) < INTERVAL_POINTS:

@@ -153,7 +153,7 @@ def load_scene(
         test=test,
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
-        hull=visual_hull(cameras, photographs, train) if sparse is None and transparent else None,
+        hull=visual_hull(cameras, photographs, train) if transparent else None,
     )
 
 

@@ -60,7 +60,7 @@ class Scene:
         test: indices of the held-out photographs.
         origin_world: what was subtracted, once and in float64, from the coordinates on disk.
         background_rgb: the background colour of photographs with alpha; None for real photographs.
-        hull: the visual hull of the object; None with sparse points, or without alpha.
+        hull: the visual hull of the object; None without alpha.
     """
 
     root: Path

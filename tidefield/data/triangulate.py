@@ -5,23 +5,30 @@ Photographs are matched with neighbours by position, near ones for many matches 
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from tidefield.data.cache import POINTS_SUFFIX, cache_folder, make_room, refuse_shared
 from tidefield.data.images import Progress
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.sift import find_features
+from tidefield.errors import RunError
+from tidefield.files import completed_file
 from tidefield.geometry.lenses import Lens
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
@@ -47,6 +54,9 @@ _STEPS = 5
 """Of Gauss-Newton, which from the point nearest to the rays has then converged."""
 FEWEST = 100
 """Fewer points do not tell where a scene's surface is."""
+
+_VERSION = 1
+"""Part of the key of kept points: to be raised when the same photographs would give others."""
 
 _log = logging.getLogger(__name__)
 
@@ -194,6 +204,70 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     )
 
 
+def find_points(
+    posed: PosedPhotographs,
+    used: Sequence[int],
+    root: Path,
+    progress: Progress | None = None,
+    cache: Path | None = None,
+) -> Observations | None:
+    """Triangulate the points of a scene that has none, and say so; found once, they are kept in the cache.
+
+    Args:
+        posed, used, progress: see `triangulate`.
+        root: of the scene, for messages.
+        cache: a folder; the user's if not given.
+    """
+    folder = cache or cache_folder()
+    store = folder and folder / f"{_key(posed, used)}{POINTS_SUFFIX}"
+    if store and store.is_file():
+        with suppress(ValueError, KeyError, EOFError, BadZipFile):  # damaged: they are found again
+            return _read(store)
+    _log.info("%s has no sparse points: triangulating them from its photographs and poses", root)
+    points = triangulate(posed, used, progress)
+    if points is None:
+        _log.warning(
+            "%s has no sparse points, and fewer than %d could be triangulated: the surface is searched everywhere "
+            "between near and far, and views may be blurred or torn; check the poses and lenses, or make a scene with "
+            "`tidefield prepare`",
+            root,
+            FEWEST,
+        )
+    else:
+        count, seen = len(points.xyz_world), len(points.uv_px)
+        _log.info("%s: found %s points, each seen by %.1f photographs", root, f"{count:,}", seen / count)
+    if store:
+        _keep(points, store)
+    return points
+
+
+def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
+    """What the points depend on, as a file's name."""
+    files = [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in posed.paths]
+    parts = [_VERSION, files, [asdict(lens) for lens in posed.lenses], posed.T_world_camera.tolist(), list(used)]
+    return hashlib.sha256(json.dumps(parts).encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+def _read(store: Path) -> Observations | None:
+    with store.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        points = Observations(**{name: arrays[name] for name in arrays.files}) if arrays.files else None
+    os.utime(store)
+    return points
+
+
+def _keep(points: Observations | None, store: Path) -> None:
+    """Write points, or that there are none, unless the cache cannot be used: then they are found again next time."""
+    arrays = {} if points is None else {field.name: getattr(points, field.name) for field in fields(points)}
+    try:
+        store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        refuse_shared(store.parent)
+        make_room(store.parent, sum(array.nbytes for array in arrays.values()))
+        with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)
+    except (OSError, RunError) as error:
+        _log.warning("the points cannot be kept for the next time: %s", error)
+
+
 def triangulate_again(
     points: Observations, T_world_camera: Float64[np.ndarray, "V 3 4"], lenses: Sequence[Lens], used: Sequence[int]
 ) -> Observations:
@@ -209,11 +283,12 @@ def triangulate_again(
     mine = np.isin(points.photograph_index, np.asarray(used))
     point, photograph, uv = points.point_index[mine], points.photograph_index[mine], points.uv_px[mine]
     xy, focal = np.full(uv.shape, np.nan), np.ones(len(uv))
-    for i, rows in enumerate(replace(points, photograph_index=photograph).by_photograph(len(lenses))):
+    for i in used:
+        rows = photograph == i
         xy[rows], focal[rows] = lenses[i].unproject(uv[rows]), (lenses[i].fx + lenses[i].fy) / 2
     good = np.isfinite(xy).all(axis=1)
     good &= (np.bincount(point[good], minlength=len(points.xyz_world)) >= 2)[point]
-    point, photograph, uv, xy, focal = (values[good] for values in (point, photograph, uv, xy, focal))
+    point, photograph, uv, xy, focal = point[good], photograph[good], uv[good], xy[good], focal[good]
     kept, point = np.unique(point, return_inverse=True)
     R, centre = T_world_camera[photograph, :, :3], T_world_camera[photograph, :, 3]
 
@@ -314,16 +389,3 @@ def _write_database(
                 config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=found.astype(np.uint32)
             )
             db.write_two_view_geometry(i + 1, j + 1, geometry)
-
-
-def find_points(
-    posed: PosedPhotographs, used: Sequence[int], root: Path, progress: Progress | None, cache: Path | None
-) -> Observations | None:
-    """Triangulate points, or read those that were found before from the cache of photographs.
-
-    Args:
-        posed, used, progress: see `triangulate`.
-        root: of the scene, for messages.
-        cache: folder; the user's if not given.
-    """
-    return triangulate(posed, used, progress)

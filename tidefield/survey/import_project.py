@@ -22,6 +22,7 @@ from tidefield.data.images import Progress, decode
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.files import naming, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
+from tidefield.data.triangulate import find_points
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
@@ -63,7 +64,8 @@ def import_project(
         progress: called with (written, of how many) photographs; reduced ones count once more.
 
     Returns:
-        The scene's model, and its georeference if the project states it.
+        The scene's model, with points that are triangulated if the project has none that its photographs observed, and
+        its georeference if the project states it.
 
     Raises:
         SceneError: `source` is not a scene, or is damaged.
@@ -72,6 +74,9 @@ def import_project(
     refuse_existing(out, replaceable=False)
     reduced_folders(downscale)
     original = _at_file_size(read_posed(source, allow_missing))
+    if original.points is None or not len(original.points.uv_px):
+        found = find_points(original, range(len(original.names)), source)
+        original = replace(original, points=found or original.points)
     posed = _undistorted(original, undistort)
     located = read_georeference(source)
     if located is None and posed.reference is not None:

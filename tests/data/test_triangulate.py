@@ -1,0 +1,116 @@
+"""Sparse points from posed photographs: found where there are none, and placed by training photographs alone."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import camera_files
+import ground_flight as flight
+import numpy as np
+import pytest
+import scenes_on_disk as disk
+import torch
+from numpy.testing import assert_allclose
+
+import tidefield as tf
+from tidefield.baselines.untrained import sparse_depth
+from tidefield.data import triangulate
+from tidefield.data.load import load_scene, read_posed
+from tidefield.data.scene import every_eighth
+from tidefield.geometry.lenses import Lens
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene with poses and without points: nine photographs of hills from 40 m above."""
+    lens = Lens(flight.WIDTH, flight.HEIGHT, flight.FOCAL, flight.FOCAL, flight.WIDTH / 2, flight.HEIGHT / 2)
+    ground = camera_files.texture((flight.SIDE, flight.SIDE))
+    x, y = np.meshgrid([-12.0, 0.0, 12.0], [-9.0, 0.0, 9.0])
+    position = np.stack([x.ravel(), y.ravel(), np.linspace(39, 41, 9)], axis=1)
+    poses = np.concatenate([np.tile(DOWN, (9, 1, 1)), position[:, :, None]], axis=2)
+    pictures = tuple(flight.picture(ground, place) for place in position)
+    names = tuple(f"{k}.png" for k in range(9))
+    root = tmp_path_factory.mktemp("hills")
+    disk.write_transforms(root, disk.Truth(names, (lens,) * 9, poses, np.zeros((0, 3)), pictures))
+    return root
+
+
+def test_points_of_a_scene_without_are_found_on_its_surface_and_kept(
+    hills: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    with caplog.at_level(logging.INFO):
+        scene = load_scene(hills, cache=tmp_path)
+    assert "has no sparse points: triangulating them" in caplog.text
+    assert scene.points is not None
+    xyz = scene.points.xyz_world.double().numpy() + scene.origin_world.numpy()
+    assert len(xyz) > 200
+    error_m = np.abs(xyz[:, 2] - flight.hills(xyz[:, :2]))
+    assert np.median(error_m) < 0.06, "a pixel is 12 cm"
+    assert np.percentile(error_m, 95) < 0.24
+    assert not np.isin(scene.points.camera_index, scene.test).any()
+    assert (scene.cameras.near_far[:, 0] > 15).all()
+    assert (scene.cameras.near_far[:, 1] < 65).all()
+    monkeypatch.setattr(triangulate, "triangulate", lambda *_: pytest.fail("they were kept"))
+    again = load_scene(hills, cache=tmp_path).points
+    assert again is not None
+    assert torch.equal(again.xyz_world, scene.points.xyz_world)
+
+
+def test_kept_points_that_are_damaged_are_found_again(hills: Path, tmp_path: Path):
+    first = load_scene(hills, cache=tmp_path).points
+    (store,) = tmp_path.glob("*.points")
+    store.write_bytes(store.read_bytes()[:100])
+    again = load_scene(hills, cache=tmp_path).points
+    assert first is not None
+    assert again is not None
+    assert torch.equal(again.xyz_world, first.xyz_world)
+
+
+def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    disk.write_transforms(tmp_path / "scene", disk.survey(disk.PINHOLE))
+    assert load_scene(tmp_path / "scene", cache=tmp_path).points is None
+    assert "views may be blurred or torn" in caplog.text
+
+
+def test_points_are_placed_by_the_observations_of_the_photographs_used_alone(tmp_path: Path):
+    truth = disk.survey()
+    disk.write_colmap(tmp_path, truth)
+    posed = read_posed(tmp_path, False)
+    assert posed.points is not None
+    train, test = every_eighth(9)
+    moved = posed.points.uv_px + 30.0 * np.isin(posed.points.photograph_index, test)[:, None]
+    nowhere = replace(posed.points, xyz_world=np.zeros_like(posed.points.xyz_world), uv_px=moved)
+    found = triangulate.triangulate_again(nowhere, posed.T_world_camera, posed.lenses, train)
+    assert np.isin(found.photograph_index, train).all()
+    assert np.bincount(found.point_index).min() >= 2
+    nearest = np.linalg.norm(found.xyz_world[:, None] - truth.ground[None], axis=2).min(1)
+    assert_allclose(nearest, 0, atol=1e-5)
+
+
+def test_points_whose_rays_are_nearly_parallel_are_dropped(tmp_path: Path):
+    truth = disk.survey()
+    far = replace(truth, ground=truth.ground * (1, 1, 0) - (0, 0, 3000))
+    far = replace(far, ground=far.ground * (300, 300, 1))
+    disk.write_colmap(tmp_path, far)
+    posed = read_posed(tmp_path, False)
+    assert posed.points is not None
+    assert len(posed.points.uv_px)
+    assert not len(triangulate.triangulate_again(posed.points, posed.T_world_camera, posed.lenses, range(9)).uv_px)
+
+
+def test_nothing_of_a_held_out_photograph_reaches_a_rendering(tmp_path: Path):
+    truth = disk.survey()
+    held_out = {sorted(truth.names)[i] for i in every_eighth(9)[1]}
+    pictures = [255 - p if name in held_out else p for name, p in zip(truth.names, truth.pictures, strict=True)]
+    disk.write_colmap(tmp_path / "first", truth)
+    disk.write_colmap(tmp_path / "second", replace(truth, pictures=tuple(pictures)), wrong=frozenset(held_out))
+    first, second = load_scene(tmp_path / "first"), load_scene(tmp_path / "second")
+    for make in (sparse_depth, tf.zero_shot):
+        one, other = make(first), make(second)
+        for i in first.test:
+            assert not torch.equal(first.photographs[i], second.photographs[i])
+            for name in ("colour", "depth", "opacity"):
+                views = one(first.cameras[i]), other(second.cameras[i])
+                assert torch.equal(*(getattr(view, name) for view in views)), f"{make.__name__}: {name}"
