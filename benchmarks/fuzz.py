@@ -1,14 +1,13 @@
 """Give damaged files to everything that reads files, and keep those that it neither accepts nor refuses properly.
 
 A finding is a file on which a reader raises anything but the project's own error, ends its process, or needs too much
-time or memory. Readers run in a process of their own, which is started again after each end. A file depends on the seed,
-the reader and its number alone.
+time or memory. Readers run in a process of their own, which is started again after each end. A file depends on the
+seed, the reader and its number alone.
 """
 
 from __future__ import annotations
 
 import faulthandler
-import gc
 import logging
 import multiprocessing
 import os
@@ -20,9 +19,10 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -73,7 +73,7 @@ def measure_fuzz(
         seeds: writes the whole files.
 
     Raises:
-        RunError: there were findings, or a whole file was not accepted.
+        RunError: a reader does not accept its whole files.
     """
     counts = {}
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
@@ -95,22 +95,26 @@ def measure_fuzz(
 
 
 def _fuzz(reader: Reader, seconds: float, seed: int, worker: _Worker, kept: Path, count: Count) -> None:
-    worker.read(reader, seed, None)  # what is loaded at the first call counts for no file
-    outcome = worker.read(reader, seed, None)
-    if outcome["kind"] != "accepted":
-        raise RunError(f"{reader.name}: its whole files gave {outcome['kind']}, expected acceptance: {outcome['text']}")
+    # Twice: what is loaded at the first time counts for no file.
+    for outcome in [*worker.read(reader, seed, None, 0.0), *worker.read(reader, seed, None, 0.0)]:
+        if outcome["kind"] != "accepted":
+            raise RunError(
+                f"{reader.name}: its whole files gave {outcome['kind']}, expected acceptance: {outcome['text']}"
+            )
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        outcome = worker.read(reader, seed, count.files)
-        count.files += 1
-        count.slowest_seconds = round(max(count.slowest_seconds, outcome["seconds"]), 2)
-        if outcome["kind"] in ("accepted", "refused"):
-            setattr(count, outcome["kind"], getattr(count, outcome["kind"]) + 1)
-            continue
-        place = f"{outcome['kind']}: {_place(outcome['text'])}"
-        if place not in count.findings:
-            _keep(kept, reader, count.files - 1, worker.damaged, outcome)
-        count.findings[place] = count.findings.get(place, 0) + 1
+    while count.files == 0 or time.monotonic() < end:
+        for outcome in worker.read(reader, seed, count.files, end - time.monotonic()):
+            count.files += 1
+            count.slowest_seconds = round(max(count.slowest_seconds, outcome["seconds"]), 2)
+            if outcome["kind"] == "accepted":
+                count.accepted += 1
+            elif outcome["kind"] == "refused":
+                count.refused += 1
+            else:
+                place = f"{outcome['kind']}: {_place(outcome['text'])}"
+                if place not in count.findings:
+                    _keep(kept, reader, count.files - 1, outcome)
+                count.findings[place] = count.findings.get(place, 0) + 1
 
 
 def _place(text: str) -> str:
@@ -120,24 +124,19 @@ def _place(text: str) -> str:
     return f"{own[-1][0]}:{own[-1][1]} {last.partition(':')[0]}" if own else last
 
 
-def _keep(kept: Path, reader: Reader, number: int, damaged: Path, outcome: dict[str, Any]) -> None:
+def _keep(kept: Path, reader: Reader, number: int, outcome: dict[str, Any]) -> None:
     folder = kept / re.sub(r"\W+", "-", reader.name.lower()) / str(number)
     folder.mkdir(parents=True, exist_ok=True)
-    for file in damaged.iterdir():
-        shutil.copy(file, folder)
+    (folder / outcome["file"]).write_bytes(outcome["content"])
     (folder / "traceback.txt").write_text(f"{reader.name}: {outcome['kind']}\n{outcome['text']}\n")
 
 
 class _Worker:
-    """The process that reads, which is started again when it has ended.
-
-    Attributes:
-        damaged: a folder that holds the last damaged file.
-    """
+    """The process that reads, which is started again when it has ended."""
 
     def __init__(self, work: Path) -> None:
-        self.work, self.damaged, self._log = work, work / "damaged", work / "log"
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self.work, self._log = work, work / "log"
+        self._process: SpawnProcess | None = None
 
     def __enter__(self) -> _Worker:
         return self
@@ -145,27 +144,37 @@ class _Worker:
     def __exit__(self, *_: object) -> None:
         self._end()
 
-    def read(self, reader: Reader, seed: int, number: int | None) -> dict[str, Any]:
-        """What a reader does with a file of this number, or with whole files."""
-        if self._process is None:
-            context = multiprocessing.get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(theirs, self.work, self.damaged, self._log))
-            self._process.start()
-            theirs.close()
+    def read(self, reader: Reader, seed: int, first: int | None, seconds: float) -> Iterator[dict[str, Any]]:
+        """What a reader does with damaged files from this number on, for a while, or with whole files."""
+        process = self._process or self._start()
+        number = first
         try:
-            self._pipe.send((reader, seed, number))
-            if self._pipe.poll(WAITING_SECONDS):
-                return self._pipe.recv()
+            self._pipe.send((reader, seed, first, seconds))
+            while self._pipe.poll(WAITING_SECONDS):
+                outcome = self._pipe.recv()
+                if outcome is None:
+                    return
+                yield outcome
+                number = None if number is None else number + 1
             status = "it waits"
         except (EOFError, OSError):
-            self._process.join()
-            code = self._process.exitcode or 0
+            process.join()
+            code = process.exitcode or 0
             status = "its process ended by " + (signal.Signals(-code).name if code < 0 else f"status {code}")
         self._end()
         kind = "time" if status.endswith("SIGPROF") or status == "it waits" else "end"
         text = self._log.read_text(errors="replace")[-20_000:]
-        return {"kind": kind, "seconds": CPU_SECONDS if kind == "time" else 0.0, "text": f"{text}\n{status}"}
+        file = damage(reader, self.work / "seeds" / reader.seed, seed, number)
+        yield _outcome(kind, CPU_SECONDS if kind == "time" else 0.0, f"{text}\n{status}", *file)
+
+    def _start(self) -> SpawnProcess:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, self.work, self._log))
+        process.start()
+        theirs.close()
+        self._process = process
+        return process
 
     def _end(self) -> None:
         if self._process is not None:
@@ -175,7 +184,7 @@ class _Worker:
         self._process = None
 
 
-def _serve(pipe: Connection, work: Path, damaged: Path, log: Path) -> None:
+def _serve(pipe: Connection, work: Path, log: Path) -> None:
     """Read what is asked for, until the other side is gone."""
     with log.open("wb", buffering=0) as file:
         os.dup2(file.fileno(), 1)
@@ -188,30 +197,44 @@ def _serve(pipe: Connection, work: Path, damaged: Path, log: Path) -> None:
 
     torch.set_num_threads(1)
     mapped = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + _ADDRESSES,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + _ADDRESSES, mapped + _ADDRESSES))
     while True:
         try:
-            reader, seed, number = pipe.recv()
+            reader, seed, first, seconds = pipe.recv()
         except EOFError:
             return
-        os.truncate(log, 0)
-        pipe.send(_read(reader, seed, number, work, damaged))
+        end, number = time.monotonic() + seconds, first
+        while True:
+            pipe.send(_read(reader, seed, number, work, log))
+            if number is None or time.monotonic() > end:
+                break
+            number += 1
+        pipe.send(None)
 
 
-def _read(reader: Reader, seed: int, number: int | None, work: Path, damaged: Path) -> dict[str, Any]:
+def damage(reader: Reader, whole: Path, seed: int, number: int | None) -> tuple[str, bytes]:
+    """The path below a folder of whole files, and the content, of the damaged file of a number."""
+    random = Random(f"{seed} {reader.name} {number}")
+    file = random.choice(sorted(path for pattern in reader.files for path in whole.glob(pattern)))
+    content = file.read_bytes()
+    return file.relative_to(whole).as_posix(), content if number is None else reader.damage(content, random)
+
+
+def _outcome(kind: str, seconds: float, text: str, file: str, content: bytes) -> dict[str, Any]:
+    is_finding = kind not in ("accepted", "refused")
+    kept = {"file": Path(file).name, "content": content} if is_finding else {}
+    return {"kind": kind, "seconds": seconds, "text": text[-20_000:], **kept}
+
+
+def _read(reader: Reader, seed: int, number: int | None, work: Path, log: Path) -> dict[str, Any]:
     """Read a fresh copy of a reader's files, one of them damaged."""
-    folder = work / "case" / "files"
+    folder, whole = work / "case" / "files", work / "seeds" / reader.seed
     shutil.rmtree(folder.parent, ignore_errors=True)
-    shutil.copytree(work / "seeds" / reader.seed, folder)
+    shutil.copytree(whole, folder)
+    file, content = damage(reader, whole, seed, number)
     if number is not None:
-        random = Random(f"{seed} {reader.name} {number}")
-        file = random.choice(sorted(path for pattern in reader.files for path in folder.glob(pattern)))
-        content = reader.damage(file.read_bytes(), random)
-        file.write_bytes(content)
-        shutil.rmtree(damaged, ignore_errors=True)
-        damaged.mkdir()
-        (damaged / file.name).write_bytes(content)
-    gc.collect()
+        (folder / file).write_bytes(content)
+    os.truncate(log, 0)
     before = _reset_peak()
     kind, text, start = "accepted", "", time.process_time()
     signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
@@ -226,7 +249,7 @@ def _read(reader: Reader, seed: int, number: int | None, work: Path, damaged: Pa
     seconds, needed = time.process_time() - start, _peak() - before
     if needed > MOST_BYTES and kind in ("accepted", "refused"):
         kind, text = "memory", f"{needed / 1e9:.1f} GB; {kind} {text}"
-    return {"kind": kind, "seconds": seconds, "text": text}
+    return _outcome(kind, seconds, text, file, content)
 
 
 def _reset_peak() -> int:

@@ -13,8 +13,8 @@ from typing import Any
 MOST_DAMAGES = 3
 """In one file."""
 EXTREME_NUMBERS = tuple(
-    b"0 -0.0 -1 1 3.5 255 65536 2147483648 4294967295 9223372036854775808 -9223372036854775809 1e-320 1e15 1e16 1e38 1e308 "
-    b"-1e308 1e400 NaN Infinity -Infinity nan inf 1e 0x10 1,5 1_000".split()
+    b"0 -0.0 -1 1 3.5 255 65536 2147483648 4294967295 9223372036854775808 -9223372036854775809 1e-320 1e15 1e16 1e38 "
+    b"1e308 -1e308 1e400 NaN Infinity -Infinity nan inf 1e 0x10 1,5 1_000".split()
 )
 TOKENS = (
     *EXTREME_NUMBERS,
@@ -41,9 +41,11 @@ Mutation = Callable[[bytes, Random], bytes]
 
 def mutate(content: bytes, random: Random) -> bytes:
     """Damage a file in one to three places, each in a way that its format allows."""
-    for _ in range(random.randint(1, MOST_DAMAGES)):
-        content = random.choice(_mutations(content))(content, random)
-    return content
+    damaged = content
+    while damaged == content:
+        for _ in range(random.randint(1, MOST_DAMAGES)):
+            damaged = random.choice(_mutations(damaged))(damaged, random)
+    return damaged
 
 
 def _mutations(content: bytes) -> list[Mutation]:
@@ -137,7 +139,7 @@ def mutate_value(top: Any, random: Random) -> Any:
     """Change one value of a tree of lists and tables."""
     if not isinstance(top, dict | list) or not top or random.random() < 0.01:
         return random.choice(JSON_VALUES)
-    parent = top
+    parent: Any = top
     while True:  # values near the top as often as the many below
         keys = list(parent) if isinstance(parent, dict) else range(len(parent))
         key = random.choice(keys)
@@ -147,10 +149,10 @@ def mutate_value(top: Any, random: Random) -> Any:
     kind = random.randrange(8)
     if kind == 0:
         del parent[key]
-    elif kind == 1 and isinstance(parent, dict):
-        parent[random.choice((*parent, "", "x", "\ud800", "a" * 5000, "../../x"))] = parent.pop(key)
-    elif kind == 1:
+    elif kind == 1 and isinstance(parent, list):
         parent.insert(random.randrange(len(parent)), parent[key])
+    elif kind == 1:
+        parent[random.choice((*parent, "", "x", "\ud800", "a" * 5000, "../../x"))] = parent.pop(key)
     elif kind == 2:  # as another value of the same table has it
         parent[key] = parent[random.choice(keys)]
     else:

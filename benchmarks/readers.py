@@ -9,7 +9,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from io import BytesIO, StringIO
+from io import StringIO
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -49,6 +49,14 @@ def _scene(folder: Path) -> None:
     from tidefield.data.load import load_scene
 
     load_scene(folder)
+
+
+def _description(folder: Path) -> None:
+    """A scene without the exposures of its photographs, which take most of the time of reading it."""
+    import torch
+
+    with patch("tidefield.data.load.estimate_gains", lambda photographs, *_: torch.ones(len(photographs), 3)):
+        _scene(folder)
 
 
 def _imported(folder: Path) -> None:
@@ -102,7 +110,7 @@ def _prepared(folder: Path) -> None:
     """A scene that is complete: what is damaged would be done again, which ends the reading here."""
     from rich.console import Console
 
-    from tidefield.commands.prepare import Prepare, prepare
+    from tidefield.commands.prepare import prepare
     from tidefield.survey.stages import Stages
 
     class Reading(Stages):
@@ -217,15 +225,17 @@ def _mutate_tensors(content: bytes, random: Random) -> bytes:
 
 _PHOTOGRAPHS = ("images/*.png",)
 READERS = (
-    Reader("COLMAP, binary", "colmap", ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"), _scene),
-    Reader("COLMAP, text", "colmap_text", ("sparse/0/*.txt",), _scene),
+    Reader(
+        "COLMAP, binary", "colmap", ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"), _scene
+    ),
+    Reader("COLMAP, text", "colmap_text", ("sparse/0/*.txt",), _description),
     Reader("COLMAP, for pycolmap", "colmap", ("sparse/0/*.bin",), _model),
     Reader("COLMAP, imported", "colmap", ("sparse/0/*.bin",), _imported),
     Reader("transforms.json", "transforms", ("transforms.json",), _scene),
     Reader("PLY", "transforms", ("sparse_pc.ply",), _scene),
     Reader("Blender", "blender", ("transforms_*.json",), _scene),
     Reader("LLFF", "llff", ("poses_bounds.npy",), _scene),
-    Reader("OpenSfM", "opensfm", ("reconstruction.json", "tracks.csv", "reference_lla.json"), _scene),
+    Reader("OpenSfM", "opensfm", ("reconstruction.json", "tracks.csv", "reference_lla.json"), _description),
     Reader("OpenSfM, imported", "opensfm", ("reconstruction.json", "tracks.csv", "reference_lla.json"), _imported),
     Reader("ODM", "odm", ("opensfm/reconstruction.json", "opensfm/image_list.txt"), _scene),
     Reader("photographs of a scene", "transforms", _PHOTOGRAPHS, _scene),
@@ -288,7 +298,9 @@ def _make_layouts(folder: Path, scene: Path) -> None:
     blender = _copy(scene, folder / "blender", "sparse")
     top = json.loads((transforms / "transforms.json").read_text())
     for part in ("train", "test"):
-        frames = [frame for frame in top["frames"] if (frame["file_path"] in top["train_filenames"]) == (part == "train")]
+        frames = [
+            frame for frame in top["frames"] if (frame["file_path"] in top["train_filenames"]) == (part == "train")
+        ]
         angle = 2 * np.arctan(top["w"] / 2 / top["fl_x"])
         (blender / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     llff = _copy(scene, folder / "llff", "sparse")
@@ -374,7 +386,7 @@ def _make_survey_files(folder: Path) -> None:
     for name in ("survey", "gps", "geo", "control"):
         (folder / name).mkdir()
         for file in ("a.jpg", "b b.jpg", "c.png", "d.tif"):
-            options = {"xmp": packet} if file.endswith("jpg") else {}
+            options: dict[str, Any] = {"xmp": packet} if file.endswith("jpg") else {}
             Image.fromarray(texture).save(folder / name / file, exif=exif.tobytes(), **options)
     east, north = _PLACE
     rows = [(name, east + 1e-4 * k, north + 1e-4 * k) for k, name in enumerate(("a.jpg", "b b.jpg", "c.png", "d.tif"))]
