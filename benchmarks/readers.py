@@ -177,7 +177,7 @@ def _nerfstudio_job(folder: Path) -> None:
     from tidefield.baselines.nerfstudio.driver import _read_job, progress_of
 
     progress_of(folder)
-    torch.tensor(_read_job(folder)["factor"])
+    torch.tensor(_read_job(folder)[1])
 
 
 def _demonstration(folder: Path) -> None:
