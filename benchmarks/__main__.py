@@ -196,6 +196,8 @@ def fuzz(
         readers: Names of readers, as the table shows them; all if not given.
         seed: Of the damage.
     """
+    if readers and runs is not None:
+        raise RunError("--readers was given with --runs: the record is of all readers; leave one of them out")
     from benchmarks.fuzz import measure_fuzz
     from benchmarks.readers import READERS
     from benchmarks.robustness import fuzz_table

@@ -20,12 +20,14 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from random import Random
 from typing import Any
+from unittest.mock import patch
 
 from benchmarks.readers import Reader, make_seeds
 from tidefield.errors import RunError, TidefieldError
@@ -76,17 +78,17 @@ def measure_fuzz(
         RunError: a reader does not accept its whole files.
     """
     counts = {}
-    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-        work = Path(folder)
-        os.environ["XDG_CACHE_HOME"] = str(work / "cache")
+    with ExitStack() as stack:
+        work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fuzz-")))
+        stack.enter_context(patch.dict(os.environ, XDG_CACHE_HOME=str(work / "cache")))
         say("writing whole files")
         seeds(work / "seeds")
-        with _Worker(work) as worker:
-            for reader in readers:
-                counts[reader.name] = count = Count()
-                _fuzz(reader, 60 * minutes / len(readers), seed, worker, kept, count)
-                shutil.rmtree(work / "cache", ignore_errors=True)
-                say(f"{reader.name}: {count.files} files, {sum(count.findings.values())} findings")
+        worker = stack.enter_context(_Worker(work))
+        for reader in readers:
+            counts[reader.name] = count = Count()
+            _fuzz(reader, 60 * minutes / len(readers), seed, worker, kept, count)
+            shutil.rmtree(work / "cache", ignore_errors=True)
+            say(f"{reader.name}: {count.files} files, {sum(count.findings.values())} findings")
     if runs is not None:
         record = {name: vars(count) for name, count in counts.items()}
         command = f"python -m benchmarks fuzz --minutes {minutes:g} --seed {seed}"
