@@ -120,6 +120,19 @@ def test_an_error_of_nerfstudio_is_reported(scene: Scene, tmp_path: Path, fake: 
         driver.progress_of(run)
 
 
+@pytest.mark.parametrize(
+    "job",
+    [
+        *("[1]", '{"trained": 7}', '{"trained": [3, 30.0]}', '{"trained": [3, 30.0], "factor": [1, 1]}'),
+        f'{{"trained": [3, 1{400 * "0"}], "factor": [1, 1, 1]}}',
+    ],
+)
+def test_a_damaged_job_is_named(job: str, tmp_path: Path):
+    (tmp_path / "job.json").write_text(job)
+    with pytest.raises(RunError, match=r"job\.json.*expected"):
+        driver.progress_of(tmp_path)
+
+
 def test_without_nerfstudio_the_message_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(RunError, match="run `tidefield baselines install nerfacto`"):

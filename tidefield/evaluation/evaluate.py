@@ -125,8 +125,9 @@ def delete_evaluation(out: Path, names: Sequence[str]) -> None:
     """Delete an evaluation, its pictures, and those that one of these photographs, ended before its end, has left."""
     report = read_json(out / EVALUATION_FILE)
     listed = report.get("per_photograph") if isinstance(report, dict) else None
-    pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in (*names, *(listed or ()))}
-    pictures |= {f"{name}.png" for name in (*names, *(listed or ()))}
+    names = [*names, *(listed if isinstance(listed, dict) else ())]
+    pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in names}
+    pictures |= {f"{name}.png" for name in names}
     found = [(file, file.relative_to(out / folder)) for folder in FOLDERS for file in (out / folder).rglob("*.png")]
     delete_files(out, [out / EVALUATION_FILE, *(file for file, name in found if name.as_posix() in pictures)])
 

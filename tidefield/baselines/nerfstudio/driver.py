@@ -12,7 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
-from tidefield.config import Budget
+from tidefield.config import Budget, Range, from_json
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -38,6 +38,9 @@ KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_T
 """What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """A worker may take so long to end."""
+_TRAINED = tuple[Annotated[int, Range(0, (1 << 63) - 1)], Annotated[float, Range(0, 1e12)]]
+_FACTOR = tuple[(Annotated[float, Range(1e-9, 1)],) * 3]
+"""Types of what job.json holds."""
 
 
 def delete_training(folder: Path) -> None:
@@ -125,7 +128,7 @@ def progress_of(folder: Path) -> TrainingProgress:
     Raises:
         RunError: not to its end.
     """
-    step, seconds = _read_job(folder)["trained"]
+    step, seconds = _read_job(folder)[0]
     return TrainingProgress(step, seconds)
 
 
@@ -136,7 +139,7 @@ def renderer(folder: Path) -> Iterator[Render]:
     Raises:
         RunError: nerfstudio is not installed, or fails.
     """
-    factor = torch.tensor(_read_job(folder)["factor"])
+    factor = torch.tensor(_read_job(folder)[1])
     with _worker("render", folder) as worker:
         worker.answer()  # once it has loaded
 
@@ -215,11 +218,16 @@ def _failed(folder: Path) -> RunError:
     )
 
 
-def _read_job(folder: Path) -> dict[str, Any]:
-    job = read_json(folder / JOB_FILE) or {}
+def _read_job(folder: Path) -> tuple[tuple[int, float], tuple[float, ...]]:
+    """Steps and seconds of a training that is complete, and the factor of its scene."""
+    path = folder / JOB_FILE
+    job = read_json(path) or {}
+    if not isinstance(job, dict):
+        raise RunError(f"{path} is damaged: expected what training wrote; train it with --overwrite")
     if "trained" not in job:
         raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
-    return job
+    factor = from_json(_FACTOR, job.get("factor"), f"{path}: factor")
+    return from_json(_TRAINED, job["trained"], f"{path}: trained"), factor
 
 
 def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
