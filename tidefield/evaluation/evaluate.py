@@ -90,12 +90,13 @@ def evaluate(
                 # Measured before LPIPS's networks are loaded, which are no part of the method.
                 memory, networks = _peak_memory(), load_lpips()
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
-            seen = doubly_seen(scene, scene.cameras[index])
-            scores = score(image, truth, seen, networks)
+            used = scene.photographs.used(index)
+            seen = doubly_seen(scene, scene.cameras[index]) & used
+            scores = score(image, truth, seen, networks, used)
             photographs[scene.names[index]] = {
                 **{name: scores.values[name] for name in NAMES},
                 "reasons": scores.reasons,
-                "seen_share": float(seen.float().mean()),
+                "seen_share": float(seen[used].float().mean()) if used.any() else 0.0,
                 "seconds": seconds,
             }
             _write_pictures(out, file, image, truth, rendering)

@@ -223,7 +223,7 @@ def _read_job(folder: Path) -> dict[str, Any]:
 
 
 def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
-    """Write photographs (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
+    """Write photographs and masks (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
     Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
 
@@ -236,6 +236,10 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
     for index, file in enumerate(files):
         colour = scene.photographs[index].float() / cameras.gain[index] * factor
         Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+    masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
+    for index, mask in enumerate(masks):
+        (folder / "masks").mkdir(exist_ok=True)
+        Image.fromarray(scene.photographs.used(index).numpy()).convert("L").save(folder / mask)
     columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
     lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
     points = scene.points
@@ -247,6 +251,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
         _point_colours(scene),
+        masks=masks,
         overwrite=True,
     )
     return factor

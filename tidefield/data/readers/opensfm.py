@@ -37,6 +37,7 @@ from tidefield.data.readers.files import (
     in_range,
     inside,
     keep_present,
+    masks_beside,
     naming,
     number,
     numbers,
@@ -100,6 +101,7 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
         T_world_camera=T_world_camera,
         points=points,
         reference=_reference(file, reconstruction),
+        masks=masks_beside(root, names, file) or masks_beside(file.parent, names, file),
     )
 
 

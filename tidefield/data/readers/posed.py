@@ -71,6 +71,7 @@ class PosedPhotographs:
         split: names of the training and the held-out photographs, where the format has a split.
         background_rgb: the background of photographs with alpha, where the format states it.
         reference: the geographic origin, where the format states it.
+        masks: of each photograph (`PhotographFile.mask`), or None; empty if no photograph has one.
     """
 
     names: tuple[str, ...]
@@ -82,6 +83,7 @@ class PosedPhotographs:
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background_rgb: tuple[float, float, float] | None = None
     reference: Reference | None = None
+    masks: tuple[Path | None, ...] = ()
 
 
 def proper_rotations(

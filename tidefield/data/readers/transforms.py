@@ -82,7 +82,14 @@ def read_blender(root: Path, allow_missing: bool) -> PosedPhotographs:
         near_far=np.stack([_BLENDER_NEAREST * distance, _BLENDER_FARTHEST * distance], axis=1),
         split=(train, test[0] - train) if test else None,
         background_rgb=_WHITE,
+        masks=_joined(parts),
     )
+
+
+def _joined(parts: Sequence[PosedPhotographs]) -> tuple[Path | None, ...]:
+    """The masks of several parts of a scene; empty if none has any."""
+    masks = sum((part.masks or (None,) * len(part.names) for part in parts), ())
+    return masks if any(masks) else ()
 
 
 def _photographs(
@@ -113,7 +120,25 @@ def _photographs(
         paths=paths,
         lenses=tuple(_lens({**top, **frame}, path, file) for _, path, frame in found),
         T_world_camera=_poses([frame for _, _, frame in found], file),
+        masks=_masks([frame for _, _, frame in found], root, file, allow_missing),
     )
+
+
+def _masks(frames: Sequence[Mapping[str, Any]], root: Path, file: Path, allow_missing: bool) -> tuple[Path | None, ...]:
+    """The masks that frames name; empty if none does."""
+    masks: list[Path | None] = []
+    for frame in frames:
+        name = frame.get("mask_path")
+        path = None if name is None else inside(root, str(name), file)
+        if path is not None and not path.is_file():
+            if not allow_missing:
+                raise SceneError(
+                    f"{file} names the mask {name}, which is missing: add it, or use --allow-missing to use the whole "
+                    "photograph"
+                )
+            path = None
+        masks.append(path)
+    return tuple(masks) if any(masks) else ()
 
 
 def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
@@ -196,6 +221,7 @@ def write_transforms_file(
     xyz_world: Float64[np.ndarray, "P 3"],
     rgb: UInt8[np.ndarray, "P 3"],
     *,
+    masks: Sequence[str] = (),
     header: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -210,6 +236,8 @@ def write_transforms_file(
         T_world_camera: poses with OpenCV's axes.
         split: indices of the training and of the held-out photographs.
         xyz_world, rgb: the sparse points.
+        masks: of each photograph, relative to the folder; empty if no photograph has one. nerfstudio reads masks of all
+            photographs or of none.
         header: further entries at the top.
         overwrite: replace existing files.
 
@@ -227,10 +255,11 @@ def write_transforms_file(
     top["frames"] = [
         {
             "file_path": file,
+            **({"mask_path": masks[i]} if masks else {}),
             "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
             **({} if is_shared else calibration),
         }
-        for file, pose, calibration in zip(files, _flip_axes(T_world_camera), calibrations, strict=True)
+        for i, (file, pose, calibration) in enumerate(zip(files, _flip_axes(T_world_camera), calibrations, strict=True))
     ]
     with completed_file(folder / _FILE, overwrite=overwrite) as partial:
         partial.write_text(json.dumps(top, indent=1, allow_nan=False), encoding="utf-8")
