@@ -10,7 +10,7 @@ from camera_files import exif, named, one, photograph, real_survey, survey_folde
 from PIL import Image
 from PIL.ExifTags import Base
 
-from tidefield.errors import SurveyError
+from tidefield.errors import SceneError, SurveyError
 from tidefield.survey.io.photographs import read_survey
 
 
@@ -157,3 +157,57 @@ def test_a_name_that_is_not_utf_8_is_refused_and_shown(tmp_path):
         pytest.skip("this file system has names in Unicode only")
     with pytest.raises(SurveyError, match=r"not UTF-8, caf\\xe9.jpg: expected .*; rename it"):
         read_survey(tmp_path)
+
+
+def mask(path: Path, size: tuple[int, int] = (64, 48)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("L", size, 255).save(path)
+
+
+def test_masks_next_to_the_photographs_are_used_and_are_no_photographs(tmp_path: Path):
+    for name in ("a.jpg", "sub/b.jpg", "c.png"):
+        photograph(tmp_path / name)
+    size = read_survey(tmp_path).photographs[0].width, read_survey(tmp_path).photographs[0].height
+    mask(tmp_path / "masks" / "a.jpg.png", size)
+    mask(tmp_path / "masks" / "sub" / "b.jpg.png", size)
+    mask(tmp_path / "masks" / "of one that was removed.jpg.png")
+    survey = read_survey(tmp_path)
+    assert {p.name: p.mask and p.mask.name for p in survey.photographs} == {
+        "a.jpg": "a.jpg.png",
+        "c.png": None,
+        "sub/b.jpg": "b.jpg.png",
+    }
+    assert f"{tmp_path / 'masks'} has masks of 2 photographs: what is black there is not used." in survey.remarks
+
+
+def test_a_folder_called_masks_without_masks_is_one_of_photographs(tmp_path: Path):
+    for name in ("masks/a.jpg", "masks/b.png", "masks/c.png"):
+        photograph(tmp_path / name)
+    assert len(read_survey(tmp_path).photographs) == 3
+
+
+def test_masks_may_lie_elsewhere_or_among_the_photographs(tmp_path: Path):
+    card = tmp_path / "card"
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(card / name)
+    size = read_survey(card).photographs[0].width, read_survey(card).photographs[0].height
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        mask(tmp_path / "elsewhere" / f"{name}.png", size)
+    survey = read_survey(card, masks=tmp_path / "elsewhere")
+    assert all(p.mask for p in survey.photographs)
+    assert not any("masks" in remark for remark in survey.remarks)
+    mask(card / "a.jpg.png", size)
+    survey = read_survey(card, masks=card)
+    assert [p.mask is not None for p in survey.photographs] == [True, False, False]
+    assert "1 of the photographs have masks" in survey.remarks[0]
+
+
+def test_masks_that_do_not_fit_are_errors(tmp_path: Path):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(tmp_path / "card" / name)
+    mask(tmp_path / "other" / "a.png")
+    with pytest.raises(SurveyError, match=r"has no mask of any photograph in .*: expected a PNG .*such as a.jpg.png"):
+        read_survey(tmp_path / "card", masks=tmp_path / "other")
+    mask(tmp_path / "card" / "masks" / "a.jpg.png", (7, 5))
+    with pytest.raises(SceneError, match=r"a.jpg.png has 7 x 5 pixels, but its photograph .*a.jpg has"):
+        read_survey(tmp_path / "card")

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from ground_flight import ABOVE, FOCAL, Flight, fly
+from PIL import Image
 from rich.console import Console
 
 from tidefield.data.georeference import read_georeference
@@ -319,3 +320,29 @@ def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: 
             assert picture.size == (400, 300)
             assert picture.getexif().get(ExifTags.Base.Orientation, 1) == 1
     assert np.abs(position_error_m(tmp_path / "scene", flight)).max() < 0.3
+
+
+def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tmp_path: Path):
+    card = shutil.copytree(flight.folder, tmp_path / "card")
+    used = np.full((ground_flight.HEIGHT, ground_flight.WIDTH), 255, dtype=np.uint8)
+    used[-60:] = 0
+    (card / "masks").mkdir()
+    for name in flight.names[:-1]:
+        Image.fromarray(used).convert("RGB").save(card / "masks" / f"{name}.png")
+    scene = tmp_path / "scene"
+    assert run(card, scene).models[0] == sorted(flight.names)
+    frames = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))["frames"]
+    assert [frame["mask_path"] for frame in frames] == [f"masks/{name}.png" for name in sorted(flight.names)]
+    for name in flight.names:
+        with Image.open(scene / "masks" / f"{name}.png") as mask:
+            assert mask.mode == "L"  # of the kind that nerfstudio reads
+            assert (np.asarray(mask) == (255 if name == flight.names[-1] else used)).all()
+    loaded = load_scene(scene)
+    assert loaded.points is not None
+    masked = loaded.points.camera_index != loaded.index(flight.names[-1])
+    assert loaded.points.uv_px[masked, 1].max() < ground_flight.HEIGHT - 60
+    assert loaded.points.uv_px[~masked, 1].max() > ground_flight.HEIGHT - 60
+    # Without the masks everything after the features is done again, and the scene has none.
+    shutil.rmtree(card / "masks")
+    run(card, scene)
+    assert not (scene / "masks").exists()

@@ -36,6 +36,9 @@ class Prepare:
     photographs is used where EXIF has none."""
     control: Path | None = None
     """Ground control (ODM's gcp_list.txt); without it, such a file next to the photographs is used."""
+    masks: Path | None = None
+    """Folder with a mask of each photograph, such as IMG_1.jpg.png for IMG_1.jpg, black where it is not to be used;
+    without it, a folder `masks` next to the photographs is used."""
     no_control: Annotated[bool, arg(name="no-control", help="Use no ground control, even if a file is there.")] = False
     keep_all: bool = False
     """Use photographs of low quality, too."""
@@ -62,7 +65,13 @@ def prepare(options: Prepare, console: Console) -> None:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     set_up_pycolmap(options.verbosity.verbose)
     features = FeatureOptions(options.feature_width, options.features)
-    survey = read_survey(options.photographs, options.gps, options.control, find_control=not options.no_control)
+    survey = read_survey(
+        options.photographs,
+        options.gps,
+        options.control,
+        find_control=not options.no_control,
+        masks=options.masks,
+    )
     for remark in survey.remarks:
         log.warning(remark)
     prepared = prepare_scene(

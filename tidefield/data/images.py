@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 from platformdirs import user_cache_path
 from torch import Tensor
 
@@ -301,6 +302,18 @@ def read_mask(path: Path, size: tuple[int, int], photograph: Path) -> Bool[np.nd
     Raises:
         SceneError: the mask cannot be read, or has another size than the photograph.
     """
+    with _open_mask(path, size, photograph) as picture:
+        return np.asarray(picture.convert("L")) > 0
+
+
+def check_mask(path: Path, size: tuple[int, int], photograph: Path) -> None:
+    """Check, without decoding it, that a mask fits its photograph (see `read_mask`)."""
+    with _open_mask(path, size, photograph):
+        pass
+
+
+@contextmanager
+def _open_mask(path: Path, size: tuple[int, int], photograph: Path) -> Iterator[Image.Image]:
     with open_picture(path) as picture:
         if picture.size != size:
             raise SceneError(
@@ -308,7 +321,14 @@ def read_mask(path: Path, size: tuple[int, int], photograph: Path) -> Bool[np.nd
                 f"x {size[1]}: expected a mask of the same size, black where the photograph is not to be used; make it "
                 "again at that size"
             )
-        return np.asarray(picture.convert("L")) > 0
+        yield picture
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
+    """Write a mask as a grey PNG of black and white, the one kind that nerfstudio reads, too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with completed_file(path, overwrite=True) as partial:
+        Image.fromarray(255 * mask.astype(np.uint8)).save(partial, format="PNG")
 
 
 def fill_masked(pixels: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W C"]:

@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Float32
 from PIL import ExifTags, Image
 
+from tidefield.data.images import read_mask, write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
 from tidefield.files import completed_file
@@ -75,6 +76,19 @@ def write_images(
             progress(done, len(photographs))
 
 
+def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
+    """Write the masks of photographs into a folder as NAME.png, a white one for photographs without.
+
+    nerfstudio reads masks of all photographs or of none.
+    """
+    for photograph in photographs:
+        size = photograph.width, photograph.height
+        used = np.ones(size[::-1], dtype=bool)
+        if photograph.mask is not None:
+            used = read_mask(photograph.mask, size, photograph.path)
+        write_mask(folder / f"{photograph.name}.png", used)
+
+
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     """Compute the tangent of the angle between each pixel's ray and the optical axis."""
     # From the centre of the first pixel to that of the last, so that nothing is extrapolated.
@@ -88,7 +102,12 @@ def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
 
 
 def write_transforms(
-    folder: Path, model: pycolmap.Reconstruction, *, z_is_up: bool = False, overwrite: bool = False
+    folder: Path,
+    model: pycolmap.Reconstruction,
+    *,
+    masks: bool = False,
+    z_is_up: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write `transforms.json` and `sparse_pc.ply` of a model whose photographs are in `folder/images`.
 
@@ -97,6 +116,7 @@ def write_transforms(
 
     Args:
         model: cameras with Brown's distortion; photographs without a pose are left out.
+        masks: whether `folder/masks` has a mask of every photograph.
         z_is_up: whether the world's z axis points up: nerfstudio then does not rotate the world.
 
     Raises:
@@ -122,6 +142,7 @@ def write_transforms(
         every_eighth(len(images)),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3) - origin,
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        masks=[f"masks/{image.name}.png" for image in images if masks],
         header={
             **({"orientation_override": "none"} if z_is_up else {}),
             "applied_transform": np.column_stack([np.eye(3), 0.0 - origin]).tolist(),

@@ -15,7 +15,7 @@ import pycolmap
 from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
-from tidefield.data.images import Progress
+from tidefield.data.images import Progress, read_mask, write_mask
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import RunError
@@ -83,10 +83,12 @@ def import_project(
             (_link if link else shutil.copyfile)(path, target)
             if progress is not None:
                 progress(done, len(posed.names))
+        if posed.masks:
+            _write_masks(posed, folder / "masks")
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
-        write_transforms(folder, model, z_is_up=located is not None)
+        write_transforms(folder, model, masks=bool(posed.masks), z_is_up=located is not None)
         if located is not None:
             located.write(folder)
     return model, located
@@ -151,6 +153,14 @@ def _at_file_size(posed: PosedPhotographs) -> PosedPhotographs:
         )
         points = replace(points, uv_px=points.uv_px * scale[points.photograph_index])
     return replace(posed, names=names, lenses=lenses, points=points)
+
+
+def _write_masks(posed: PosedPhotographs, folder: Path) -> None:
+    """Write the mask of every photograph, a white one for those without."""
+    for name, path, lens, mask in zip(posed.names, posed.paths, posed.lenses, posed.masks, strict=True):
+        size = lens.width, lens.height
+        used = np.ones(size[::-1], dtype=bool) if mask is None else read_mask(mask, size, path)
+        write_mask(folder / f"{name}.png", used)
 
 
 def _link(path: Path, target: Path) -> None:

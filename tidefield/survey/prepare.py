@@ -19,7 +19,7 @@ from tidefield.errors import RunError, SurveyError
 from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
-from tidefield.survey.export import write_images, write_transforms
+from tidefield.survey.export import write_images, write_masks, write_transforms
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
@@ -113,7 +113,8 @@ def prepare(
             raise ValueError(f"{database.name} is no database of features")
         return facts
 
-    stages.run("features", [names, asdict(features)], [database], extract_features, refuse_damaged)
+    masks = _masks_fingerprint(good)  # no part of the key of scenes without masks
+    stages.run("features", [names, asdict(features), *masks], [database], extract_features, refuse_damaged)
     pairs = stages.run(
         "pairs",
         {},
@@ -163,6 +164,7 @@ def prepare(
         {"colour": colour},
         [
             *(images / photograph.name for photograph in placed),
+            *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
             *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
         ],
         lambda _: write_scene(placed, scene, colour, console),
@@ -221,6 +223,9 @@ def write_scene(
     cameras = [camera_of[photograph.name] for photograph in photographs]
     with ProgressBar(console, "Writing photographs") as bar:
         write_images(photographs, images, None, cameras, bar)
+    masks = any(photograph.mask is not None for photograph in photographs)
+    if masks:
+        write_masks(photographs, scene / "masks")
     correction = None
     if colour != "off":
         with ProgressBar(console, "Measuring exposures") as bar:
@@ -231,7 +236,7 @@ def write_scene(
                 write_images(photographs, images, correction, cameras, bar)
     model.extract_colors_for_all_images(images)
     write_model(model, sparse)
-    write_transforms(scene, model, z_is_up=True, overwrite=True)
+    write_transforms(scene, model, masks=masks, z_is_up=True, overwrite=True)
     return {"evening": _to_json(correction)}
 
 
@@ -257,6 +262,12 @@ def _fingerprint(survey: Survey) -> list:
         position, lens = repr(photograph.position), repr(photograph.lens)
         fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens])
     return fingerprint
+
+
+def _masks_fingerprint(survey: Survey) -> list:
+    """Identify the masks of photographs; empty if no photograph has one."""
+    masks = [(p.name, p.mask.stat()) for p in survey.photographs if p.mask is not None]
+    return [[name, state.st_size, state.st_mtime_ns] for name, state in masks]
 
 
 def _to_json(value: Any) -> Any:

@@ -76,6 +76,7 @@ class Photograph:
         position: of the camera, or None.
         relative_altitude_m: height above take-off; NaN if unknown.
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
+        mask: a picture of the upright photograph's size that is black where the photograph is not to be used, or None.
     """
 
     path: Path
@@ -91,6 +92,7 @@ class Photograph:
     position: Position | None
     relative_altitude_m: float
     gimbal_deg: tuple[float, float, float] | None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)

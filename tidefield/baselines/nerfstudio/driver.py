@@ -21,6 +21,7 @@ from PIL import Image
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget
+from tidefield.data.images import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -238,8 +239,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
     masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
     for index, mask in enumerate(masks):
-        (folder / "masks").mkdir(exist_ok=True)
-        Image.fromarray(scene.photographs.used(index).numpy()).convert("L").save(folder / mask)
+        write_mask(folder / mask, scene.photographs.used(index).numpy())
     columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
     lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
     points = scene.points

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from PIL import ExifTags
 
+from tidefield.data.images import check_mask
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control
@@ -22,6 +23,8 @@ from tidefield.survey.io.positions import locate_photographs
 from tidefield.survey.io.text_files import find_file, normalise_name
 from tidefield.survey.survey import Photograph, Survey
 
+MASKS = "masks"
+"""Folder of masks next to the photographs, and in a scene."""
 FEWEST = 3
 """Fewest photographs of a survey: with two, no third view verifies the poses."""
 
@@ -37,7 +40,12 @@ _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the las
 
 
 def read_survey(
-    folder: Path, gps: Path | None = None, control: Path | None = None, *, find_control: bool = True
+    folder: Path,
+    gps: Path | None = None,
+    control: Path | None = None,
+    *,
+    find_control: bool = True,
+    masks: Path | None = None,
 ) -> Survey:
     """Read all photographs (JPEG, PNG, TIFF) in a folder and its sub-folders, with positions and ground control.
 
@@ -50,21 +58,26 @@ def read_survey(
         gps: a file of positions, which have priority over EXIF.
         control: a file of ground control in the format of ODM's gcp_list.txt.
         find_control: use such a file in the folder where none is given; one that does not fit is only remarked.
+        masks: a folder with NAME.png for photographs called NAME; without it, `masks` in the folder, if it has any.
 
     Raises:
         SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
             positions or the given ground control cannot be parsed.
     """
     paths, raws = _list_photographs(folder)
+    mask_of, remarks = _find_masks(folder, paths, masks)
+    home = masks or folder / MASKS
+    if mask_of:  # they are no photographs
+        own = set(mask_of.values())
+        paths = [path for path in paths if path not in own and (home == folder or not path.is_relative_to(home))]
     names = [path.relative_to(folder).as_posix() for path in paths]
     _refuse_collisions(names)
-    remarks = []
     if raws:
         remarks.append(f"{len(raws)} camera raw files are not read ({list_names(raws)}): develop them first.")
     with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
         # Pillow warns of tags that it cannot read, without the name of the file; they count as unknown.
         warnings.simplefilter("ignore", UserWarning)
-        read = list(pool.map(_read, paths, names))
+        read = list(pool.map(_read, paths, names, [mask_of.get(path) for path in paths]))
     photographs = [photograph for photograph in read if isinstance(photograph, tuple)]
     unread = [f"Left out: {problem}" for problem in read if isinstance(problem, str)]
     if len(photographs) < FEWEST:
@@ -166,7 +179,30 @@ def _refuse_collisions(names: Sequence[str]) -> None:
         )
 
 
-def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
+def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -> tuple[dict[Path, Path], list[str]]:
+    """Find the masks of photographs, and say what is to be said of them.
+
+    Raises:
+        SurveyError: there is no mask where they were asked for.
+    """
+    home = masks or folder / MASKS
+    candidates = {path: home / f"{path.relative_to(folder)}.png" for path in photographs}
+    found = {path: mask for path, mask in candidates.items() if mask.is_file()}
+    count = len([path for path in photographs if path not in set(found.values())])
+    if masks is not None and not found:
+        example = next(iter(candidates.values())).relative_to(home).as_posix()
+        raise SurveyError(
+            f"{masks} has no mask of any photograph in {folder}: expected a PNG called like its photograph, such as "
+            f"{example}, that is black where the photograph is not to be used; give the folder of the masks, or leave "
+            "--masks out"
+        )
+    if masks is not None:
+        some = [f"{len(found)} of the photographs have masks in {masks}, the others are used whole."]
+        return found, some if len(found) < count else []
+    return found, [f"{home} has masks of {len(found)} photographs: what is black there is not used."] if found else []
+
+
+def _read(path: Path, name: str, mask: Path | None) -> tuple[Photograph, tuple[str, ...]] | str:
     """Read a photograph and which blocks of its metadata are damaged, or return why it cannot be read."""
     try:
         with open_image(path) as image:
@@ -190,5 +226,8 @@ def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
         position=metadata.position,
         relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
+        mask=mask,
     )
+    if mask is not None:
+        check_mask(mask, (width, height), path)
     return photograph, metadata.damaged

@@ -20,6 +20,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
+from tidefield.data.images import read_mask
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
@@ -185,9 +186,15 @@ def _features(
     found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
     keypoints[:, :3] *= photograph.width / grey.shape[1]
+    found_descriptors = np.asarray(descriptors.data, dtype=np.uint8)
+    if photograph.mask is not None:
+        used = read_mask(photograph.mask, (photograph.width, photograph.height), photograph.path)
+        column, row = np.floor(keypoints[:, :2]).astype(np.int64).T
+        kept = used[row.clip(0, photograph.height - 1), column.clip(0, photograph.width - 1)]
+        keypoints, found_descriptors = keypoints[kept], found_descriptors[kept]
     # The largest are the most repeatable; VLFeat returns somewhat more than the maximum.
     largest = np.argsort(-keypoints[:, 2], kind="stable")[: options.count]
-    return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]
+    return keypoints[largest], found_descriptors[largest]
 
 
 def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:
