@@ -1,3 +1,4 @@
+import json
 import logging
 import os
 import shutil
@@ -249,3 +250,16 @@ def test_masks_are_imported_in_the_places_where_colmap_and_nerfstudio_look(tmp_p
         assert torch.equal(ours.photographs.used(i), theirs.photographs.used(i))
         assert torch.equal(by_path.photographs.used(i), theirs.photographs.used(i))
     assert not theirs.photographs.used(theirs.index(truth.names[0])).all()
+
+
+def test_a_fisheye_stays_one_for_colmap_and_nerfstudio(tmp_path: Path) -> None:
+    write_opensfm(tmp_path / "theirs", reconstruction("fisheye_opencv"))
+    made, _ = import_project(tmp_path / "theirs", tmp_path / "ours")
+    lenses = read_posed(tmp_path / "theirs", False).lenses
+    assert {camera.model_name for camera in made.cameras.values()} == {"OPENCV_FISHEYE"}
+    assert read_posed(tmp_path / "ours", False).lenses == lenses
+    top = json.loads((tmp_path / "ours" / "transforms.json").read_text())
+    assert top["camera_model"] == "OPENCV_FISHEYE"
+    assert [top[key] for key in ("k1", "k2", "k3", "k4")] == list(lenses[0].distortion)
+    shutil.rmtree(tmp_path / "ours" / "sparse")
+    assert read_posed(tmp_path / "ours", False).lenses == lenses

@@ -31,7 +31,7 @@ from torch import Tensor
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens, rectify
+from tidefield.geometry.lenses import LensModel, rectify
 from tidefield.machine import cores
 
 Progress = Callable[[int, int], None]
@@ -99,7 +99,7 @@ class PhotographFile:
     """
 
     path: Path
-    lens: Lens
+    lens: LensModel
     width: int
     height: int
     has_alpha: bool

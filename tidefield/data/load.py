@@ -25,7 +25,7 @@ from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import Lens, LensModel
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
     )
 
 
-def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
+def own_lens(path: Path, lens: LensModel) -> tuple[LensModel, bool]:
     """Resize a lens to its photograph's own size; also return whether the photograph has alpha.
 
     Raises:
@@ -256,7 +256,7 @@ def _pinhole(file: PhotographFile) -> Lens:
 def _sparse_points(
     points: Observations,
     T_world_camera: Float64[np.ndarray, "V 3 4"],
-    lenses: tuple[Lens, ...],
+    lenses: tuple[LensModel, ...],
     pinholes: tuple[Lens, ...],
 ) -> SparsePoints | None:
     """Undistort the observations of sparse points; leave out those that then lie outside their photographs."""

@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int
 from tidefield.data.readers.files import in_range, inside, keep_present, masks_beside, naming, opened
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, Lens, lens_from_colmap
+from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, LensModel, lens_from_colmap
 
 _NO_POINT = -1
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
@@ -140,7 +140,7 @@ class _Reader:
             raise ValueError(f"it goes on for {len(self.bytes) - self.at} bytes after its last record")
 
 
-def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, LensModel]]:
     reader = _Reader(file)
     for _ in reader.records(24):
         camera, model, width, height = reader.take("IiQQ")
@@ -178,7 +178,7 @@ def _lines(file: BinaryIO) -> Iterator[str]:
     return (line.strip() for line in file.read().decode().splitlines() if not line.startswith("#"))
 
 
-def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, LensModel]]:
     for line in filter(None, _lines(file)):
         camera, model, width, height, *parameters = line.split()
         yield int(camera), lens_from_colmap(model, int(width), int(height), [float(p) for p in parameters])

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64, Int, UInt8
 
 from tidefield.data.readers.files import LARGEST, in_range
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import LensModel
 
 
 def _no_indices() -> Int[np.ndarray, " O"]:
@@ -76,7 +76,7 @@ class PosedPhotographs:
 
     names: tuple[str, ...]
     paths: tuple[Path, ...]
-    lenses: tuple[Lens, ...]
+    lenses: tuple[LensModel, ...]
     T_world_camera: Float64[np.ndarray, "V 3 4"]
     points: Observations | None = None
     near_far: Float64[np.ndarray, "V 2"] | None = None
