@@ -40,6 +40,8 @@ class Prepare:
     """Folder with a mask of each photograph, such as IMG_1.jpg.png for IMG_1.jpg, black where it is not to be used;
     without it, a folder `masks` next to the photographs is used."""
     no_control: Annotated[bool, arg(name="no-control", help="Use no ground control, even if a file is there.")] = False
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """Lens of the camera. What a fisheye sees beyond 120 degrees is left out when the scene is read."""
     keep_all: bool = False
     """Use photographs of low quality, too."""
     colour: Literal["auto", "on", "off"] = "auto"
@@ -80,6 +82,7 @@ def prepare(options: Prepare, console: Console) -> None:
         features,
         choose_device(options.device),
         console,
+        lens=options.lens,
         keep_all=options.keep_all,
         colour=options.colour,
         redo=options.redo,

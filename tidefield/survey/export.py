@@ -18,7 +18,7 @@ from tidefield.data.images import read_mask, write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import lens_from_colmap
+from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.machine import cores
 from tidefield.survey.colour import ExposureCorrection, to_common_exposure
 from tidefield.survey.io.image_decoding import upright
@@ -95,7 +95,12 @@ def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     columns, rows = (max(2, 1 + -(-size // GRID_PX)) for size in (camera.width, camera.height))
     u, v = np.linspace(0.5, camera.width - 0.5, columns), np.linspace(0.5, camera.height - 0.5, rows)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    grid = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1).reshape(rows, columns).astype(np.float32)
+    tangent = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1)
+    lens = lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params)
+    if isinstance(lens, FisheyeLens):  # farther out, the falloff is unknown, and beyond 90 degrees there is no tangent
+        corners = lens.pinhole().unproject(np.array([(0.0, 0.0), (lens.width, lens.height)]))
+        tangent = np.fmin(np.linalg.norm(lens.unproject(uv), axis=1), np.linalg.norm(corners, axis=1).max())
+    grid = tangent.reshape(rows, columns).astype(np.float32)
     column = np.linspace(0, columns - 1, camera.width, dtype=np.float32)
     row = np.linspace(0, rows - 1, camera.height, dtype=np.float32)
     return cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR)

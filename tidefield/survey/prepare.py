@@ -24,7 +24,7 @@ from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
 from tidefield.survey.quality.measures import Measures
-from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract, is_database
+from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
@@ -71,6 +71,7 @@ def prepare(
     device: pycolmap.Device,
     console: Console,
     *,
+    lens: LensKind = "pinhole",
     keep_all: bool = False,
     colour: Literal["auto", "on", "off"] = "auto",
     redo: str | None = None,
@@ -78,6 +79,7 @@ def prepare(
     """Make a scene of a survey, or continue an interrupted run.
 
     Args:
+        lens: of the camera.
         keep_all: use photographs of low quality too.
         colour: correct exposures and lens falloff: where it helps, always, or never.
         redo: a stage to repeat, with all that follow.
@@ -106,15 +108,16 @@ def prepare(
         if not resume or not is_database(database):
             database.unlink(missing_ok=True)
         with ProgressBar(console, "Extracting features") as bar:
-            return {"features": extract(good.photographs, database, features, device, bar)}
+            return {"features": extract(good.photographs, database, features, device, bar, lens)}
 
     def refuse_damaged(facts: Facts) -> Facts:
         if not is_database(database):
             raise ValueError(f"{database.name} is no database of features")
         return facts
 
-    masks = _masks_fingerprint(good)  # no part of the key of scenes without masks
-    stages.run("features", [names, asdict(features), *masks], [database], extract_features, refuse_damaged)
+    # Both are no part of the key of scenes that have neither.
+    masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
+    stages.run("features", [names, asdict(features), *masks, *kind], [database], extract_features, refuse_damaged)
     pairs = stages.run(
         "pairs",
         {},
@@ -140,7 +143,7 @@ def prepare(
             raise ValueError("the model has other photographs")
         return models, _lens_from_json(facts["lens"])
 
-    models, lens = stages.run(
+    models, choice = stages.run(
         "poses", {}, model_files(model), lambda _: estimate_poses(survey, database, model, console), read_poses
     )
 
@@ -170,7 +173,7 @@ def prepare(
         lambda _: write_scene(placed, scene, colour, console),
         lambda facts: _correction_from_json(facts["evening"], len(placed)),
     )
-    return Prepared(survey, verdicts, frozenset(names), models, lens, located, correction, stages.seconds)
+    return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
 
 
 def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
@@ -185,11 +188,11 @@ def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Con
 
 def estimate_poses(survey: Survey, database: Path, folder: Path, console: Console) -> Facts:
     """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder."""
+    known = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Estimating poses") as bar:
-        models = reconstruct(database, folder.with_name("models"), bar)
-    has_prior = all(photograph.lens is not None for photograph in survey.photographs)
+        models = reconstruct(database, folder.with_name("models"), bar, known)
     with ProgressBar(console, "Choosing a lens") as bar:
-        choice = choose_lens(models[0], survey.photographs, has_prior, bar)
+        choice = choose_lens(models[0], survey.photographs, known, bar)
     write_model(models[0], folder)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
