@@ -28,7 +28,7 @@ class Prepare:
     """
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photographs (JPEG, PNG, TIFF), in sub-folders too."""
+    """Folder with the photographs (JPEG, PNG, TIFF, HEIC), in sub-folders too."""
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """Folder for the scene: a new one, or one to continue."""
     gps: Path | None = None

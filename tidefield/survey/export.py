@@ -21,7 +21,7 @@ from tidefield.files import completed_file
 from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.machine import cores
 from tidefield.survey.colour import ExposureCorrection, to_common_exposure
-from tidefield.survey.io.image_decoding import upright
+from tidefield.survey.io.image_decoding import HEIFS, open_image, upright
 from tidefield.survey.survey import Photograph, Progress
 
 GRID_PX = 8
@@ -55,7 +55,8 @@ def write_images(
     def write(index: int) -> None:
         photograph = photographs[index]
         target = folder / photograph.name
-        if correction is None and photograph.orientation == 1:
+        is_heif = photograph.path.suffix.casefold() in HEIFS  # written as JPEG, which others read
+        if correction is None and photograph.orientation == 1 and not is_heif:
             with completed_file(target, overwrite=True) as partial:
                 shutil.copyfile(photograph.path, partial)
             return
@@ -63,7 +64,7 @@ def write_images(
         if correction is not None:
             tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
-        with Image.open(photograph.path) as original:
+        with open_image(photograph.path) as original:
             exif = original.getexif()
         exif[ExifTags.Base.Orientation] = 1
         is_jpeg = target.suffix.lower() in (".jpg", ".jpeg")

@@ -65,7 +65,7 @@ class Photograph:
 
     Attributes:
         path: the file.
-        name: its path relative to the survey's folder, with forward slashes; unique.
+        name: its path relative to the survey's folder, with forward slashes; unique. Ends in .jpg for HEIC files.
         width, height: pixels of the upright photograph.
         orientation: EXIF's, 1 to 8; 1 is stored upright.
         camera: make and model; empty if unknown. Photographs of one camera, size and focal length share a lens.

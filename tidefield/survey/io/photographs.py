@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from PIL import ExifTags
@@ -16,7 +17,7 @@ from tidefield.data.images import check_mask
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control
-from tidefield.survey.io.image_decoding import open_image, refuse_truncated, stored_size, upright_size
+from tidefield.survey.io.image_decoding import HEIFS, open_image, refuse_truncated, stored_size, upright_size
 from tidefield.survey.io.lens_prior import lens_prior
 from tidefield.survey.io.metadata import read_metadata
 from tidefield.survey.io.positions import locate_photographs
@@ -28,12 +29,12 @@ MASKS = "masks"
 FEWEST = 3
 """Fewest photographs of a survey: with two, no third view verifies the poses."""
 
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff")
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", *HEIFS)
 _RAWS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mef", ".mos"),
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
-_OTHER_IMAGES = (".heic", ".heif", ".avif", ".webp", ".jp2", ".jxl", ".bmp")
+_OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp")
 # Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
 _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
@@ -47,7 +48,7 @@ def read_survey(
     find_control: bool = True,
     masks: Path | None = None,
 ) -> Survey:
-    """Read all photographs (JPEG, PNG, TIFF) in a folder and its sub-folders, with positions and ground control.
+    """Read all photographs (JPEG, PNG, TIFF, HEIC) in a folder and its sub-folders, with positions and ground control.
 
     Hidden folders, scenes (folders with a `sparse` folder or a `georeference.json`) and OpenDroneMap's results are
     skipped. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose
@@ -70,8 +71,9 @@ def read_survey(
     if mask_of:  # they are no photographs
         own = set(mask_of.values())
         paths = [path for path in paths if path not in own and (home == folder or not path.is_relative_to(home))]
-    names = [path.relative_to(folder).as_posix() for path in paths]
-    _refuse_collisions(names)
+    _refuse_collisions([path.relative_to(folder).as_posix() for path in paths])
+    _refuse_unreadable([path for path in paths if path.suffix.casefold() in HEIFS])
+    names = [_name(path.relative_to(folder)) for path in paths]
     if raws:
         remarks.append(f"{len(raws)} camera raw files are not read ({list_names(raws)}): develop them first.")
     with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
@@ -179,6 +181,19 @@ def _refuse_collisions(names: Sequence[str]) -> None:
         )
 
 
+def _refuse_unreadable(heifs: Sequence[Path]) -> None:
+    if heifs and find_spec("pillow_heif") is None:
+        raise SurveyError(
+            f"{len(heifs)} photographs are HEIC files ({list_names([path.name for path in heifs])}): expected the "
+            "library that reads them; pip install 'tidefield[heic]', or export them as JPEG"
+        )
+
+
+def _name(path: Path) -> str:
+    """The name of a photograph in a scene: other programs read no HEIC, so it is written as JPEG there."""
+    return (path.with_suffix(".jpg") if path.suffix.casefold() in HEIFS else path).as_posix()
+
+
 def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -> tuple[dict[Path, Path], list[str]]:
     """Find the masks of photographs, and say what is to be said of them.
 
@@ -202,7 +217,7 @@ def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -
     return found, [f"{home} has masks of {len(found)} photographs: what is black there is not used."] if found else []
 
 
-def _read(path: Path, name: str, mask: Path | None) -> tuple[Photograph, tuple[str, ...]] | str:
+def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, tuple[str, ...]] | str:
     """Read a photograph and which blocks of its metadata are damaged, or return why it cannot be read."""
     try:
         with open_image(path) as image:
