@@ -321,3 +321,13 @@ def test_the_real_nerfacto_trains_and_renders(scene: Scene, tmp_path: Path):
     uniform = (truth - truth.mean((0, 1))).square().mean()
     error = (view.colour - truth).square().mean()
     assert error < 0.8 * uniform, "better than the best picture of one colour"
+
+
+def test_masks_are_exported_for_all_photographs_or_none(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    masked = wall.with_left_halves_masked(scene, (2,))
+    driver.export(masked, tmp_path / "data")
+    frames = json.loads((tmp_path / "data" / "transforms.json").read_text())["frames"]
+    assert [frame["mask_path"] for frame in frames] == [f"masks/{i:05d}.png" for i in range(5)]
+    again = load_scene(tmp_path / "data")
+    assert all(torch.equal(again.photographs.used(i), masked.photographs.used(i)) for i in range(5))

@@ -38,7 +38,8 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     ranked = sorted(photographs, key=lambda photograph: photographs[photograph]["psnr"])
     chosen = ranked[len(ranked) // 2]
     index = scene.index(chosen)
-    truth, seen = scene.photographs[index].numpy(), doubly_seen(scene, scene.cameras[index]).numpy()
+    truth = scene.photographs[index].numpy()
+    seen = (doubly_seen(scene, scene.cameras[index]) & scene.photographs.used(index)).numpy()
     held_out = [scene.names[i] for i in scene.test]
     file = picture_names(held_out)[held_out.index(chosen)]
     pictures = {"ground truth": truth}

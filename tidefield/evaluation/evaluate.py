@@ -91,12 +91,13 @@ def evaluate(
                 memory, networks = _peak_memory(), load_lpips()
                 delete_files(out, [path])  # an older one is not of the pictures that follow
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
-            seen = doubly_seen(scene, scene.cameras[index])
-            scores = score(image, truth, seen, networks)
+            used = scene.photographs.used(index)
+            seen = doubly_seen(scene, scene.cameras[index]) & used
+            scores = score(image, truth, seen, networks, used)
             photographs[scene.names[index]] = {
                 **{name: scores.values[name] for name in NAMES},
                 "reasons": scores.reasons,
-                "seen_share": float(seen.float().mean()),
+                "seen_share": float(seen[used].float().mean()) if used.any() else 0.0,
                 "seconds": seconds,
             }
             _write_pictures(out, file, image, truth, rendering)

@@ -21,6 +21,7 @@ from PIL import Image
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget, Range, from_json
+from tidefield.data.images import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -231,7 +232,7 @@ def _read_job(folder: Path) -> tuple[tuple[int, float], tuple[float, ...]]:
 
 
 def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
-    """Write photographs (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
+    """Write photographs and masks (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
     Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
 
@@ -244,6 +245,9 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
     for index, file in enumerate(files):
         colour = scene.photographs[index].float() / cameras.gain[index] * factor
         Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+    masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
+    for index, mask in enumerate(masks):
+        write_mask(folder / mask, scene.photographs.used(index).numpy())
     columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
     lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
     points = scene.points
@@ -255,6 +259,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
         _point_colours(scene),
+        masks=masks,
         overwrite=True,
     )
     return factor

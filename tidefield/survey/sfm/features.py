@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 from urllib.parse import quote, unquote
 
 import cv2
@@ -20,6 +21,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
+from tidefield.data.images import read_mask
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
@@ -30,7 +32,10 @@ Keypoints = Float32[np.ndarray, "K 4"]
 Descriptors = UInt8[np.ndarray, "K 128"]
 
 DEFAULT_FOCAL = 1.2
-"""Focal length in widths of the photograph where no prior exists: COLMAP's default."""
+"""Focal length in widths of the photograph where no prior exists: COLMAP's default. A fisheye's is that of 180 degrees
+along the diagonal."""
+LensKind = Literal["pinhole", "fisheye"]
+"""What the lens model of a survey starts from: COLMAP's OPENCV, or its OPENCV_FISHEYE."""
 
 
 OPTION_RANGE = (100, 50_000)
@@ -102,9 +107,20 @@ def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
     return [numbers[kind] for kind in kinds]
 
 
-def initial_camera(photograph: Photograph) -> pycolmap.Camera:
-    """Make an OPENCV camera of COLMAP from the lens prior."""
+def initial_camera(photograph: Photograph, kind: LensKind = "pinhole") -> pycolmap.Camera:
+    """Make an OPENCV or OPENCV_FISHEYE camera of COLMAP from the lens prior.
+
+    Makers calibrate no fisheyes: of their priors, the focal length alone is used.
+    """
     lens, width, height = photograph.lens, photograph.width, photograph.height
+    if kind == "fisheye":
+        focal = lens.focal_px if lens else np.hypot(width, height) / np.pi
+        number = pycolmap.INVALID_CAMERA_ID
+        camera = pycolmap.Camera.create_from_model_name(number, "OPENCV_FISHEYE", focal, width, height)
+        camera.has_prior_focal_length = (
+            True  # so that pairs are verified by rays: pixels of a fisheye fit no epipolar line
+        )
+        return camera
     focal = lens.focal_px if lens else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(pycolmap.INVALID_CAMERA_ID, "OPENCV", focal, width, height)
     if lens and lens.principal_px:
@@ -128,6 +144,7 @@ def extract(
     options: FeatureOptions,
     device: pycolmap.Device,
     progress: Progress,
+    kind: LensKind = "pinhole",
 ) -> int:
     """Write cameras, photographs and their features to a database; what it contains already is kept.
 
@@ -136,7 +153,7 @@ def extract(
     """
     with pycolmap.Database.open(database) as db:
         todo = []
-        for photograph, camera_id in zip(photographs, _write_cameras(db, photographs), strict=True):
+        for photograph, camera_id in zip(photographs, _write_cameras(db, photographs, kind), strict=True):
             image = db.read_image_with_name(encode_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
                 todo.append((photograph, camera_id))
@@ -185,18 +202,24 @@ def _features(
     found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
     keypoints[:, :3] *= photograph.width / grey.shape[1]
+    found_descriptors = np.asarray(descriptors.data, dtype=np.uint8)
+    if photograph.mask is not None:
+        used = read_mask(photograph.mask, (photograph.width, photograph.height), photograph.path)
+        column, row = np.floor(keypoints[:, :2]).astype(np.int64).T
+        kept = used[row.clip(0, photograph.height - 1), column.clip(0, photograph.width - 1)]
+        keypoints, found_descriptors = keypoints[kept], found_descriptors[kept]
     # The largest are the most repeatable; VLFeat returns somewhat more than the maximum.
     largest = np.argsort(-keypoints[:, 2], kind="stable")[: options.count]
-    return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]
+    return keypoints[largest], found_descriptors[largest]
 
 
-def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:
+def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph], kind: LensKind) -> list[int]:
     """Write the cameras that the database lacks, each with its rig; return the camera of each photograph."""
     groups = lens_groups(photographs)
     # The photographs' order is fixed, so cameras have the same numbers when an interrupted run continues.
     for group in sorted(set(groups)):
         if not db.exists_camera(group + 1):
-            camera = initial_camera(photographs[groups.index(group)])
+            camera = initial_camera(photographs[groups.index(group)], kind)
             camera.camera_id = group + 1
             db.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=group + 1)
