@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt
 REQUIRED := pyproject.toml constraints.txt $(VENV)/.made
 
-.PHONY: demo test bench kills lint docs lowest clean help
+.PHONY: demo test bench kills fuzz lint docs lowest clean help
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test     the tests (ARGS=... for pytest)"
 	@echo "make bench    the benchmarks (ARGS=... for them)"
 	@echo "make kills    commands killed at random moments, and what they complete afterwards"
+	@echo "make fuzz     damaged files for everything that reads files (ARGS=\"--minutes 10\")"
 	@echo "make lint     ruff and pyright"
 	@echo "make docs     the site, in docs/_build/html"
 	@echo "make lowest   the main job with the lowest promised versions, in $(VENV)-lowest"
@@ -34,6 +35,9 @@ bench: $(VENV)/.installed-dev
 
 kills: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks kills $(ARGS)
+
+fuzz: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks fuzz $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | frames | memory | surveys | kills | table | card`; without a name, speed.
+"""`python -m benchmarks speed | frames | memory | surveys | kills | fuzz | table | robustness | card`, or else speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -22,8 +22,8 @@ MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
 LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
-DESCRIPTION = """Measure speed, views, memory and surveys, and write the page of results. Without a name, it is speed.
-`tidefield compare` and `tidefield ablate` measure quality.
+DESCRIPTION = """Measure speed, views, memory, surveys and robustness, and write the pages of results. Without a name,
+it is speed. `tidefield compare` and `tidefield ablate` measure quality.
 
 Measure on a machine that does nothing else. The page is made of the files of `tidefield compare`, `tidefield ablate`,
 speed, frames and memory."""
@@ -180,6 +180,52 @@ def kills(runs: Path = MEASURED, train: int = 20, prepare: int = 10, compare: in
         print(f"{name}: {of['identical']} of {of['kills']} identical")
 
 
+def fuzz(
+    minutes: float = 10.0,
+    runs: Path | None = None,
+    kept: Path = Path("runs/fuzz"),
+    readers: tuple[str, ...] = (),
+    seed: int = 0,
+) -> None:
+    """Give damaged files to everything that reads files, and keep those that are not properly refused (minutes).
+
+    Args:
+        minutes: For all readers together, each for the same time.
+        runs: Store the counts in this folder's fuzz.json.
+        kept: Folder for the findings: the files and their tracebacks.
+        readers: Names of readers, as the table shows them; all if not given.
+        seed: Of the damage.
+    """
+    if readers and runs is not None:
+        raise RunError("--readers was given with --runs: the record is of all readers; leave one of them out")
+    from benchmarks.fuzz import measure_fuzz
+    from benchmarks.readers import READERS
+    from benchmarks.robustness import fuzz_table
+
+    names = [reader.name for reader in READERS]
+    unknown = next((name for name in readers if name not in names), None)
+    if unknown is not None:
+        raise RunError(f"there is no reader {unknown!r}: expected one of {'; '.join(names)}; choose one of these")
+    chosen = [reader for reader in READERS if not readers or reader.name in readers]
+    counts = measure_fuzz(chosen, minutes, seed, kept, runs, partial(print, flush=True))
+    print(fuzz_table({name: vars(count) for name, count in counts.items()}).markdown())
+    if any(count.findings for count in counts.values()):
+        raise RunError(f"there are findings: expected none; their files and tracebacks are in {kept}")
+
+
+def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
+    """Write the page on damaged files and killed commands from stored counts.
+
+    Args:
+        runs: Folder of fuzz.json and kills.json.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.robustness import write_robustness
+
+    write_robustness(runs, out)
+    print(out)
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -219,7 +265,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, table, card, surveys, kills)
+    functions = (speed, frames, memory, table, robustness, card, surveys, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

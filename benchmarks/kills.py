@@ -79,8 +79,10 @@ def measure_kills(
         for name, job in _jobs(work).items():
             if counts[name]:
                 record[name] = _kill(job, name, counts[name], work, environment, moments, say)
-    command = " ".join(["python -m benchmarks kills", *(f"--{name} {counts[name]}" for name in counts)])
-    write_json(runs / KILLS_FILE, {"command": f"{command} --seed {seed}", "kills": record, **describe()})
+                # After each, as the whole takes long and may be interrupted.
+                done = " ".join(f"--{name} {record[name]['kills'] if name in record else 0}" for name in counts)
+                command = f"python -m benchmarks kills {done} --seed {seed}"
+                write_json(runs / KILLS_FILE, {"command": command, "kills": record, **describe()})
     bad = [name for name, of in record.items() if of["identical"] < of["kills"] or of["processes"] or of["files"]]
     if bad:
         raise RunError(

@@ -124,7 +124,7 @@ def page(compared: Results, ablated: Results, others: Sequence[Results], stored:
         "## Time and memory of each method",
         *([cost_table(compared).markdown()] if compared.by else ["Not measured."]),
         "## How this was measured",
-        "\n".join(f"- {line}" for line in _circumstances(records)),
+        "\n".join(f"- {line}" for line in circumstances(records)),
         "`make bench ARGS=table` wrote this page from [docs/measured](measured); nothing is typed by hand. The "
         "commands:",
         "\n".join(f"    {command}" for command in dict.fromkeys(record["command"] for _, record in records)),
@@ -234,8 +234,8 @@ def _records(
     return [(name, record) for name, record in (*vars(stored).items(), *steps) if record]
 
 
-def _circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
-    """Machines, dates and versions."""
+def circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    """Machines, dates and versions of measurements, by their names."""
     machines: dict[str, dict[str, None]] = {}
     dates = sorted({record["date"] for _, record in records})
     for name, record in records:

@@ -19,6 +19,9 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "radial": {**{key: BROWN[key] for key in ("focal_x", "focal_y", "c_x", "c_y", "k1", "k2")}},
     "simple_radial": {**{key: BROWN[key] for key in ("focal_x", "focal_y", "c_x", "c_y", "k1")}},
 }
+CAMERAS["fisheye"] = {"projection_type": "fisheye", "focal": 0.41, "k1": 0.03, "k2": -0.01}
+CAMERAS["fisheye_opencv"] = {"projection_type": "fisheye_opencv", "focal_x": 0.41, "focal_y": 0.42}
+CAMERAS["fisheye_opencv"] |= {"c_x": 0.012, "c_y": -0.021, "k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": -0.0005}
 for kind in ("radial", "simple_radial"):
     CAMERAS[kind]["projection_type"] = kind
 
@@ -33,6 +36,12 @@ def project(camera: dict[str, Any], shot: dict[str, Any], xyz_world: np.ndarray)
         return None
     xn, yn = x / z, y / z
     r = math.hypot(xn, yn)
+    if camera["projection_type"].startswith("fisheye"):
+        angle = math.atan2(math.hypot(x, y), z)
+        d = sum(camera.get(f"k{k}", 0) * angle ** (2 * k) for k in range(1, 5))
+        d = (1 + d) * angle / math.hypot(x, y)
+        fx, fy = camera.get("focal_x", camera.get("focal")), camera.get("focal_y", camera.get("focal"))
+        return fx * d * x + camera.get("c_x", 0), fy * d * y + camera.get("c_y", 0)
     d = 1 + camera.get("k1", 0) * r**2 + camera.get("k2", 0) * r**4
     if camera["projection_type"] == "perspective":
         return camera["focal"] * d * xn, camera["focal"] * d * yn

@@ -9,10 +9,11 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel, colmap_parameters
 
 BARREL = Lens(64, 48, 50.0, 51.0, 31.5, 24.5, k1=-0.12, k2=0.02, p1=0.001, p2=-0.002)
 PINHOLE = Lens(64, 48, 50.0, 50.0, 32.0, 24.0)
+FISHEYE = FisheyeLens(64, 48, 28.0, 28.5, 31.5, 24.5, k1=0.03, k2=-0.01, k3=0.002, k4=-0.0005)
 UTM = np.array([430_000.0, 6_100_000.0, 0.0])
 
 
@@ -21,13 +22,13 @@ class Truth:
     """A survey: nine photographs in three strips, 10 m above bumpy ground, nearly straight down."""
 
     names: tuple[str, ...]
-    lenses: tuple[Lens, ...]
+    lenses: tuple[LensModel, ...]
     T_world_camera: np.ndarray
     ground: np.ndarray
     pictures: tuple[np.ndarray, ...]
 
 
-def survey(lens: Lens = BARREL, offset: np.ndarray | None = None) -> Truth:
+def survey(lens: LensModel = BARREL, offset: np.ndarray | None = None) -> Truth:
     random = np.random.default_rng(7)
     poses, pictures, names = [], [], []
     for i in range(9):
@@ -70,9 +71,7 @@ def write_colmap(
     model = pycolmap.Reconstruction()
     numbers = {lens: i for i, lens in enumerate(dict.fromkeys(truth.lenses), start=1)}
     for lens, number in numbers.items():
-        parameters = [lens.fx, lens.fy, lens.cx, lens.cy]
-        kind = "OPENCV" if lens.is_distorted else "PINHOLE"
-        parameters += [lens.k1, lens.k2, lens.p1, lens.p2] if lens.is_distorted else []
+        kind, parameters = lens.colmap_model, colmap_parameters(lens, lens.colmap_model)
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=number, model=kind, width=lens.width, height=lens.height, params=parameters)
         )
@@ -96,7 +95,7 @@ def write_colmap(
     return folder
 
 
-def observe(lens: Lens, pose: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def observe(lens: LensModel, pose: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distorted pixels of points, and which of them are in the photograph."""
     uv = lens.project((ground - pose[:, 3]) @ pose[:, :3])
     return uv, ((uv >= 0) & (uv < (lens.width, lens.height))).all(axis=1)
@@ -117,7 +116,8 @@ def write_transforms(root: Path, truth: Truth, **more: object) -> Path:
             "h": lens.height,
         }
         frame |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-        frame |= {"k1": lens.k1, "k2": lens.k2, "p1": lens.p1, "p2": lens.p2} | ({"k3": lens.k3} if lens.k3 else {})
+        names = ("k1", "k2", "k3", "k4") if isinstance(lens, FisheyeLens) else ("k1", "k2", "p1", "p2", "k3")
+        frame |= {name: getattr(lens, name) for name in names if name != "k3" or lens.k3}
         frames.append(frame)
     root.mkdir(parents=True, exist_ok=True)
     file = root / "transforms.json"

@@ -82,6 +82,14 @@ def scene(own: Cameras, test: tuple[int, ...] = (1,)) -> Scene:
     )
 
 
+def with_left_halves_masked(own: Scene, which: tuple[int, ...]) -> Scene:
+    """The same scene; what is left of the middle of some photographs is not to be used."""
+    mask = torch.arange(own.cameras.width) >= own.cameras.width // 2
+    mask = mask.expand(own.cameras.height, -1).contiguous()
+    masks = tuple(mask if i in which else None for i in range(len(own.names)))
+    return replace(own, photographs=replace(own.photographs, masks=masks))
+
+
 def with_gains(own: Cameras) -> Cameras:
     """The same cameras, each at another exposure and white balance."""
     gain = 0.7 + 0.5 * torch.rand(len(own), 3, generator=torch.Generator().manual_seed(1))

@@ -153,3 +153,13 @@ def test_a_background_shows_where_nothing_is(scene: Scene):
     network.coarse, network.fine = Nothing(SMALL), Nothing(SMALL)
     view = make_render(network, replace(scene, background_rgb=(1.0, 0.5, 0.0)), CPU)(scene.cameras[0])
     torch.testing.assert_close(view.colour, torch.tensor([1.0, 0.5, 0.0]).expand(36, 48, 3))
+
+
+def test_masked_pixels_are_not_drawn(scene: Scene):
+    masked = wall.with_left_halves_masked(scene, scene.train[:2])
+    which, uv, colour = draw_pixels(masked, 500, torch.Generator().manual_seed(0))
+    everything = draw_pixels(scene, 500, torch.Generator().manual_seed(0))
+    kept = (everything[1][:, 0] >= scene.cameras.width // 2) | ~torch.isin(everything[0], torch.tensor(scene.train[:2]))
+    assert 100 < len(which) == kept.sum() < 500
+    for drawn, all_of_them in zip((which, uv, colour), everything, strict=True):
+        assert torch.equal(drawn, all_of_them[kept])

@@ -120,6 +120,19 @@ def test_an_error_of_nerfstudio_is_reported(scene: Scene, tmp_path: Path, fake: 
         driver.progress_of(run)
 
 
+@pytest.mark.parametrize(
+    "job",
+    [
+        *("[1]", '{"trained": 7}', '{"trained": [3, 30.0]}', '{"trained": [3, 30.0], "factor": [1, 1]}'),
+        f'{{"trained": [3, 1{400 * "0"}], "factor": [1, 1, 1]}}',
+    ],
+)
+def test_a_damaged_job_is_named(job: str, tmp_path: Path):
+    (tmp_path / "job.json").write_text(job)
+    with pytest.raises(RunError, match=r"job\.json.*expected"):
+        driver.progress_of(tmp_path)
+
+
 def test_without_nerfstudio_the_message_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(RunError, match="run `tidefield baselines install nerfacto`"):
@@ -308,3 +321,13 @@ def test_the_real_nerfacto_trains_and_renders(scene: Scene, tmp_path: Path):
     uniform = (truth - truth.mean((0, 1))).square().mean()
     error = (view.colour - truth).square().mean()
     assert error < 0.8 * uniform, "better than the best picture of one colour"
+
+
+def test_masks_are_exported_for_all_photographs_or_none(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    masked = wall.with_left_halves_masked(scene, (2,))
+    driver.export(masked, tmp_path / "data")
+    frames = json.loads((tmp_path / "data" / "transforms.json").read_text())["frames"]
+    assert [frame["mask_path"] for frame in frames] == [f"masks/{i:05d}.png" for i in range(5)]
+    again = load_scene(tmp_path / "data")
+    assert all(torch.equal(again.photographs.used(i), masked.photographs.used(i)) for i in range(5))

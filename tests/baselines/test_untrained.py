@@ -122,3 +122,18 @@ def test_unseen_ground_is_transparent_and_filled_from_next_to_it():
     assert unseen.float().mean() == 10 / 48  # one step moves the picture by 9.6 columns
     next_to = view.colour[:, 10].mean(0)
     assert (view.colour[unseen].mean(0) - next_to).abs().max() < 0.1
+
+
+def test_masked_pixels_are_read_by_no_baseline():
+    scene = wall.with_left_halves_masked(wall.scene(wall.cameras(5, step=0.6), test=(2,)), (0, 1, 3, 4))
+    for index in (0, 1, 3, 4):
+        scene.photographs[index][:, :23] = 255  # brighter than all of the wall
+    for method in (sparse_depth, plane_sweep, nearest):
+        view = method(scene)(scene.cameras[2])
+        shown = view.opacity > 0
+        # Photographs 0.6 m apart see the wall 5.8 px apart: the last masks end at 24 - 2 * 5.8, the next at 24 + 5.8.
+        assert shown[:, 30:36].all()
+        assert view.colour[shown].max() < 0.95
+        if method is not plane_sweep:
+            assert not shown[:, :12].any()
+            assert (view.colour - scene.photographs[2] / 255)[:, 30:36].abs().mean() < 0.02

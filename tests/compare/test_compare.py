@@ -335,6 +335,10 @@ def test_mistakes_are_reported_before_anything_is_trained(disk: Path, monkeypatc
         ("process.json", '{"settings": {}, "train": {"peak_memory_bytes": "x"}}'),
         ("curve.json", "[[1]]"),
         ("curve.json", "7"),
+        ("curve.json", f"[[1, 1{400 * '0'}]]"),
+        ("evaluation.json", lambda whole: whole.replace("1234.0", "NaN")),
+        ("evaluation.json", lambda whole: whole.replace("1234.0", f"1{400 * '0'}")),
+        ("evaluation.json", lambda whole: json.dumps({**json.loads(whole), "per_photograph": {}})),
     ],
 )
 def test_a_damaged_result_is_named(name: str, damaged, disk: Path, tmp_path: Path):
@@ -348,6 +352,21 @@ def test_a_damaged_result_is_named(name: str, damaged, disk: Path, tmp_path: Pat
         with pytest.raises(RunError, match=f"{name} is damaged"):
             compare({"flats": disk}, ("tidefield", "nearest"), SETTINGS, out, run, quiet)
         assert len(run.words) == 2, "before anything is trained"
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_bytes(b"x"), lambda file: shrink(file)])
+def test_a_rendering_that_cannot_be_shown_is_named(damage, disk: Path, tmp_path: Path):
+    run, out = Children(load_scene(disk, width=48)), tmp_path / "out"
+    compare({"flats": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    for file in (out / "runs" / "flats" / "nearest" / "renderings").rglob("*.png"):
+        damage(file)
+    with pytest.raises(RunError, match=r"png cannot be shown \(.*evaluation.json and repeat"):
+        write_comparison(read_results(out, ["flats"], ["nearest"]), {"flats": disk}, SETTINGS, out)
+
+
+def shrink(file: Path) -> None:
+    with Image.open(file) as picture:
+        picture.resize((20, 20)).save(file)
 
 
 def test_an_evaluation_that_was_not_recorded_is_repeated(disk: Path, tmp_path: Path):

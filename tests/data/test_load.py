@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from scenes_on_disk import (
     BARREL,
+    FISHEYE,
     PINHOLE,
     UTM,
     Truth,
@@ -26,6 +27,7 @@ from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import SceneError
+from tidefield.geometry.lenses import rectify
 
 REAL = SHARED / "scenes"
 
@@ -382,3 +384,26 @@ def test_real_scenes_load_with_sane_ranges_and_points_where_they_were_seen(name:
         distance_px = reprojection_px(scene)
         assert distance_px.max() < 2
         assert distance_px.median() < 0.1
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms.json", "instant-ngp"])
+def test_photographs_of_a_fisheye_become_pinhole_ones(tmp_path: Path, layout: str) -> None:
+    truth = survey(FISHEYE)
+    if layout == "colmap":
+        write_colmap(tmp_path, truth)
+    elif layout == "transforms.json":
+        write_transforms(tmp_path, truth, camera_model="OPENCV_FISHEYE")
+    else:
+        write_transforms(tmp_path, truth, camera_model="OPENCV", is_fisheye=True)
+    scene = load_scene(tmp_path)
+    pinhole = FISHEYE.pinhole()
+    assert scene.cameras.focal_px[0].tolist() == pytest.approx([pinhole.fx, pinhole.fy])
+    index = scene.names.index(truth.names[0])
+    assert torch.equal(scene.photographs[index], torch.from_numpy(rectify(truth.pictures[0], FISHEYE, 64, 48)))
+    if layout == "colmap":
+        points = scene.points
+        assert points is not None
+        assert points.error_px.max() < 0.01
+        uv = scene.cameras.project(points.xyz_world)[0]
+        off = uv[points.camera_index, points.point_index] - points.uv_px
+        assert off.abs().max() < 0.01

@@ -33,7 +33,7 @@ def test_image_lists_do_not_leave_a_project(tmp_path: Path) -> None:
         read_posed(root, False)
 
 
-@pytest.mark.parametrize("kind", ["fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual", "spherical", 7])
+@pytest.mark.parametrize("kind", ["fisheye62", "fisheye624", "dual", "spherical", 7])
 def test_cameras_that_are_no_pinhole_cameras_are_refused_with_advice(tmp_path: Path, kind: object) -> None:
     top = reconstruction()
     top["cameras"]["v2 make model"]["projection_type"] = kind

@@ -117,15 +117,15 @@ def test_a_model_without_its_images_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 def test_an_unsupported_camera_model_is_named(tmp_path: Path, text: bool) -> None:
     model = pycolmap.Reconstruction()
-    parameters = [50.0, 50.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0]
+    parameters = [50.0, 50.0, 32.0, 24.0, *[0.0] * 8]
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="OPENCV_FISHEYE", width=64, height=48, params=parameters)
+        pycolmap.Camera(camera_id=1, model="THIN_PRISM_FISHEYE", width=64, height=48, params=parameters)
     )
     folder = tmp_path / "sparse" / "0"
     folder.mkdir(parents=True)
     (model.write_text if text else model.write_binary)(str(folder))
     assert find_colmap(tmp_path, "sparse/0") == folder
-    with pytest.raises(SceneError, match=r"model OPENCV_FISHEYE: supported are .*image_undistorter"):
+    with pytest.raises(SceneError, match=r"model THIN_PRISM_FISHEYE: supported are .*image_undistorter"):
         read_colmap(tmp_path, folder, False)
 
 
@@ -168,9 +168,10 @@ def test_values_missing_in_frames_come_from_the_top_or_the_photograph(tmp_path: 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera model OPENCV_FISHEYE.*undistort"),
+        ({"camera_model": "FISHEYE624"}, "camera model FISHEYE624.*undistort"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR"),
-        ({"is_fisheye": True}, "fisheye"),
+        ({"ftheta_p0": 0.0}, "camera model F-Theta"),
+        ({"is_fisheye": True, "k5": 0.1}, "the term k5"),
         ({"k4": 0.1}, "the term k4"),
         ({"fl_x": "wide"}, "fl_x = 'wide'"),
         ({"fl_x": float("nan")}, "fl_x = nan"),

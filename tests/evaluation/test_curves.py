@@ -64,3 +64,14 @@ def test_a_training_leaves_a_point_for_each_share_of_its_budget(tmp_path: Path):
     assert len(points) == len(SHARES)
     assert [seconds for seconds, _ in points] == sorted(seconds for seconds, _ in points)
     assert all(10 < psnr < 60 for _, psnr in points)
+
+
+def test_masked_pixels_do_not_count():
+    scene = wall.with_left_halves_masked(wall.scene(wall.cameras(6), (1, 3, 4)), (1, 3))
+    curve = make_curve(scene)
+    depth = torch.ones(curve.truths[0].shape[:2])
+    wrong_left = [truth.float() / 255 for truth in curve.truths]
+    for colour in wrong_left:
+        colour[:, : colour.shape[1] // 2] = 0
+    curve.add(1.0, [Rendering(colour, depth, depth) for colour in wrong_left])
+    assert curve.points[0][1] > 50

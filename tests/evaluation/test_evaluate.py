@@ -47,6 +47,13 @@ def quiet() -> Console:
     return Console(file=io.StringIO(), width=120)
 
 
+@pytest.mark.parametrize("listed", [7, ["a"], [1], "abc", None])
+def test_an_evaluation_with_a_damaged_list_of_photographs_is_replaced(listed, scene, tmp_path):
+    (tmp_path / "evaluation.json").write_text(json.dumps({"per_photograph": listed}))
+    evaluate(perfect, scene, tmp_path, configuration={}, overwrite=True, console=quiet())
+    assert set(json.loads((tmp_path / "evaluation.json").read_text())["per_photograph"]) == {"01.jpg"}
+
+
 def test_the_report_holds_every_key_that_scripts_rely_on(scene, tmp_path):
     evaluation = evaluate(darker, scene, tmp_path / "out", configuration={"method": "wall"}, console=quiet())
     report = json.loads((tmp_path / "out" / "evaluation.json").read_text())

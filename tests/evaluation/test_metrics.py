@@ -137,3 +137,19 @@ def test_exactly_the_missing_values_have_a_reason():
     assert "none of this photograph's pixels" in scores.reasons["psnr_seen"]
     assert scores.values["psnr_cc"] is not None
     assert "at least 32 pixels" in scores.reasons["lpips_alex"]
+
+
+def test_masked_pixels_count_in_no_metric():
+    image, truth = noise(seed=1), noise(seed=2)
+    used = left_half(image)
+    found = score(image, truth, full(image), NO_LPIPS, used).values
+    expected = score(image, truth, used, NO_LPIPS).values
+    for name, value in expected.items():
+        if name.removesuffix("_cc").endswith("_seen"):
+            assert found[name] == found[name.replace("_seen", "")] == value
+
+
+def test_a_photograph_that_is_masked_altogether_has_no_values_but_a_reason():
+    scores = score(noise(seed=1), noise(seed=2), full(noise()), NO_LPIPS, ~full(noise()))
+    assert all(value is None for value in scores.values.values())
+    assert "the mask leaves none" in scores.reasons["ssim_cc"]

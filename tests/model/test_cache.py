@@ -68,3 +68,19 @@ def test_more_blocks_than_slots_are_refused(network: Network):
     neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 3]])
     with pytest.raises(CacheFull):
         cramped.views(Neighbours(neighbours, torch.ones(2, 5, 4)), torch.zeros(2, 3))
+
+
+@pytest.mark.usefixtures("small_blocks")
+@torch.inference_mode()
+def test_masked_pixels_are_no_valid_samples(network: Network):
+    at = wall.with_left_halves_masked(scene(), (1,))
+    seen_uv = torch.tensor([[60.0, 40.0], [75.0, 15.0], [85.0, 48.0], [150.0, 90.0]])
+    for index, expected in ((1, [False, False, True, True]), (2, [True] * 4)):
+        view = at.cameras[index]
+        directions = view.directions_world(seen_uv[None])[0]
+        middle = view.position_world + 5 * directions
+        neighbours = Neighbours(torch.full((4, 1), index), torch.ones(4, 1, 4))
+        views = FeatureCache(network, at, CPU).views(neighbours, middle)
+        for stride, coarse in ((4, True), (1, False)):
+            found = views.read(stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), coarse)
+            assert found.valid[:, 0, 0].tolist() == expected

@@ -160,9 +160,9 @@ def test_files_are_overwritten_only_on_request(tmp_path: Path) -> None:
 def test_unsupported_cameras_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(write_colmap(tmp_path, survey(PINHOLE))))
     camera = next(iter(model.cameras.values()))
-    camera.model, camera.params = pycolmap.CameraModelId.OPENCV_FISHEYE, [*camera.params, 0, 0, 0, 0]
+    camera.model, camera.params = pycolmap.CameraModelId.THIN_PRISM_FISHEYE, [*camera.params, *[0] * 8]
     before = sorted(os.listdir(tmp_path))
-    with pytest.raises(SceneError, match="OPENCV_FISHEYE"):
+    with pytest.raises(SceneError, match="THIN_PRISM_FISHEYE"):
         write_transforms(tmp_path, model)
     assert sorted(os.listdir(tmp_path)) == before
 

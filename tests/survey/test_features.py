@@ -108,3 +108,20 @@ def test_a_strip_of_one_pixel_has_no_features(tmp_path: Path):
     Image.new("RGB", (20_000, 1)).save(tmp_path / "strip.png")
     strip = replace(unlocated_photograph(0, None), path=tmp_path / "strip.png", width=20_000, height=1)
     assert extract([strip], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None) == 0
+
+
+def test_masked_pixels_have_no_features(wall_photographs: list[Photograph], tmp_path: Path):
+    used = np.zeros((180, 240), dtype=np.uint8)
+    used[:, 100:] = 255
+    Image.fromarray(used).save(tmp_path / "mask.png")
+    wall_photographs[0] = replace(wall_photographs[0], mask=tmp_path / "mask.png")
+    extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
+    with pycolmap.Database.open(tmp_path / "a.db") as db:
+        left, count = [], []
+        for image in sorted(db.read_all_images(), key=lambda image: image.name):
+            keypoints = np.asarray(db.read_keypoints(image.image_id))
+            assert np.asarray(db.read_descriptors(image.image_id).data).shape == (len(keypoints), 128)
+            left.append(int((keypoints[:, 0] < 100).sum()))
+            count.append(len(keypoints))
+    assert left[0] == 0 < count[0]
+    assert min(left[1:]) > 0

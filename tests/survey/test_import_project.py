@@ -1,3 +1,4 @@
+import json
 import logging
 import os
 import shutil
@@ -297,3 +298,34 @@ def test_an_unwritable_folder_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="cannot be written"):
         import_project(tmp_path / "project", tmp_path / "file" / "scene")
+
+
+def test_masks_are_imported_in_the_places_where_colmap_and_nerfstudio_look(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "theirs", truth := survey(BARREL))
+    used = np.zeros((48, 64, 3), dtype=np.uint8)
+    used[:, 20:] = 1  # what is not black is used
+    (tmp_path / "theirs" / "masks" / "strip_0").mkdir(parents=True)
+    Image.fromarray(used).save(tmp_path / "theirs" / "masks" / f"{truth.names[0]}.png")
+    import_project(tmp_path / "theirs", tmp_path / "ours")
+    theirs, ours = load_scene(tmp_path / "theirs"), load_scene(tmp_path / "ours")
+    (tmp_path / "nerfstudio").mkdir()
+    for part in ("images", "masks", "transforms.json", "sparse_pc.ply"):
+        (tmp_path / "ours" / part).rename(tmp_path / "nerfstudio" / part)
+    by_path = load_scene(tmp_path / "nerfstudio")
+    for i in range(9):
+        assert torch.equal(ours.photographs.used(i), theirs.photographs.used(i))
+        assert torch.equal(by_path.photographs.used(i), theirs.photographs.used(i))
+    assert not theirs.photographs.used(theirs.index(truth.names[0])).all()
+
+
+def test_a_fisheye_stays_one_for_colmap_and_nerfstudio(tmp_path: Path) -> None:
+    write_opensfm(tmp_path / "theirs", reconstruction("fisheye_opencv"))
+    made, _ = import_project(tmp_path / "theirs", tmp_path / "ours")
+    lenses = read_posed(tmp_path / "theirs", False).lenses
+    assert {camera.model_name for camera in made.cameras.values()} == {"OPENCV_FISHEYE"}
+    assert read_posed(tmp_path / "ours", False).lenses == lenses
+    top = json.loads((tmp_path / "ours" / "transforms.json").read_text())
+    assert top["camera_model"] == "OPENCV_FISHEYE"
+    assert [top[key] for key in ("k1", "k2", "k3", "k4")] == list(lenses[0].distortion)
+    shutil.rmtree(tmp_path / "ours" / "sparse")
+    assert read_posed(tmp_path / "ours", False).lenses == lenses

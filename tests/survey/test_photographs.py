@@ -5,13 +5,17 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from camera_files import exif, named, one, photograph, real_survey, survey_folder
 from PIL import Image
-from PIL.ExifTags import Base
+from PIL.ExifTags import IFD, Base
 
-from tidefield.errors import SurveyError
+from tidefield.errors import SceneError, SurveyError
+from tidefield.survey.export import write_images
+from tidefield.survey.io import photographs
 from tidefield.survey.io.photographs import read_survey
+from tidefield.survey.sfm.features import initial_camera
 
 
 def test_three_real_surveys_are_read_whole_and_without_remarks():
@@ -66,8 +70,8 @@ def test_a_folder_that_does_not_exist_or_has_no_photographs_is_an_error(tmp_path
         read_survey(tmp_path / "file")
     with pytest.raises(SurveyError, match="has no photographs"):
         read_survey(tmp_path)
-    (tmp_path / "a.HEIC").write_bytes(b"")
-    with pytest.raises(SurveyError, match=r"images of other formats \(a.HEIC\)"):
+    (tmp_path / "a.webp").write_bytes(b"")
+    with pytest.raises(SurveyError, match=r"images of other formats \(a.webp\)"):
         read_survey(tmp_path)
 
 
@@ -157,3 +161,105 @@ def test_a_name_that_is_not_utf_8_is_refused_and_shown(tmp_path):
         pytest.skip("this file system has names in Unicode only")
     with pytest.raises(SurveyError, match=r"not UTF-8, caf\\xe9.jpg: expected .*; rename it"):
         read_survey(tmp_path)
+
+
+def mask(path: Path, size: tuple[int, int] = (64, 48)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("L", size, 255).save(path)
+
+
+def test_masks_next_to_the_photographs_are_used_and_are_no_photographs(tmp_path: Path):
+    for name in ("a.jpg", "sub/b.jpg", "c.png"):
+        photograph(tmp_path / name)
+    size = read_survey(tmp_path).photographs[0].width, read_survey(tmp_path).photographs[0].height
+    mask(tmp_path / "masks" / "a.jpg.png", size)
+    mask(tmp_path / "masks" / "sub" / "b.jpg.png", size)
+    mask(tmp_path / "masks" / "of one that was removed.jpg.png")
+    survey = read_survey(tmp_path)
+    assert {p.name: p.mask and p.mask.name for p in survey.photographs} == {
+        "a.jpg": "a.jpg.png",
+        "c.png": None,
+        "sub/b.jpg": "b.jpg.png",
+    }
+    assert f"{tmp_path / 'masks'} has masks of 2 photographs: what is black there is not used." in survey.remarks
+
+
+def test_a_folder_called_masks_without_masks_is_one_of_photographs(tmp_path: Path):
+    for name in ("masks/a.jpg", "masks/b.png", "masks/c.png"):
+        photograph(tmp_path / name)
+    assert len(read_survey(tmp_path).photographs) == 3
+
+
+def test_masks_may_lie_elsewhere_or_among_the_photographs(tmp_path: Path):
+    card = tmp_path / "card"
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(card / name)
+    size = read_survey(card).photographs[0].width, read_survey(card).photographs[0].height
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        mask(tmp_path / "elsewhere" / f"{name}.png", size)
+    survey = read_survey(card, masks=tmp_path / "elsewhere")
+    assert all(p.mask for p in survey.photographs)
+    assert not any("masks" in remark for remark in survey.remarks)
+    mask(card / "a.jpg.png", size)
+    survey = read_survey(card, masks=card)
+    assert [p.mask is not None for p in survey.photographs] == [True, False, False]
+    assert "1 of the photographs have masks" in survey.remarks[0]
+
+
+def test_masks_that_do_not_fit_are_errors(tmp_path: Path):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(tmp_path / "card" / name)
+    mask(tmp_path / "other" / "a.png")
+    with pytest.raises(SurveyError, match=r"has no mask of any photograph in .*: expected a PNG .*such as a.jpg.png"):
+        read_survey(tmp_path / "card", masks=tmp_path / "other")
+    mask(tmp_path / "card" / "masks" / "a.jpg.png", (7, 5))
+    with pytest.raises(SceneError, match=r"a.jpg.png has 7 x 5 pixels, but its photograph .*a.jpg has"):
+        read_survey(tmp_path / "card")
+
+
+def heic(path: Path, pixels: np.ndarray) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed (the extra [heic])")
+    table = exif({Base.Model: "Phone", Base.FocalLength: 5.7}, place=(54.5, -2.7))
+    picture = pillow_heif.from_pillow(Image.fromarray(pixels))
+    picture.save(path, quality=90, exif=table.tobytes())
+
+
+def test_heic_photographs_are_read_and_written_as_jpeg_with_their_exif(tmp_path: Path):
+    ramp = np.stack(np.broadcast_arrays(*np.ogrid[60:180:2, 40:200:2], 90), -1).astype(np.uint8)
+    for name in ("a.HEIC", "b.heif", "c.heic"):
+        heic(tmp_path / name, ramp)
+    survey = read_survey(tmp_path)
+    assert [p.name for p in survey.photographs] == ["a.jpg", "b.jpg", "c.jpg"]
+    first = survey.photographs[0]
+    assert (first.width, first.height, first.orientation, first.camera) == (80, 60, 1, "Phone")
+    assert first.position is not None
+    assert first.position.latitude_deg == pytest.approx(54.5)
+    write_images(
+        survey.photographs, tmp_path / "images", None, [initial_camera(p) for p in survey.photographs], lambda *_: None
+    )
+    with Image.open(tmp_path / "images" / "a.jpg") as written:
+        assert written.format == "JPEG"
+        assert written.getexif()[Base.Model] == "Phone"
+        assert written.getexif().get_ifd(IFD.GPSInfo)[2][0] == 54
+        assert np.abs(np.asarray(written).astype(int) - ramp).max() < 12
+
+
+def test_heic_photographs_without_the_extra_are_one_error_that_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name in ("a.HEIC", "b.heic", "c.heic"):
+        (tmp_path / name).write_bytes(b"....ftypheic")
+    monkeypatch.setattr(photographs, "find_spec", lambda name: None)
+    with pytest.raises(SurveyError, match=r"3 photographs are HEIC files \(a.HEIC.*pip install 'tidefield\[heic\]'"):
+        read_survey(tmp_path)
+
+
+def test_a_damaged_heic_photograph_is_left_out(tmp_path: Path):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(tmp_path / name)
+    heic(tmp_path / "d.heic", np.zeros((48, 64, 3), dtype=np.uint8))
+    whole = (tmp_path / "d.heic").read_bytes()
+    (tmp_path / "d.heic").write_bytes(whole[: len(whole) // 2])
+    survey = read_survey(tmp_path)
+    assert [p.name for p in survey.photographs] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert any("d.heic cannot be read" in remark for remark in survey.remarks)

@@ -16,8 +16,9 @@ from PIL import Image
 from rich.console import Console
 
 from tidefield.data.georeference import read_georeference
-from tidefield.data.load import load_scene
+from tidefield.data.load import load_scene, read_posed
 from tidefield.errors import RunError, SurveyError
+from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
@@ -344,3 +345,51 @@ def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: 
             assert picture.size == (400, 300)
             assert picture.getexif().get(ExifTags.Base.Orientation, 1) == 1
     assert np.abs(position_error_m(tmp_path / "scene", flight)).max() < 0.3
+
+
+def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tmp_path: Path):
+    card = shutil.copytree(flight.folder, tmp_path / "card")
+    used = np.full((ground_flight.HEIGHT, ground_flight.WIDTH), 255, dtype=np.uint8)
+    used[-60:] = 0
+    (card / "masks").mkdir()
+    for name in flight.names[:-1]:
+        Image.fromarray(used).convert("RGB").save(card / "masks" / f"{name}.png")
+    scene = tmp_path / "scene"
+    assert run(card, scene).models[0] == sorted(flight.names)
+    frames = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))["frames"]
+    assert [frame["mask_path"] for frame in frames] == [f"masks/{name}.png" for name in sorted(flight.names)]
+    for name in flight.names:
+        with Image.open(scene / "masks" / f"{name}.png") as mask:
+            assert mask.mode == "L"  # of the kind that nerfstudio reads
+            assert (np.asarray(mask) == (255 if name == flight.names[-1] else used)).all()
+    loaded = load_scene(scene)
+    assert loaded.points is not None
+    masked = loaded.points.camera_index != loaded.index(flight.names[-1])
+    assert loaded.points.uv_px[masked, 1].max() < ground_flight.HEIGHT - 60
+    assert loaded.points.uv_px[~masked, 1].max() > ground_flight.HEIGHT - 60
+    # Without the masks everything after the features is done again, and the scene has none.
+    shutil.rmtree(card / "masks")
+    run(card, scene)
+    assert not (scene / "masks").exists()
+
+
+def test_photographs_of_a_fisheye_become_a_scene_for_nerfstudio_and_for_us(tmp_path: Path):
+    lens = FisheyeLens(ground_flight.WIDTH, ground_flight.HEIGHT, 260.0, 260.0, 200.0, 150.0, k1=0.03)
+    flight = fly(tmp_path / "card", lens=lens)
+    scene, survey = tmp_path / "scene", read_survey(flight.folder)
+    prepared = prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), lens="fisheye")
+    assert prepared.models[0] == sorted(flight.names)
+    found = read_posed(scene, False).lenses[0]
+    assert isinstance(found, FisheyeLens)
+    rays = np.random.default_rng(0).uniform(-0.8, 0.8, (200, 2))
+    rays = np.c_[rays, np.ones(200)]
+    assert np.abs(found.project(rays) - lens.project(rays)).max() < 1.5
+    assert np.abs(position_error_m(scene, flight)).max() < 0.3
+    top = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
+    assert top["camera_model"] == "OPENCV_FISHEYE"
+    loaded = load_scene(scene)
+    assert loaded.points is not None
+    assert loaded.points.error_px.median() < 1
+    page = write_report(collect_findings(prepared, scene, {}), scene)
+    assert "FISHEYE" in (scene / "report.json").read_text(encoding="utf-8")
+    assert page.is_file()

@@ -3,13 +3,17 @@
 from dataclasses import replace
 
 import pytest
+import textured_wall as wall
 import torch
+from networks import SMALL, SMALL_PAPER, network
 from torch import Tensor
 
+from tidefield.config import NetworkConfig
 from tidefield.data.batches import Batch
+from tidefield.data.depth_prior import DepthPriors
 from tidefield.evaluation.lpips import prepare_torchvision
 from tidefield.model.network import RayGrid, TileRendering
-from tidefield.train.losses import COARSE_WEIGHT, DEPTH_SCALE, photometric, sparse_depth, structural
+from tidefield.train.losses import COARSE_WEIGHT, DEPTH_SCALE, BatchLoss, photometric, sparse_depth, structural
 
 SIDE, TILES = 8, 2
 STRIDE = 4
@@ -150,3 +154,18 @@ def test_the_structural_term_is_nothing_for_the_truth_and_leaves_out_what_has_no
     assert colour.grad is not None
     assert colour.grad.isfinite().all()
     assert (colour.grad[1] == 0).all()
+
+
+@pytest.mark.parametrize("preset", [SMALL.network, SMALL_PAPER])
+@pytest.mark.parametrize("everything", [False, True])
+def test_a_scene_with_masks_is_learned_from_where_it_is_not_masked(preset: NetworkConfig, everything: bool):
+    config = replace(SMALL.train, crop_px=None if preset is SMALL_PAPER else 48, tiles=4)
+    own = wall.with_left_halves_masked(wall.scene(wall.cameras(6)), tuple(range(6)))
+    if everything:
+        masks = tuple(torch.zeros(36, 48, dtype=torch.bool) for _ in range(6))
+        own = replace(own, photographs=replace(own.photographs, masks=masks))
+    learner = BatchLoss(network(preset), config)
+    loss, error = learner(own, DepthPriors(own), own.cameras, 3, torch.Generator().manual_seed(3))
+    loss.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in learner.parameters())
+    assert (float(error.detach()) > 0) != everything

@@ -223,6 +223,13 @@ def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(5 < point["psnr"]["wall"] < 60 for point in points)
 
 
+@pytest.mark.parametrize("text", ["7", "[7]", '[{"step": "x"}]', '{"step": 1}'])
+def test_a_damaged_record_of_the_validation_is_named(text: str, tmp_path: Path):
+    (tmp_path / "validation.json").write_text(text)
+    with pytest.raises(RunError, match=r"validation\.json is damaged"):
+        Validation({}, tmp_path)
+
+
 def test_weights_are_handed_on_in_half_precision(tmp_path: Path) -> None:
     scene = wall.scene(wall.cameras(4))
     trainer, file = SceneTrainer(SMALL, scene, 1, CPU), tmp_path / "w.safetensors"

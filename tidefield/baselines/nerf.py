@@ -198,16 +198,21 @@ class NerfTrainer(Trainer):
 def draw_pixels(
     scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 2"], Float[Tensor, "R 3"]]:
-    """Random pixels of random training photographs: which photographs, where, and their colours at common exposure."""
+    """Random pixels of random training photographs: which photographs, where, and their colours at common exposure.
+
+    Those of them that are masked are left out.
+    """
     train = torch.tensor(scene.train)
     which = train[torch.randint(len(train), (count,), generator=generator)]
     pixel = (torch.rand(count, 2, generator=generator) * scene.cameras.size_px[which]).floor()
-    colour = torch.empty(count, 3)
+    colour, used = torch.empty(count, 3), torch.ones(count, dtype=torch.bool)
     for index in which.unique().tolist():
         mine = which == index
         u, v = pixel[mine].long().unbind(-1)
         colour[mine] = scene.photographs[index][v, u].float() / (255 * scene.cameras.gain[index])
-    return which, pixel + 0.5, colour
+        if scene.photographs.masks:
+            used[mine] = scene.photographs.used(index)[v, u]
+    return which[used], pixel[used] + 0.5, colour[used]
 
 
 def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:

@@ -67,7 +67,7 @@ def nearest(scene: Scene) -> Render:
         depth = surface_depth(camera, scene.points, scene.cameras)
         points_world = surface_points(camera, depth)
         uv, z = sources.project(points_world)
-        seen = in_frame(sources, uv, z)
+        seen = in_frame(sources, uv, z, scene.photographs.masks_of(indices))
         distance = (sources.position_world - camera.position_world).norm(dim=-1)
         overlap = seen.float().mean(1)
         best = int(distance.masked_fill(overlap < overlap.max() / 2, torch.inf).argmin())
@@ -124,7 +124,8 @@ def nearest_photographs(scene: Scene, camera: Cameras, count: int) -> list[int]:
     sources = scene.cameras[list(indices)]
     uv, z = sources.project(points_world)
     angle = _angles(camera, sources, points_world)
-    angle = torch.where(in_frame(sources, uv, z), angle, torch.pi / 2).mean(1)
+    seen = in_frame(sources, uv, z, scene.photographs.masks_of(indices))
+    angle = torch.where(seen, angle, torch.pi / 2).mean(1)
     return [indices[i] for i in angle.argsort()[:count].tolist()]
 
 
@@ -151,7 +152,8 @@ def _blend(
     sources = scene.cameras[list(indices)]
     uv, z = sources.project(points_world)
     angle = _angles(camera, sources, points_world)
-    angle = angle.masked_fill(~in_frame(sources, uv, z), torch.inf)
+    seen = in_frame(sources, uv, z, scene.photographs.masks_of(indices))
+    angle = angle.masked_fill(~seen, torch.inf)
     smallest, which = angle.topk(min(VIEWS + 1, len(sources)), dim=0, largest=False)
     # The weight falls to 0 at the first photograph left out, so that no seam shows where the choice changes.
     limit = smallest[VIEWS] if len(sources) > VIEWS else torch.full_like(smallest[0], torch.inf)
@@ -192,7 +194,7 @@ def _match(
     for index in views:
         source = scene.cameras[index]
         uv, z = source.project(points_world)
-        inside = in_frame(source, uv, z)[0]
+        inside = in_frame(source, uv, z, scene.photographs.masks_of([index]))[0]
         if not inside.any():
             continue
         colour = read_photograph(scene, index, uv[0, inside])

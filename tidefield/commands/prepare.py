@@ -28,7 +28,7 @@ class Prepare:
     """
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photographs (JPEG, PNG, TIFF), in sub-folders too."""
+    """Folder with the photographs (JPEG, PNG, TIFF, HEIC), in sub-folders too."""
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """Folder for the scene: a new one, or one to continue."""
     gps: Path | None = None
@@ -36,7 +36,12 @@ class Prepare:
     photographs is used where EXIF has none."""
     control: Path | None = None
     """Ground control (ODM's gcp_list.txt); without it, such a file next to the photographs is used."""
+    masks: Path | None = None
+    """Folder with a mask of each photograph, such as IMG_1.jpg.png for IMG_1.jpg, black where it is not to be used;
+    without it, a folder `masks` next to the photographs is used."""
     no_control: Annotated[bool, arg(name="no-control", help="Use no ground control, even if a file is there.")] = False
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """Lens of the camera. What a fisheye sees beyond 120 degrees is left out when the scene is read."""
     keep_all: bool = False
     """Use photographs of low quality, too."""
     colour: Literal["auto", "on", "off"] = "auto"
@@ -63,7 +68,13 @@ def prepare(options: Prepare, console: Console) -> None:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     set_up_pycolmap(options.verbosity.verbose)
     features = FeatureOptions(options.feature_width, options.features)
-    survey = read_survey(options.photographs, options.gps, options.control, find_control=not options.no_control)
+    survey = read_survey(
+        options.photographs,
+        options.gps,
+        options.control,
+        find_control=not options.no_control,
+        masks=options.masks,
+    )
     for remark in survey.remarks:
         log.warning(remark)
     prepared = prepare_scene(
@@ -72,6 +83,7 @@ def prepare(options: Prepare, console: Console) -> None:
         features,
         choose_device(options.device),
         console,
+        lens=options.lens,
         keep_all=options.keep_all,
         colour=options.colour,
         downscale=options.downscale,

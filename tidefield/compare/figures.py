@@ -10,8 +10,11 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter
 
 from tidefield.compare.results import Results
+from tidefield.compare.run import EVALUATION_FILE
+from tidefield.data.readers.files import open_picture
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
+from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.evaluate import picture_names
 from tidefield.evaluation.panels import GAP_PX, PAPER, STRIP_PX, strip
 
@@ -35,15 +38,15 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     ranked = sorted(photographs, key=lambda photograph: photographs[photograph]["psnr"])
     chosen = ranked[len(ranked) // 2]
     index = scene.index(chosen)
-    truth, seen = scene.photographs[index].numpy(), doubly_seen(scene, scene.cameras[index]).numpy()
+    truth = scene.photographs[index].numpy()
+    seen = (doubly_seen(scene, scene.cameras[index]) & scene.photographs.used(index)).numpy()
     held_out = [scene.names[i] for i in scene.test]
     file = picture_names(held_out)[held_out.index(chosen)]
     pictures = {"ground truth": truth}
     for method in methods:
         folder = results.by[name, method].folder
         assert folder is not None, "figures are made where the pictures are"
-        with Image.open(folder / "renderings" / file) as picture:
-            pictures[method] = np.asarray(picture.convert("RGB"))
+        pictures[method] = _rendering(folder / "renderings" / file, truth.shape)
     corners = most_different(truth, [pictures[method] for method in methods], seen, truth.shape[1] // SHARE)
     columns = []
     for title, picture in pictures.items():
@@ -54,6 +57,26 @@ def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | Non
     for k, column in enumerate(columns):
         whole.paste(column, (k * (column.width + GAP_PX), 0))
     return whole
+
+
+def _rendering(file: Path, shape: tuple[int, ...]) -> UInt8[np.ndarray, "H W 3"]:
+    """Read a rendering of an evaluation, which has the shape of its photograph.
+
+    Raises:
+        RunError: it is missing, damaged, or of another shape.
+    """
+    try:
+        with open_picture(file) as picture:
+            found = np.asarray(picture.convert("RGB"))
+        fault = None if found.shape == shape else f"it has {found.shape[1]} x {found.shape[0]} pixels"
+    except SceneError as error:
+        found, fault = np.empty(0, np.uint8), str(error.__cause__ or error)
+    if fault:
+        raise RunError(
+            f"{file} cannot be shown ({fault}): expected the picture that `tidefield evaluate` wrote; delete "
+            f"{file.parents[1] / EVALUATION_FILE} and repeat the command"
+        )
+    return found
 
 
 def most_different(

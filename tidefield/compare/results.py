@@ -77,7 +77,7 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
 def _curve(path: Path) -> list[tuple[float, float]]:
     try:
         return [(float(x), float(y)) for x, y in read_json(path) or ()]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{path} is damaged: expected what this program wrote; delete it and repeat") from error
 
 

@@ -294,7 +294,8 @@ def _is_evaluation(data: Any) -> bool:
     numbers = [data["rays_per_second"], data["seconds_per_frame"], *(x for x in optional if x is not None)]
     numbers += [one["psnr"] for one in data["per_photograph"].values()]
     texts = [*reasons.values(), *weights.values()]
-    return all(_is_number(x) for x in numbers) and all(isinstance(x, str) for x in texts) and set(weights) <= set(mean)
+    are_whole = bool(data["per_photograph"]) and set(weights) <= set(mean)
+    return are_whole and all(_is_number(x) for x in numbers) and all(isinstance(x, str) for x in texts)
 
 
 def _is_process(data: Any) -> bool:
@@ -303,7 +304,7 @@ def _is_process(data: Any) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _kind(method: str) -> str:

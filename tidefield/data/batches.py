@@ -14,6 +14,7 @@ from torch import Tensor
 from tidefield.config import TrainConfig
 from tidefield.data.depth_prior import STRIDE, DepthPriors, Observed, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
+from tidefield.data.images import Masks
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
@@ -28,7 +29,8 @@ class Batch:
         targets: the tiles' photographs.
         corner_px: the tiles' upper left pixel corners.
         colours: the ground truth.
-        weight: of each pixel in the loss: 0 outside its photograph, which may be smaller than a tile, and
+        weight: of each pixel in the loss: 0 where it is masked, 0 outside its photograph, which may be smaller than a
+            tile, and
             `TrainConfig.unseen_weight` where fewer than two other training photographs see the surface.
         inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
         depth_weight: confidence in these depths, 0 to 1; 0 where there is none.
@@ -37,6 +39,7 @@ class Batch:
         which: for each neighbour, the image of `images` to read.
         images: what to encode, in groups of one size: crops of photographs, or whole ones.
         image_corner_px: upper left corners of the images in their photographs.
+        image_used: 1 for pixels of the images that are not masked; empty if the scene has no masks.
     """
 
     targets: Int[Tensor, " T"]
@@ -50,6 +53,7 @@ class Batch:
     which: Int[Tensor, "T N"]
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
+    image_used: tuple[Float[Tensor, "_ 1 _ _"], ...] = ()
 
     def to(self, device: torch.device) -> Batch:
         def move(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
@@ -72,17 +76,23 @@ class Batch:
             **own | {"which": torch.arange(len(chosen), device=chosen.device).reshape(own["which"].shape)},
             images=(self.images[0][chosen],),
             image_corner_px=(self.image_corner_px[0][chosen],),
+            image_used=tuple(used[chosen] for used in self.image_used),
         )
 
 
 def tile_doubly_seen(
-    camera: Cameras, prior: Float[Tensor, "3 h w"], corner_px: Float[Tensor, "2"], side_px: int, others: Cameras
+    camera: Cameras,
+    prior: Float[Tensor, "3 h w"],
+    corner_px: Float[Tensor, "2"],
+    side_px: int,
+    others: Cameras,
+    masks: Masks = (),
 ) -> Bool[Tensor, " R"]:
     """Decide which pixels of a tile show surface that at least two other cameras see, at the prior's resolution."""
     cells = max(1, side_px // STRIDE)
     middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
     uv, z = others.project(unproject_to_surface(camera, prior, middles))
-    seen = (in_frame(others, uv, z).sum(0) >= 2).reshape(cells, cells)
+    seen = (in_frame(others, uv, z, masks).sum(0) >= 2).reshape(cells, cells)
     cell = torch.arange(side_px) * cells // side_px
     return seen[cell][:, cell].reshape(-1)
 
@@ -121,18 +131,20 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
         colours, inside = _tile(scene, target, at.long(), side)
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
-            others = scene.cameras[train[train != target]]
-            weight[~tile_doubly_seen(camera, prior, at, side, others)] = config.unseen_weight
+            others = train[train != target]
+            masks = scene.photographs.masks_of(others.tolist())
+            seen = tile_doubly_seen(camera, prior, at, side, scene.cameras[others], masks)
+            weight[~seen] = config.unseen_weight
         depth = _sparse_depth(priors.observed(target), at, side)
         tiles.append((colours, weight * inside, *depth, found.index[0], found.blend_weight[0], middle_world))
     columns = (torch.stack(column) for column in zip(*tiles, strict=True))
     colours, weight, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
     if not views:
-        which, images, corners = neighbours, (), ()
+        which, images, corners, used = neighbours, (), (), ()
     elif config.crop_px is None:
-        which, images, corners = _whole(scene, neighbours)
+        which, images, corners, used = _whole(scene, neighbours)
     else:
-        which, images, corners = _crops(scene, neighbours, middles_world, config.crop_px)
+        which, images, corners, used = _crops(scene, neighbours, middles_world, config.crop_px)
     return Batch(
         targets=targets,
         corner_px=corner,
@@ -145,36 +157,44 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
         which=which,
         images=images,
         image_corner_px=corners,
+        image_used=used,
     )
 
 
 def _tile(
     scene: Scene, index: int, corner: Int[Tensor, "2"], side: int
 ) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, " R"]]:
-    """Colours of a tile's pixels, and which of them lie in the photograph."""
+    """Colours of a tile's pixels, and which of them lie in the photograph and are not masked."""
     u, v = corner.tolist()
     pixels = to_common_exposure(scene, index, slice(v, v + side), slice(u, u + side))
     height, width = pixels.shape[:2]
     colours, inside = torch.zeros(side, side, 3), torch.zeros(side, side, dtype=torch.bool)
     colours[:height, :width], inside[:height, :width] = pixels, True
+    if scene.photographs.masks:
+        inside[:height, :width] = scene.photographs.used(index)[v : v + side, u : u + side]
     return colours.reshape(-1, 3), inside.reshape(-1)
 
 
-def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+_Images = tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]
+"""`which`, `images`, `image_corner_px` and `image_used` of a batch."""
+
+
+def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> _Images:
     """Every neighbour once, whole, in groups of one size."""
     photographs, which = neighbours.unique(return_inverse=True)
     sizes, group = scene.cameras.size_px[photographs].unique(dim=0, return_inverse=True)
     order = group.argsort(stable=True)
-    images = tuple(
-        torch.stack([to_common_exposure(scene, int(i)).permute(2, 0, 1) for i in photographs[group == g]])
-        for g in range(len(sizes))
+    groups = [photographs[group == g].tolist() for g in range(len(sizes))]
+    images = tuple(torch.stack([to_common_exposure(scene, i).permute(2, 0, 1) for i in mine]) for mine in groups)
+    used = tuple(
+        torch.stack([scene.photographs.used(i)[None].float() for i in mine])
+        for mine in groups
+        if scene.photographs.masks
     )
-    return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images)
+    return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images), used
 
 
-def _crops(
-    scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"], side: int
-) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _crops(scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"], side: int) -> _Images:
     """A crop of every neighbour of each tile, around the projection of the tile's middle."""
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
@@ -183,8 +203,12 @@ def _crops(
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())
-    crops = [
-        to_common_exposure(scene, i, slice(v, v + height), slice(u, u + width)).permute(2, 0, 1)
+    places = [
+        (i, slice(v, v + height), slice(u, u + width))
         for i, (u, v) in zip(flat.tolist(), corner.long().tolist(), strict=True)
     ]
-    return torch.arange(len(flat)).reshape(neighbours.shape), (torch.stack(crops),), (corner,)
+    crops = torch.stack([to_common_exposure(scene, *place).permute(2, 0, 1) for place in places])
+    used: tuple[Tensor, ...] = ()
+    if scene.photographs.masks:
+        used = (torch.stack([scene.photographs.used(i)[None, rows, columns].float() for i, rows, columns in places]),)
+    return torch.arange(len(flat)).reshape(neighbours.shape), (crops,), (corner,), used

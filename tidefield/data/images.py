@@ -14,12 +14,14 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -27,11 +29,13 @@ from tidefield.data.cache import SUFFIX, cache_folder, make_room, refuse_shared
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens, rectify
+from tidefield.geometry.lenses import LensModel, rectify
 from tidefield.machine import cores
 
 Progress = Callable[[int, int], None]
 """Called with the number of photographs that are ready, and the number of all."""
+Masks = Sequence[Bool[Tensor, "_ _"] | None]
+"""One for each of some photographs, or none at all (`Photographs.masks_of`)."""
 
 # Part of every key: to be raised when the same photograph would give other pixels.
 _PIXELS_VERSION = 1
@@ -48,13 +52,17 @@ class Photographs:
     Attributes:
         colours: 8-bit sRGB pictures.
         alphas: their opacity, None for opaque photographs. Colours are already composited on the background.
+        masks: False for pixels that are not to be used, whose colours are those of the nearest used pixels; None for
+            photographs without a mask. Empty if no photograph has one.
     """
 
     colours: tuple[UInt8[Tensor, "_ _ 3"], ...]
     alphas: tuple[UInt8[Tensor, "_ _"] | None, ...] = ()
+    masks: tuple[Bool[Tensor, "_ _"] | None, ...] = ()
 
     def __post_init__(self) -> None:
         assert len(self.alphas) in (0, len(self.colours)), "one alpha (or None) per photograph"
+        assert len(self.masks) in (0, len(self.colours)), "one mask (or None) per photograph"
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -64,6 +72,15 @@ class Photographs:
 
     def alpha(self, index: int) -> UInt8[Tensor, "H W"] | None:
         return self.alphas[index] if self.alphas else None
+
+    def used(self, index: int) -> Bool[Tensor, "H W"]:
+        """Return which pixels of a photograph are to be used: all of them where it has no mask."""
+        mask = self.masks[index] if self.masks else None
+        return torch.ones(self.colours[index].shape[:2], dtype=torch.bool) if mask is None else mask
+
+    def masks_of(self, which: Sequence[int]) -> Masks:
+        """Return the masks of some photographs, one each; empty if no photograph of the scene has one."""
+        return tuple(self.masks[i] for i in which) if self.masks else ()
 
 
 @dataclass(frozen=True)
@@ -75,17 +92,19 @@ class PhotographFile:
         lens: the camera that took it, for exactly the file's pixels.
         width, height: of the result.
         has_alpha: whether the file has an opacity channel.
+        mask: a picture of the same size, which is black where the photograph is not to be used; None for none.
     """
 
     path: Path
-    lens: Lens
+    lens: LensModel
     width: int
     height: int
     has_alpha: bool
+    mask: Path | None = None
 
     @property
     def bytes(self) -> int:
-        return self.width * self.height * (4 if self.has_alpha else 3)
+        return self.width * self.height * (3 + self.has_alpha + (self.mask is not None))
 
 
 @quiet_pillow()
@@ -179,27 +198,33 @@ def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, fl
     for file in files:
         status = file.path.stat()
         about = {**asdict(file), "path": str(file.path.resolve())}
+        del about["mask"]
         parts.append([about, status.st_size, status.st_mtime_ns])
+        if file.mask is not None:
+            status = file.mask.stat()
+            parts.append([str(file.mask.resolve()), status.st_size, status.st_mtime_ns])
     text = json.dumps([_PIXELS_VERSION, background_rgb, parts], sort_keys=True)
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
 def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
     """Photographs as views of a store's bytes."""
-    colours, alphas, start = [], [], 0
+    colours, alphas, masks, start = [], [], [], 0
     for file in files:
         pixels = file.width * file.height
         planes = torch.from_numpy(store[start : start + file.bytes])
+        single = list(planes[3 * pixels :].view(-1, file.height, file.width))
         colours.append(planes[: 3 * pixels].view(file.height, file.width, 3))
-        alphas.append(planes[3 * pixels :].view(file.height, file.width) if file.has_alpha else None)
+        alphas.append(single.pop(0) if file.has_alpha else None)
+        masks.append(single.pop().view(torch.bool) if file.mask is not None else None)
         start += file.bytes
-    return Photographs(tuple(colours), tuple(alphas))
+    return Photographs(tuple(colours), tuple(alphas), tuple(masks) if any(m is not None for m in masks) else ())
 
 
 def _decoded(
     files: Sequence[PhotographFile], background_rgb: tuple[float, float, float], progress: Progress | None
 ) -> Iterator[UInt8[np.ndarray, " bytes"]]:
-    """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha if there is any."""
+    """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha and mask if there are any."""
     largest = max(file.lens.width * file.lens.height for file in files)
     # Decoding takes some 12 bytes per pixel; all workers together stay around a gigabyte.
     workers = max(1, min(cores(), 8, 1_000_000_000 // (12 * largest)))
@@ -220,11 +245,92 @@ def _decoded(
 
 def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
     pixels = decode(file.path)
+    mask = None if file.mask is None else read_mask(file.mask, (file.lens.width, file.lens.height), file.path)
     if not file.has_alpha:
-        return rectify(pixels, file.lens, file.width, file.height).reshape(-1)
+        pixels = pixels if mask is None else fill_masked(pixels, mask)
+        return _planes(rectify(pixels, file.lens, file.width, file.height), mask, file)
     # Composited before it is resampled: the colour of a transparent pixel is arbitrary.
     alpha = pixels[..., 3:].astype(np.float32) / 255
     flat = pixels[..., :3] * alpha + 255 * np.array(background_rgb, np.float32) * (1 - alpha)
     pixels = np.concatenate([np.round(flat).astype(np.uint8), pixels[..., 3:]], axis=-1)
-    pixels = rectify(pixels, file.lens, file.width, file.height)
-    return np.concatenate([pixels[..., :3].reshape(-1), pixels[..., 3].reshape(-1)])
+    if mask is not None:
+        pixels = fill_masked(pixels, mask)
+        pixels[~mask, 3] = 255  # the object may be there: it is not carved away
+    return _planes(rectify(pixels, file.lens, file.width, file.height), mask, file)
+
+
+def _planes(
+    pixels: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "_ _"] | None, file: PhotographFile
+) -> UInt8[np.ndarray, " bytes"]:
+    """The bytes of a store: interleaved colours, then alpha and mask, each by itself."""
+    planes = [pixels[..., :3], *pixels.transpose(2, 0, 1)[3:]]
+    if mask is not None:
+        planes.append(rectify_mask(mask, file.lens, file.width, file.height).astype(np.uint8))
+    return np.concatenate([plane.reshape(-1) for plane in planes])
+
+
+def rectify_mask(
+    mask: Bool[np.ndarray, "H W"], lens: LensModel, width: int, height: int
+) -> Bool[np.ndarray, "height width"]:
+    """Resample a mask as its photograph (`rectify`); True where a pixel is made of used ones alone."""
+    return rectify(255 * mask[..., None].astype(np.uint8), lens, width, height)[..., 0] == 255
+
+
+def read_mask(path: Path, size: tuple[int, int], photograph: Path) -> Bool[np.ndarray, "H W"]:
+    """Read a mask: False where it is black, that is where the photograph is not to be used.
+
+    Args:
+        size: width and height of the photograph.
+        photograph: for messages.
+
+    Raises:
+        SceneError: the mask cannot be read, or has another size than the photograph.
+    """
+    with _open_mask(path, size, photograph) as picture:
+        return np.asarray(picture.convert("L")) > 0
+
+
+def check_mask(path: Path, size: tuple[int, int], photograph: Path) -> None:
+    """Check, without decoding it, that a mask fits its photograph (see `read_mask`)."""
+    with _open_mask(path, size, photograph):
+        pass
+
+
+@contextmanager
+def _open_mask(path: Path, size: tuple[int, int], photograph: Path) -> Iterator[Image.Image]:
+    with open_picture(path) as picture:
+        if picture.size != size:
+            raise SceneError(
+                f"{path} has {picture.width} x {picture.height} pixels, but its photograph {photograph} has {size[0]} "
+                f"x {size[1]}: expected a mask of the same size, black where the photograph is not to be used; make it "
+                "again at that size"
+            )
+        yield picture
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
+    """Write a mask as a grey PNG of black and white, the one kind that nerfstudio reads, too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with completed_file(path, overwrite=True) as partial:
+        Image.fromarray(255 * mask.astype(np.uint8)).save(partial, format="PNG")
+
+
+def fill_masked(pixels: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W C"]:
+    """Give masked pixels the colour of the nearest used one, so that no window or filter sees what was masked."""
+    if mask.all() or not mask.any():
+        return pixels.copy()
+    # Labels number the used pixels from 1, row by row.
+    labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )[1]
+    label = np.asarray(labels, dtype=np.int64)
+    where = np.zeros(label.max() + 1, dtype=np.int64)
+    where[label[mask]] = np.flatnonzero(mask)
+    return pixels.reshape(-1, pixels.shape[2])[where[label]]
+
+
+def is_used(mask: Bool[Tensor, "H W"], uv_px: Float[Tensor, "*P 2"]) -> Bool[Tensor, "*P"]:
+    """Read a mask at pixels; those outside of the photograph read its border."""
+    u, v = uv_px.floor().long().unbind(-1)
+    height, width = mask.shape
+    return mask.to(uv_px.device)[v.clamp(0, height - 1), u.clamp(0, width - 1)]

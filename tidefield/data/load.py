@@ -14,7 +14,7 @@ from torch import Tensor
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
 from tidefield.data.hull import visual_hull
-from tidefield.data.images import PhotographFile, Progress, open_photographs, read_header
+from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, read_header
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.files import naming, reading
@@ -26,7 +26,7 @@ from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import Lens, LensModel
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,12 @@ def load_scene(
     require_width(width)
     posed = read_posed(root, allow_missing)
     files = []
-    for path, lens in zip(posed.paths, posed.lenses, strict=True):
+    masks = posed.masks or (None,) * len(posed.names)
+    for path, lens, mask in zip(posed.paths, posed.lenses, masks, strict=True):
         own, has_alpha = own_lens(path, lens)
         new_width = min(width or own.width, own.width)
         new_height = max(1, round(own.height * new_width / own.width))
-        files.append(PhotographFile(path, own, new_width, new_height, has_alpha))
+        files.append(PhotographFile(path, own, new_width, new_height, has_alpha, mask))
     train, test = every_eighth(len(posed.names))
     if posed.split is not None:
         train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
@@ -128,6 +129,13 @@ def load_scene(
     if points is not None and len(points.uv_px):
         points = triangulate_again(points, T_world_camera, posed.lenses, train)
     pinholes = tuple(_pinhole(file) for file in files)
+    photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
+    sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
+    if sparse is not None and photographs.masks:
+        sparse = _of_used_pixels(sparse, photographs)
+        points = sparse and Observations(
+            sparse.xyz_world.double().numpy(), sparse.point_index.numpy(), sparse.camera_index.numpy()
+        )
     near_far = posed.near_far
     if near_far is None or points is not None:
         near_far = estimate_near_far(T_world_camera, pinholes, points)
@@ -139,8 +147,6 @@ def load_scene(
         near_far=_float32(near_far),
         gain=torch.ones(len(pinholes), 3),
     )
-    sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
-    photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))
     return Scene(
@@ -193,10 +199,11 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
         T_world_camera=T_world_camera[order],
         near_far=None if posed.near_far is None else posed.near_far[order],
         points=points,
+        masks=tuple(posed.masks[i] for i in order) if posed.masks else (),
     )
 
 
-def own_lens(path: Path, lens: Lens) -> tuple[Lens, bool]:
+def own_lens(path: Path, lens: LensModel) -> tuple[LensModel, bool]:
     """Resize a lens to its photograph's own size; also return whether the photograph has alpha.
 
     Raises:
@@ -266,7 +273,7 @@ def _pinhole(file: PhotographFile) -> Lens:
 def _sparse_points(
     points: Observations,
     T_world_camera: Float64[np.ndarray, "V 3 4"],
-    lenses: tuple[Lens, ...],
+    lenses: tuple[LensModel, ...],
     pinholes: tuple[Lens, ...],
 ) -> SparsePoints | None:
     """Undistort the observations of sparse points; leave out those that then lie outside their photographs."""
@@ -292,6 +299,18 @@ def _sparse_points(
         camera_index=torch.from_numpy(points.photograph_index[good].astype(np.int64)),
         uv_px=_float32(uv_px[good]),
     )
+
+
+def _of_used_pixels(points: SparsePoints, photographs: Photographs) -> SparsePoints | None:
+    """Leave out observations in masked pixels, and points that then have none."""
+    kept = torch.ones(len(points.uv_px), dtype=torch.bool)
+    for index, mask in enumerate(photographs.masks):
+        if mask is not None:
+            mine = points.camera_index == index
+            kept[mine] = is_used(mask, points.uv_px[mine])
+    seen = torch.zeros(len(points.xyz_world), dtype=torch.bool)
+    seen[points.point_index[kept]] = True
+    return points.observed(kept).subset(seen) if kept.any() else None
 
 
 def _float32(values: np.ndarray | Sequence[tuple[float, float]]) -> Tensor:

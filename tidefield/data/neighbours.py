@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.depth_prior import unproject_to_surface
+from tidefield.data.images import Masks, is_used
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 
@@ -50,15 +51,22 @@ class Neighbours:
         return Neighbours(self.index[tiles], self.blend_weight[tiles])
 
 
-def rank_by_view(targets: Cameras, surface_world: Float[Tensor, "K S 3"], candidates: Cameras) -> Float[Tensor, "K V"]:
-    """Rank candidates by the share of a target's surface points in their frames, times exp(-angle / scale).
+def rank_by_view(
+    targets: Cameras, surface_world: Float[Tensor, "K S 3"], candidates: Cameras, masks: Masks = ()
+) -> Float[Tensor, "K V"]:
+    """Rank candidates by the share of a target's surface points in their frames and not masked, times
+    exp(-angle / scale).
 
     The angle is the mean one at the surface points between the target's and the candidate's rays. Unlike the viewing
     directions, it distinguishes nadir photographs.
     """
     corners, points = surface_world.shape[:2]
     uv, z = candidates.project(surface_world.reshape(-1, 3))
-    share = (from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)).reshape(-1, corners, points).mean(-1).T
+    weight = from_border(uv, candidates.size_px[:, None], BORDER) * (z > 0)
+    for k, mask in enumerate(masks):
+        if mask is not None:
+            weight[k] *= is_used(mask, uv[k])
+    share = weight.reshape(-1, corners, points).mean(-1).T
     ours = F.normalize(surface_world - targets.position_world[:, None], dim=-1)
     theirs = F.normalize(surface_world[:, None] - candidates.position_world[None, :, None], dim=-1)
     angle = angle_between(ours[:, None], theirs)
@@ -132,16 +140,16 @@ def choose_neighbours(
     surface = unproject_to_surface(camera, prior, uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
     by_direction = strategy == "direction"
     spare = EXTRA_VIEWS if count and not by_direction else 0
-    sources = torch.tensor(scene.sources(camera), dtype=torch.long)
+    sources, masks_of = torch.tensor(scene.sources(camera), dtype=torch.long), scene.photographs.masks_of
     if not by_direction and len(sources) > PRESELECT_ABOVE and len(surface) > PRESELECT_STEP:
         # The best at some corners are the best at those in between: the cost stays bounded in large scenes.
-        some = rank_by_view(camera, surface[::PRESELECT_STEP], scene.cameras[sources])
+        some = rank_by_view(camera, surface[::PRESELECT_STEP], scene.cameras[sources], masks_of(sources.tolist()))
         sources = sources[some.topk(min(2 * (count + spare), len(sources)), dim=1).indices.unique()]
     candidates = scene.cameras[sources]
     if by_direction:
         rank = rank_by_direction(camera, candidates).expand(len(surface), -1)
     else:
-        rank = rank_by_view(camera, surface, candidates)
+        rank = rank_by_view(camera, surface, candidates, masks_of(sources.tolist()))
     chosen, blend_weight = select_best(rank, count, spare)
     first = (torch.arange(rows)[:, None] * (columns + 1) + torch.arange(columns)).reshape(-1, 1)
     return _combine_corners(sources[chosen], blend_weight, first + torch.tensor([0, 1, columns + 1, columns + 2]))

@@ -32,6 +32,11 @@ class SparsePoints:
     camera_index: Int[Tensor, " O"]
     uv_px: Float[Tensor, "O 2"]
 
+    def observed(self, kept: Bool[Tensor, " O"]) -> SparsePoints:
+        """Select observations; all points stay."""
+        parts = {name: getattr(self, name)[kept] for name in ("point_index", "camera_index", "uv_px")}
+        return replace(self, **parts)
+
     def subset(self, kept: Bool[Tensor, " P"]) -> SparsePoints:
         """Select points together with their observations."""
         seen = kept[self.point_index.long()]
@@ -82,6 +87,7 @@ class Scene:
         parts = [f"{len(self.names)} photographs {describe_sizes(self.cameras)}"]
         parts += [f"{len(self.train)} train", f"{len(self.test)} test"]
         parts += [f"{len(self.points.xyz_world):,} points"] if self.points is not None else ["no points"]
+        parts += ["masks"] if self.photographs.masks else []
         return f"Scene({self.root.name!r}, {', '.join(parts)})"
 
     def index(self, name: str) -> int:

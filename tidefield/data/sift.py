@@ -5,20 +5,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 if TYPE_CHECKING:
     import pycolmap
 
 
 def find_features(
-    grey: UInt8[np.ndarray, "H W"], count: int, device: pycolmap.Device
+    grey: UInt8[np.ndarray, "H W"], count: int, device: pycolmap.Device, used: Bool[np.ndarray, "_ _"] | None = None
 ) -> tuple[Float32[np.ndarray, "K 4"], UInt8[np.ndarray, "K 128"]]:
     """Extract keypoints (u, v, scale, orientation; pixels) and RootSIFT descriptors, the largest first.
 
     Args:
         grey: the picture; it is not enlarged first, which finds little more in sharp photographs.
         count: the largest number of features, of which the largest are kept: they are the most repeatable.
+        used: where features may lie, a mask of the same aspect and any size; everywhere if not given.
     """
     import pycolmap
 
@@ -28,5 +29,11 @@ def find_features(
     sift.sift.first_octave = 0
     found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]
-    largest = np.argsort(-keypoints[:, 2], kind="stable")[:count]  # VLFeat returns somewhat more than the maximum
+    order = np.argsort(-keypoints[:, 2], kind="stable")
+    if used is not None:
+        height, width = used.shape
+        pixel = keypoints[order, :2] * (width / grey.shape[1], height / grey.shape[0])
+        column, row = np.floor(pixel).astype(np.int64).T
+        order = order[used[row.clip(0, height - 1), column.clip(0, width - 1)]]
+    largest = order[:count]  # VLFeat returns somewhat more than the maximum
     return keypoints[largest], np.asarray(descriptors.data, dtype=np.uint8)[largest]

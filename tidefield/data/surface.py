@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 from torch import Tensor
 from torch.nn import functional as F
 
+from tidefield.data.images import Masks, is_used
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
@@ -69,25 +70,32 @@ def surface_points(camera: Cameras, depth: Float[Tensor, "H W"]) -> Float[Tensor
     return camera.position_world[0] + directions * depth.reshape(-1, 1)
 
 
-def seen_count(camera: Cameras, depth: Float[Tensor, "H W"], cameras: Cameras) -> Int[Tensor, "H W"]:
-    """Count the `cameras` that have each pixel's surface point in front of them and inside their image."""
+def seen_count(camera: Cameras, depth: Float[Tensor, "H W"], cameras: Cameras, masks: Masks = ()) -> Int[Tensor, "H W"]:
+    """Count the `cameras` that have each pixel's surface point in front of them, inside their image, and not masked."""
     points_world = surface_points(camera, depth)
     count = torch.zeros(len(points_world), dtype=torch.long, device=depth.device)
     for i in range(len(cameras)):
         uv, z = cameras[i].project(points_world)
-        count += in_frame(cameras[i], uv, z)[0]
+        count += in_frame(cameras[i], uv, z, masks[i : i + 1])[0]
     return count.reshape(depth.shape)
 
 
 def doubly_seen(scene: Scene, camera: Cameras) -> Bool[Tensor, "H W"]:
     """Select the pixels of a camera whose surface at least two training photographs see."""
     depth = surface_depth(camera, scene.points, scene.cameras)
-    return seen_count(camera, depth, scene.cameras[list(scene.train)]) >= 2
+    masks = scene.photographs.masks_of(scene.train)
+    return seen_count(camera, depth, scene.cameras[list(scene.train)], masks) >= 2
 
 
-def in_frame(cameras: Cameras, uv_px: Float[Tensor, "V P 2"], z: Float[Tensor, "V P"]) -> Bool[Tensor, "V P"]:
-    """Decide which projected points lie in front of each camera and inside its image."""
-    return (z > 0) & (uv_px > 0).all(-1) & (uv_px < cameras.size_px[:, None]).all(-1)
+def in_frame(
+    cameras: Cameras, uv_px: Float[Tensor, "V P 2"], z: Float[Tensor, "V P"], masks: Masks = ()
+) -> Bool[Tensor, "V P"]:
+    """Decide which projected points lie in front of each camera and inside its image, where that is not masked."""
+    inside = (z > 0) & (uv_px > 0).all(-1) & (uv_px < cameras.size_px[:, None]).all(-1)
+    for k, mask in enumerate(masks):
+        if mask is not None:
+            inside[k] &= is_used(mask, uv_px[k])
+    return inside
 
 
 def _mean_depth(camera: Cameras) -> Float[Tensor, "H W"]:

@@ -23,13 +23,13 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from tidefield.data.cache import POINTS_SUFFIX, cache_folder, make_room, refuse_shared
-from tidefield.data.images import Progress
+from tidefield.data.images import Progress, read_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.sift import find_features
 from tidefield.errors import RunError
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import LensModel
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
 
@@ -78,18 +78,19 @@ class Features:
     descriptors: Float32[np.ndarray, "K 128"]
 
 
-def find_photograph_features(path: Path, lens: Lens) -> Features:
-    """Find the features of a photograph, but for those where it is transparent or its lens images nothing."""
+def find_photograph_features(path: Path, lens: LensModel, mask: Path | None = None) -> Features:
+    """Find the features of a photograph, but for those where it is masked, transparent, or its lens images nothing."""
     import pycolmap
 
     with quiet_pillow(), open_picture(path) as picture:
         rgba = np.asarray(picture.convert("RGBA"))
+    used = None if mask is None else read_mask(mask, (rgba.shape[1], rgba.shape[0]), path)
     scale = min(1.0, SIDE_PX / max(rgba.shape[:2]))
     if scale < 1:
         rgba = cv2.resize(rgba, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     height, width = rgba.shape[:2]
     grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = find_features(grey, FEATURES, pycolmap.Device.cpu)
+    keypoints, descriptors = find_features(grey, FEATURES, pycolmap.Device.cpu, used)
     uv = keypoints[:, :2].astype(np.float64)
     column, row = np.floor(uv).astype(int).T.clip(0, [[width - 1], [height - 1]])
     uv *= lens.width / width, lens.height / height
@@ -160,9 +161,10 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     import pycolmap
 
     paths, lenses = [posed.paths[i] for i in used], [posed.lenses[i] for i in used]
+    masks = [posed.masks[i] if posed.masks else None for i in used]
     features: list[Features] = []
     with worker_processes(max(1, min(cores(), len(used))), _quiet) as pool:
-        for found in pool.map(find_photograph_features, paths, lenses):
+        for found in pool.map(find_photograph_features, paths, lenses, masks):
             features.append(found)
             if progress:
                 progress(len(features), len(used))
@@ -243,7 +245,8 @@ def find_points(
 
 def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
     """What the points depend on, as a file's name."""
-    files = [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in posed.paths]
+    paths = [*posed.paths, *(mask for mask in posed.masks if mask is not None)]
+    files = [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
     parts = [_VERSION, files, [asdict(lens) for lens in posed.lenses], posed.T_world_camera.tolist(), list(used)]
     return hashlib.sha256(json.dumps(parts).encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
@@ -269,7 +272,7 @@ def _keep(points: Observations | None, store: Path) -> None:
 
 
 def triangulate_again(
-    points: Observations, T_world_camera: Float64[np.ndarray, "V 3 4"], lenses: Sequence[Lens], used: Sequence[int]
+    points: Observations, T_world_camera: Float64[np.ndarray, "V 3 4"], lenses: Sequence[LensModel], used: Sequence[int]
 ) -> Observations:
     """Place points by the observations of some photographs alone, so that nothing of the others is left in them.
 
@@ -353,7 +356,7 @@ def _inverse(pose: Float64[np.ndarray, "3 4"]) -> Float64[np.ndarray, "3 4"]:
 
 
 def _model(
-    lenses: Sequence[Lens], T_camera_world: Sequence[Float64[np.ndarray, "3 4"]], features: Sequence[Features]
+    lenses: Sequence[LensModel], T_camera_world: Sequence[Float64[np.ndarray, "3 4"]], features: Sequence[Features]
 ) -> pycolmap.Reconstruction:
     """A COLMAP model of pinhole cameras, image k + 1 with camera k + 1, whose keypoints are undistorted."""
     import pycolmap

@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -43,13 +43,15 @@ class QualityCurve:
     """Of the first held-out photograph and of the middle one, at a smaller size."""
     truths: tuple[UInt8[Tensor, "H W 3"], ...]
     """The photographs, as means over the pixels' areas."""
+    used: tuple[Bool[Tensor, "H W"], ...]
+    """Their pixels that hold no masked one."""
     points: list[tuple[float, float]] = field(default_factory=list)
     """(seconds of training, mean PSNR in dB)."""
 
     def add(self, seconds: float, renderings: Sequence[Rendering]) -> None:
         """Add the point of one round of renderings."""
-        views = zip(renderings, self.truths, strict=True)
-        self.points.append((seconds, fmean(psnr(to_8_bit(view.colour), truth) for view, truth in views)))
+        views = zip(renderings, self.truths, self.used, strict=True)
+        self.points.append((seconds, fmean(psnr(to_8_bit(view.colour), *truth) for view, *truth in views)))
 
     def watch(self, folder: Path, used: float) -> Callable[[TrainerLike, float], None]:
         """Return a callback of (trainer, share of the budget) that adds and writes a point at each of `SHARES`.
@@ -73,7 +75,7 @@ class QualityCurve:
 
 def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
     """Make the curve of a scene that holds photographs out, with views `smaller` times as small as these."""
-    cameras, truths = [], []
+    cameras, truths, used = [], [], []
     for index in sorted({scene.test[0], scene.test[len(scene.test) // 2]}):
         camera = scene.cameras[index]
         small = camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
@@ -81,4 +83,6 @@ def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
         mean = F.interpolate(photograph, size=(small.height, small.width), mode="area")
         cameras.append(small)
         truths.append(mean[0].permute(1, 2, 0).round().to(torch.uint8))
-    return QualityCurve(tuple(cameras), tuple(truths))
+        share = scene.photographs.used(index)[None, None].float()
+        used.append(F.interpolate(share, size=(small.height, small.width), mode="area")[0, 0] == 1)
+    return QualityCurve(tuple(cameras), tuple(truths), tuple(used))

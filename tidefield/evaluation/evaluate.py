@@ -91,12 +91,13 @@ def evaluate(
                 memory, networks = _peak_memory(), load_lpips()
                 delete_files(out, [path])  # an older one is not of the pictures that follow
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
-            seen = doubly_seen(scene, scene.cameras[index])
-            scores = score(image, truth, seen, networks)
+            used = scene.photographs.used(index)
+            seen = doubly_seen(scene, scene.cameras[index]) & used
+            scores = score(image, truth, seen, networks, used)
             photographs[scene.names[index]] = {
                 **{name: scores.values[name] for name in NAMES},
                 "reasons": scores.reasons,
-                "seen_share": float(seen.float().mean()),
+                "seen_share": float(seen[used].float().mean()) if used.any() else 0.0,
                 "seconds": seconds,
             }
             _write_pictures(out, file, image, truth, rendering)
@@ -125,8 +126,9 @@ def delete_evaluation(out: Path, names: Sequence[str]) -> None:
     """Delete an evaluation, its pictures, and those that one of these photographs, ended before its end, has left."""
     report = read_json(out / EVALUATION_FILE)
     listed = report.get("per_photograph") if isinstance(report, dict) else None
-    pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in (*names, *(listed or ()))}
-    pictures |= {f"{name}.png" for name in (*names, *(listed or ()))}
+    names = [*names, *(listed if isinstance(listed, dict) else ())]
+    pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in names}
+    pictures |= {f"{name}.png" for name in names}
     found = [(file, file.relative_to(out / folder)) for folder in FOLDERS for file in (out / folder).rglob("*.png")]
     delete_files(out, [out / EVALUATION_FILE, *(file for file, name in found if name.as_posix() in pictures)])
 

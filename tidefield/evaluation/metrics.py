@@ -57,9 +57,23 @@ class Scores:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def score(rendering: Image8, truth: Image8, seen: Bool[Tensor, "H W"], networks: Mapping[str, Lpips | str]) -> Scores:
-    """Measure all metrics with all suffixes; `seen` are the doubly seen pixels, `networks` is from `load_lpips`."""
-    everywhere, scores = torch.ones_like(seen), Scores()
+def score(
+    rendering: Image8,
+    truth: Image8,
+    seen: Bool[Tensor, "H W"],
+    networks: Mapping[str, Lpips | str],
+    used: Bool[Tensor, "H W"] | None = None,
+) -> Scores:
+    """Measure all metrics with all suffixes.
+
+    Args:
+        rendering, truth: to compare.
+        seen: the doubly seen pixels.
+        networks: from `load_lpips`.
+        used: the pixels that are not masked, and alone count; all if None.
+    """
+    everywhere, scores = torch.ones_like(seen) if used is None else used, Scores()
+    seen = seen & everywhere
     _score_image(scores, rendering, truth, {"": everywhere, "_seen": seen}, networks)
     for suffix, mask in {"_cc": everywhere, "_seen_cc": seen}.items():
         _score_image(scores, fit_colours(rendering, truth, mask), truth, {suffix: mask}, networks)
@@ -80,8 +94,11 @@ def _score_image(
 
     for suffix in [suffix for suffix, mask in masks.items() if not mask.any()]:
         del masks[suffix]
+        reason = "two training photographs see none of this photograph's pixels"
+        if not suffix.startswith("_seen"):
+            reason = "the mask leaves none of this photograph's pixels"
         for metric in METRICS:
-            add_missing(metric, suffix, "two training photographs see none of this photograph's pixels")
+            add_missing(metric, suffix, reason)
     if not masks:
         return
     for suffix, mask in masks.items():

@@ -1,4 +1,4 @@
-"""Pinhole cameras with Brown's lens distortion, and its removal from photographs.
+"""Pinhole cameras with Brown's lens distortion and fisheye cameras, and their removal from photographs.
 
 Pixel coordinates have pixel centres at +0.5, as COLMAP's have, so a photograph of width W spans u in [0, W]. OpenCV's
 have them at 0: half a pixel is taken off the principal point wherever OpenCV is called, and nowhere else.
@@ -9,13 +9,20 @@ With x, y on the plane z = 1 of the camera and r^2 = x^2 + y^2 (Brown 1971, as i
     x_d = x radial + 2 p1 x y + p2 (r^2 + 2 x^2)
     y_d = y radial + 2 p2 x y + p1 (r^2 + 2 y^2)
     u = fx x_d + cx,   v = fy y_d + cy
+
+and of a fisheye lens (Kannala and Brandt 2006, as OpenCV's fisheye module has it), with theta = atan r
+
+    theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+    x_d = x theta_d / r,   y_d = y theta_d / r
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -30,6 +37,8 @@ _FARTHEST_PRINCIPAL = 10.0
 """From the middle of the photograph, in its longer sides: those that are cut out of larger ones have theirs outside."""
 _LARGEST_TERM = 1e12
 """Of the distortion, whose squares appear in its Jacobian; terms of real lenses are at most some hundreds."""
+WIDEST_DEG = 120.0
+"""Of a fisheye's pinhole: farther out, its pixels are stretched more than fourfold along the radius."""
 _LEAST_SHARE = 0.01
 """Of the field of view that a lens would have without distortion: a pinhole's is larger."""
 
@@ -39,9 +48,13 @@ COLMAP_PARAMETERS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""COLMAP's camera models that are pinhole cameras with Brown's distortion, and their parameters in order."""
+"""COLMAP's camera models that are a `Lens` or a `FisheyeLens`, and their parameters in order."""
+FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 COLMAP_MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
@@ -50,11 +63,13 @@ COLMAP_MODELS = (
 """All of COLMAP's camera models, each at the index that stands for it in cameras.bin (src/colmap/sensor/models.h)."""
 
 Points = Float[np.ndarray, "P 2"]
+L = TypeVar("L", bound="LensModel")
+_Jacobian = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Interior orientation of a camera for photographs of width x height pixels (see the module's equations)."""
+class LensModel(ABC):
+    """Interior orientation of a camera for photographs of width x height pixels: any of the module's equations."""
 
     width: int
     height: int
@@ -62,11 +77,6 @@ class Lens:
     fy: float
     cx: float
     cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
 
     def __post_init__(self) -> None:
         longer = max(self.width, self.height)
@@ -83,27 +93,34 @@ class Lens:
             )
 
     @property
-    def distortion(self) -> tuple[float, float, float, float, float]:
-        """(k1, k2, p1, p2, k3): OpenCV's order."""
-        return (self.k1, self.k2, self.p1, self.p2, self.k3)
+    @abstractmethod
+    def distortion(self) -> tuple[float, ...]:
+        """The terms of the distortion, in OpenCV's order."""
 
     @property
+    @abstractmethod
     def colmap_model(self) -> str:
         """The simplest of COLMAP's models that has all of the lens's terms."""
-        return "FULL_OPENCV" if self.k3 else "OPENCV" if self.is_distorted else "PINHOLE"
 
     @property
-    def is_distorted(self) -> bool:
-        return any(self.distortion)
+    @abstractmethod
+    def is_distorted(self) -> bool: ...
 
+    @abstractmethod
     def distort(self, xy: Points) -> Points:
         """Apply the distortion to points of the plane z = 1."""
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        x_d = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        y_d = y * radial + 2 * self.p2 * x * y + self.p1 * (r2 + 2 * y * y)
-        return np.stack([x_d, y_d], axis=-1)
+
+    @abstractmethod
+    def _jacobian(self, xy: Points) -> _Jacobian:
+        """The (symmetric) derivative of `distort`."""
+
+    @abstractmethod
+    def _reach(self) -> tuple[float, float]:
+        """The largest x and y on the plane z = 1 that a pinhole may have."""
+
+    @abstractmethod
+    def _tables(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each pixel of `pinhole()` lies in the photograph, as OpenCV's remap takes it."""
 
     def undistort(self, xy_distorted: Points) -> Points:
         """Invert `distort` by Newton's method; NaN where the lens images no point.
@@ -134,7 +151,7 @@ class Lens:
         """Back-project pixels to the plane z = 1; NaN where the lens images no point."""
         return self.undistort((uv_px - (self.cx, self.cy)) / (self.fx, self.fy))
 
-    def resized(self, width: int, height: int) -> Lens:
+    def resized(self: L, width: int, height: int) -> L:
         """Scale the lens to photographs of another size."""
         sx, sy = width / self.width, height / self.height
         return replace(
@@ -145,11 +162,12 @@ class Lens:
     def pinhole(self) -> Lens:
         """Compute the distortion-free camera of the same size with the largest field of view inside the photograph.
 
+        Of a fisheye it is at most `WIDEST_DEG` along the longer side; what lies beyond is left out.
         Its image has no blank pixels: its image plane is the inner rectangle of the undistorted photograph, so fx and
         fy may differ slightly where those of the lens do not. A lens without distortion is returned unchanged.
         (cv2.getOptimalNewCameraMatrix with alpha=0 samples the border more coarsely and ignores folds.)
         """
-        if not self.is_distorted:
+        if isinstance(self, Lens) and not self.is_distorted:
             return self
         x0, x1, y0, y1 = self._inner_rectangle()
         fx, fy = self.width / (x1 - x0), self.height / (y1 - y0)
@@ -160,16 +178,6 @@ class Lens:
         uv = self.unproject(uv_px) * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
         inside = (uv >= 0) & (uv < (pinhole.width, pinhole.height))
         return np.where(inside.all(axis=1, keepdims=True), uv, np.nan)
-
-    def _jacobian(self, xy: Points) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))
-        mixed = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
-        dx = radial + x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
-        dy = radial + y * y * slope + 2 * self.p2 * x + 6 * self.p1 * y
-        return (dx, mixed), (mixed, dy)
 
     def _is_unfolded(self, xy: Points) -> np.ndarray:
         """Test that no fold lies between the axis and each point; beyond a fold, two points share a pixel."""
@@ -183,10 +191,9 @@ class Lens:
         """Find left, right, top and bottom on the plane z = 1 of a rectangle that lies inside the photograph."""
         left, right, top, bottom = map(self.unproject, _sides(0.0, float(self.width), 0.0, float(self.height)))
         # A side that the model never reaches (it folds over before) starts far out and is shrunk below.
-        x0 = np.nanmax(left[:, 0], initial=-4.0 * self.width / self.fx)
-        x1 = np.nanmin(right[:, 0], initial=4.0 * self.width / self.fx)
-        y0 = np.nanmax(top[:, 1], initial=-4.0 * self.height / self.fy)
-        y1 = np.nanmin(bottom[:, 1], initial=4.0 * self.height / self.fy)
+        widest, highest = self._reach()
+        x0, x1 = np.nanmax(left[:, 0], initial=-widest), np.nanmin(right[:, 0], initial=widest)
+        y0, y1 = np.nanmax(top[:, 1], initial=-highest), np.nanmin(bottom[:, 1], initial=highest)
         if not (x0 < 0 < x1 and y0 < 0 < y1):
             raise SceneError(f"the principal point of {self} lies outside its photographs; calibrate them again")
         rectangle = np.array([x0, x1, y0, y1])
@@ -212,6 +219,121 @@ class Lens:
         return bool(inside and self._is_unfolded(border).all())
 
 
+@dataclass(frozen=True)
+class Lens(LensModel):
+    """A lens with Brown's distortion, or without distortion."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float]:
+        """(k1, k2, p1, p2, k3): OpenCV's order."""
+        return (self.k1, self.k2, self.p1, self.p2, self.k3)
+
+    @property
+    def colmap_model(self) -> str:
+        """The simplest of COLMAP's models that has all of the lens's terms."""
+        return "FULL_OPENCV" if self.k3 else "OPENCV" if self.is_distorted else "PINHOLE"
+
+    @property
+    def is_distorted(self) -> bool:
+        return any(self.distortion)
+
+    def distort(self, xy: Points) -> Points:
+        """Apply the distortion to points of the plane z = 1."""
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        x_d = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        y_d = y * radial + 2 * self.p2 * x * y + self.p1 * (r2 + 2 * y * y)
+        return np.stack([x_d, y_d], axis=-1)
+
+    def _jacobian(self, xy: Points) -> _Jacobian:
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3))
+        mixed = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
+        dx = radial + x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
+        dy = radial + y * y * slope + 2 * self.p2 * x + 6 * self.p1 * y
+        return (dx, mixed), (mixed, dy)
+
+    def _reach(self) -> tuple[float, float]:
+        return 4.0 * self.width / self.fx, 4.0 * self.height / self.fy
+
+    def _tables(self) -> tuple[np.ndarray, np.ndarray]:
+        return cv2.initUndistortRectifyMap(
+            _opencv_matrix(self),
+            np.array(self.distortion),
+            None,  # pyright: ignore[reportCallIssue, reportArgumentType] - None is OpenCV's "no rotation"
+            _opencv_matrix(self.pinhole()),
+            (self.width, self.height),
+            cv2.CV_32FC1,
+        )
+
+
+@dataclass(frozen=True)
+class FisheyeLens(LensModel):
+    """A fisheye lens, whose images of equal angles are about equally long: COLMAP's and OpenCV's OPENCV_FISHEYE."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float]:
+        return (self.k1, self.k2, self.k3, self.k4)
+
+    @property
+    def colmap_model(self) -> str:
+        return "OPENCV_FISHEYE"
+
+    @property
+    def is_distorted(self) -> bool:
+        return True
+
+    def distort(self, xy: Points) -> Points:
+        return xy * self._scale(xy)[0][:, None]
+
+    def _scale(self, xy: Points) -> tuple[np.ndarray, np.ndarray]:
+        """theta_d / r, and its derivative with respect to r, over r."""
+        r = np.hypot(*xy.T)
+        # Near the axis theta_d = r to the last digit, and the derivative is multiplied by r^2.
+        near = r < 1e-6
+        r = np.where(near, 1.0, r)
+        theta = np.arctan(r)
+        square = theta * theta
+        angle = theta * (1 + square * (self.k1 + square * (self.k2 + square * (self.k3 + square * self.k4))))
+        slope = 1 + square * (3 * self.k1 + square * (5 * self.k2 + square * (7 * self.k3 + square * 9 * self.k4)))
+        scale = angle / r
+        change = (slope / (1 + r * r) - scale) / (r * r)
+        return np.where(near, 1.0, scale), np.where(near, 0.0, change)
+
+    def _jacobian(self, xy: Points) -> _Jacobian:
+        (x, y), (scale, change) = xy.T, self._scale(xy)
+        mixed = x * y * change
+        return (scale + x * x * change, mixed), (mixed, scale + y * y * change)
+
+    def _reach(self) -> tuple[float, float]:
+        longer = np.tan(np.radians(WIDEST_DEG / 2)) / max(self.width, self.height)
+        return longer * self.width, longer * self.height
+
+    def _tables(self) -> tuple[np.ndarray, np.ndarray]:
+        return cv2.fisheye.initUndistortRectifyMap(
+            _opencv_matrix(self),
+            np.array(self.distortion),
+            np.eye(3),
+            _opencv_matrix(self.pinhole()),
+            (self.width, self.height),
+            cv2.CV_32FC1,
+        )
+
+
 def _sides(x0: float, x1: float, y0: float, y1: float) -> list[Points]:
     """Sample the left, right, top and bottom side of a rectangle."""
     x, y = np.linspace(x0, x1, 201), np.linspace(y0, y1, 201)
@@ -220,11 +342,11 @@ def _sides(x0: float, x1: float, y0: float, y1: float) -> list[Points]:
 
 def lens_from_colmap(
     model: str, width: int, height: int, parameters: Sequence[float] | Float[np.ndarray, " K"]
-) -> Lens:
+) -> Lens | FisheyeLens:
     """Convert the parameters of a COLMAP camera.
 
     Raises:
-        SceneError: for fisheye and other models, for FULL_OPENCV's k4, k5, k6, and for a wrong number of parameters.
+        SceneError: for other models, for FULL_OPENCV's k4, k5, k6, and for a wrong number of parameters.
     """
     if model not in COLMAP_PARAMETERS:
         raise SceneError(
@@ -237,6 +359,8 @@ def lens_from_colmap(
     values = dict(zip(names, map(float, parameters), strict=True))
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
+    if model in FISHEYES:
+        return FisheyeLens(width, height, **values)
     if any([values.pop(name, 0.0) for name in ("k4", "k5", "k6")]):
         raise SceneError(
             "a FULL_OPENCV camera has k4, k5 or k6 other than 0: supported are k1, k2, k3, p1, p2; run COLMAP's "
@@ -245,14 +369,14 @@ def lens_from_colmap(
     return Lens(width, height, **values)
 
 
-def colmap_parameters(lens: Lens, model: str) -> list[float]:
+def colmap_parameters(lens: LensModel, model: str) -> list[float]:
     """List a lens's parameters in the order of a COLMAP model; terms that this model lacks are dropped."""
     values = {**asdict(lens), "f": (lens.fx + lens.fy) / 2}
     return [values.get(name, 0.0) for name in COLMAP_PARAMETERS[model]]
 
 
 def rectify(
-    photograph: UInt8[np.ndarray, "H W C"], lens: Lens, width: int, height: int
+    photograph: UInt8[np.ndarray, "H W C"], lens: LensModel, width: int, height: int
 ) -> UInt8[np.ndarray, "height width C"]:
     """Resample a photograph to its `lens.pinhole()`, reduced to width x height pixels.
 
@@ -271,16 +395,9 @@ def rectify(
 
 
 @lru_cache(maxsize=2)  # one survey has one or two cameras; the tables of a 50-megapixel one take 400 MB
-def _remap_tables(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    return cv2.initUndistortRectifyMap(
-        _opencv_matrix(lens),
-        np.array(lens.distortion),
-        None,  # pyright: ignore[reportCallIssue, reportArgumentType] - None is OpenCV's "no rotation"
-        _opencv_matrix(lens.pinhole()),
-        (lens.width, lens.height),
-        cv2.CV_32FC1,
-    )
+def _remap_tables(lens: LensModel) -> tuple[np.ndarray, np.ndarray]:
+    return lens._tables()
 
 
-def _opencv_matrix(lens: Lens) -> np.ndarray:
+def _opencv_matrix(lens: LensModel) -> np.ndarray:
     return np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])

@@ -49,10 +49,13 @@ class FeatureCache:
         patch = torch.zeros(1, 3, 32, 32, device=device)
         with torch.no_grad():
             like = network.encode(patch)
+        if scene.photographs.masks:
+            like = like.masked(patch[:, :1], torch.zeros(1, 2, device=device))
         texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
         self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views + EXTRA_VIEWS)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
-        self._encoded = Encoded(features, self._empty(like.photographs), like.with_colours)
+        used = None if like.used is None else self._empty(like.used)
+        self._encoded = Encoded(features, self._empty(like.photographs), like.with_colours, used)
         self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
 
     def views(self, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
@@ -100,7 +103,11 @@ class FeatureCache:
         colours = to_common_exposure(self.scene, photograph, slice(top, bottom), slice(left, right)).permute(2, 0, 1)[
             None
         ]
-        encoded = self.network.encode(colours.to(self.device), corner[None].to(colours).to(self.device))
+        corner_px = corner[None].to(colours).to(self.device)
+        encoded = self.network.encode(colours.to(self.device), corner_px)
+        if self.scene.photographs.masks:
+            used = self.scene.photographs.used(photograph)[None, None, top:bottom, left:right]
+            encoded = encoded.masked(used.to(colours).to(self.device), corner_px)
         for maps, block in zip(_maps(self._encoded), _maps(encoded), strict=True):
             first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(block.rows)] = block.rows.to(maps.rows.dtype)
@@ -122,7 +129,7 @@ class FeatureCache:
 
 
 def _maps(encoded: Encoded) -> list[FeatureMaps]:
-    return [*encoded.features.values(), encoded.photographs]
+    return [*encoded.features.values(), encoded.photographs, *([] if encoded.used is None else [encoded.used])]
 
 
 def _block_counts(size_px: Int[Tensor, "*B 2"]) -> Int[Tensor, "*B 2"]:

@@ -8,7 +8,7 @@ Alphabet: T tiles, N views, K maps, Q texels of all maps together, P samples of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ class Gathered:
         features: F_i.
         directions: d_i, unit, from each view's camera to the sample.
         cosine: d.d_i with the target's direction.
-        valid: whether the sample is in front of the camera and inside the encoded part of the photograph.
+        valid: whether the sample is in front of the camera, inside the encoded part of the photograph, and not masked.
         blend_weight: above 0, to 1; lets views fade in and out (`data.neighbours`).
     """
 
@@ -54,17 +54,29 @@ class Encoded:
         features: maps by stride.
         photographs: the colours, at stride 1 or 1/2.
         with_colours: strides whose maps begin with three channels of mean colours, at the common exposure.
+        used: 1 for pixels that are not masked, at stride 1; None without masks.
     """
 
     features: dict[int, FeatureMaps]
     photographs: FeatureMaps
     with_colours: frozenset[int] = frozenset()
+    used: FeatureMaps | None = None
 
     @staticmethod
     def concatenate(parts: list[Encoded]) -> Encoded:
         """Join groups of photographs of one size each into one set."""
         features = {stride: concatenate([part.features[stride] for part in parts]) for stride in parts[0].features}
-        return Encoded(features, concatenate([part.photographs for part in parts]), parts[0].with_colours)
+        used = [part.used for part in parts if part.used is not None]
+        return Encoded(
+            features,
+            concatenate([part.photographs for part in parts]),
+            parts[0].with_colours,
+            concatenate(used) if used else None,
+        )
+
+    def masked(self, used: Float[Tensor, "K 1 H W"], corner_px: Float[Tensor, "K 2"]) -> Encoded:
+        """Add which pixels of the photographs, or of the crops with these upper left corners, are not masked."""
+        return replace(self, used=maps_from_images(used, corner_px, 1))
 
 
 @dataclass(frozen=True)
@@ -121,6 +133,10 @@ class Views:
             colours = values[..., :3]
         else:
             colours, on_map = gather(self.encoded.photographs, self.which, uv)
+        if self.encoded.used is not None:
+            # A masked pixel is read as little as one outside of the photograph.
+            used, _ = gather(self.encoded.used, self.which, uv)
+            on_map = on_map & (used[..., 0] > 0.5)
         offset = points_world[:, None] - self.cameras.position_world.reshape(tiles, count, 1, 3)
         # The floor keeps the direction of a point in the camera's centre finite.
         view_directions = offset * offset.square().sum(-1, keepdim=True).clamp(min=1e-18).rsqrt()

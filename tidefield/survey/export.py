@@ -14,16 +14,16 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
-from tidefield.data.images import decode
+from tidefield.data.images import decode, read_mask, write_mask
 from tidefield.data.readers.files import quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import lens_from_colmap
+from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.machine import cores
 from tidefield.survey.colour import ExposureCorrection, to_common_exposure
-from tidefield.survey.io.image_decoding import upright
+from tidefield.survey.io.image_decoding import HEIFS, open_image, upright
 from tidefield.survey.survey import Photograph, Progress
 
 GRID_PX = 8
@@ -58,7 +58,8 @@ def write_images(
     def write(index: int) -> None:
         photograph = photographs[index]
         target = folder / photograph.name
-        if correction is None and photograph.orientation == 1:
+        is_heif = photograph.path.suffix.casefold() in HEIFS  # written as JPEG, which others read
+        if correction is None and photograph.orientation == 1 and not is_heif:
             with completed_file(target, overwrite=True) as partial:
                 shutil.copyfile(photograph.path, partial)
             return
@@ -75,8 +76,8 @@ def write_images(
 
 def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
     """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright."""
-    with Image.open(original) as picture:
-        exif, kind = picture.getexif(), picture.format
+    with open_image(original) as picture:
+        exif, kind = picture.getexif(), "JPEG" if original.suffix.casefold() in HEIFS else picture.format
     exif[ExifTags.Base.Orientation] = 1
     quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind in ("JPEG", "MPO") else {}
     with completed_file(target, overwrite=True) as partial:
@@ -124,20 +125,43 @@ def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[in
             progress(done, len(names))
 
 
+def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
+    """Write the masks of photographs into a folder as NAME.png, a white one for photographs without.
+
+    nerfstudio reads masks of all photographs or of none.
+    """
+    for photograph in photographs:
+        size = photograph.width, photograph.height
+        used = np.ones(size[::-1], dtype=bool)
+        if photograph.mask is not None:
+            used = read_mask(photograph.mask, size, photograph.path)
+        write_mask(folder / f"{photograph.name}.png", used)
+
+
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
     """Compute the tangent of the angle between each pixel's ray and the optical axis."""
     # From the centre of the first pixel to that of the last, so that nothing is extrapolated.
     columns, rows = (max(2, 1 + -(-size // GRID_PX)) for size in (camera.width, camera.height))
     u, v = np.linspace(0.5, camera.width - 0.5, columns), np.linspace(0.5, camera.height - 0.5, rows)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    grid = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1).reshape(rows, columns).astype(np.float32)
+    tangent = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1)
+    lens = lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params)
+    if isinstance(lens, FisheyeLens):  # farther out, the falloff is unknown, and beyond 90 degrees there is no tangent
+        corners = lens.pinhole().unproject(np.array([(0.0, 0.0), (lens.width, lens.height)]))
+        tangent = np.fmin(np.linalg.norm(lens.unproject(uv), axis=1), np.linalg.norm(corners, axis=1).max())
+    grid = tangent.reshape(rows, columns).astype(np.float32)
     column = np.linspace(0, columns - 1, camera.width, dtype=np.float32)
     row = np.linspace(0, rows - 1, camera.height, dtype=np.float32)
     return cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR)
 
 
 def write_transforms(
-    folder: Path, model: pycolmap.Reconstruction, *, z_is_up: bool = False, overwrite: bool = False
+    folder: Path,
+    model: pycolmap.Reconstruction,
+    *,
+    masks: bool = False,
+    z_is_up: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write `transforms.json` and `sparse_pc.ply` of a model whose photographs are in `folder/images`.
 
@@ -146,6 +170,7 @@ def write_transforms(
 
     Args:
         model: cameras with Brown's distortion; photographs without a pose are left out.
+        masks: whether `folder/masks` has a mask of every photograph.
         z_is_up: whether the world's z axis points up: nerfstudio then does not rotate the world.
 
     Raises:
@@ -171,6 +196,7 @@ def write_transforms(
         every_eighth(len(images)),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3) - origin,
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        masks=[f"masks/{image.name}.png" for image in images if masks],
         header={
             **({"orientation_override": "none"} if z_is_up else {}),
             "applied_transform": np.column_stack([np.eye(3), 0.0 - origin]).tolist(),

@@ -18,7 +18,7 @@ import pycolmap
 from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
-from tidefield.data.images import Progress, decode
+from tidefield.data.images import Progress, decode, read_mask, rectify_mask, write_mask
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.files import naming, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
@@ -26,7 +26,7 @@ from tidefield.data.triangulate import find_points
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 from tidefield.geometry.geodesy import WGS84, LocalFrame
-from tidefield.geometry.lenses import colmap_parameters, rectify
+from tidefield.geometry.lenses import LensModel, colmap_parameters, rectify
 from tidefield.geometry.similarity import Similarity
 from tidefield.machine import cores
 from tidefield.survey.export import reduced_folders, write_image, write_reduced_images, write_transforms
@@ -118,10 +118,12 @@ def import_project(
                 show(done, count)
         if downscale:
             write_reduced_images(folder, posed.names, downscale, partial(show, before=count))
+        if posed.masks:
+            _write_masks(posed, original.lenses, folder / "masks")
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
-        write_transforms(folder, model, z_is_up=located is not None)
+        write_transforms(folder, model, masks=bool(posed.masks), z_is_up=located is not None)
         if located is not None:
             located.write(folder)
     return model, located
@@ -189,14 +191,14 @@ def _at_file_size(posed: PosedPhotographs) -> PosedPhotographs:
 
 
 def _undistorted(posed: PosedPhotographs, every: bool) -> PosedPhotographs:
-    """Replace lenses with k3, or every lens, by their pinhole cameras, and move the observations.
+    """Replace Brown lenses with k3, or every lens, by their pinhole cameras, and move the observations.
 
     Observations that lie outside the undistorted photographs are left out.
     """
     lenses = []
     for path, lens in zip(posed.paths, posed.lenses, strict=True):
         with naming(path):
-            lenses.append(lens.pinhole() if every or lens.k3 else lens)
+            lenses.append(lens.pinhole() if every or lens.colmap_model == "FULL_OPENCV" else lens)
     changed = sum(lens != own for lens, own in zip(lenses, posed.lenses, strict=True))
     if changed:
         _log.info(f"{changed} of {len(lenses)} photographs are undistorted and encoded again")
@@ -210,6 +212,20 @@ def _undistorted(posed: PosedPhotographs, every: bool) -> PosedPhotographs:
         parts = {name: getattr(points, name)[good] for name in ("point_index", "photograph_index")}
         points = replace(points, uv_px=uv_px[good], **parts)
     return replace(posed, lenses=tuple(lenses), points=points)
+
+
+def _write_masks(posed: PosedPhotographs, lenses: Sequence[LensModel], folder: Path) -> None:
+    """Write the mask of every photograph, a white one for those without; undistorted as the photographs are.
+
+    Args:
+        lenses: of the photographs' files.
+    """
+    for name, path, lens, own, mask in zip(posed.names, posed.paths, posed.lenses, lenses, posed.masks, strict=True):
+        size = own.width, own.height
+        used = np.ones(size[::-1], dtype=bool) if mask is None else read_mask(mask, size, path)
+        if lens != own:
+            used = rectify_mask(used, own, own.width, own.height)
+        write_mask(folder / f"{name}.png", used)
 
 
 def _link(path: Path, target: Path) -> None:

@@ -19,12 +19,12 @@ from tidefield.errors import RunError, SurveyError
 from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
-from tidefield.survey.export import reduced_folders, write_images, write_reduced_images, write_transforms
+from tidefield.survey.export import reduced_folders, write_images, write_masks, write_reduced_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
 from tidefield.survey.quality.measures import Measures
-from tidefield.survey.sfm.features import FeatureOptions, decode_name, extract, is_database
+from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
@@ -71,6 +71,7 @@ def prepare(
     device: pycolmap.Device,
     console: Console,
     *,
+    lens: LensKind = "pinhole",
     keep_all: bool = False,
     colour: Literal["auto", "on", "off"] = "auto",
     downscale: Sequence[int] = (),
@@ -79,6 +80,7 @@ def prepare(
     """Make a scene of a survey, or continue an interrupted run.
 
     Args:
+        lens: of the camera.
         keep_all: use photographs of low quality too.
         colour: correct exposures and lens falloff: where it helps, always, or never.
         downscale: factors of reduced photographs to write beside the others.
@@ -109,14 +111,16 @@ def prepare(
         if not resume or not is_database(database):
             database.unlink(missing_ok=True)
         with ProgressBar(console, "Extracting features") as bar:
-            return {"features": extract(good.photographs, database, features, device, bar)}
+            return {"features": extract(good.photographs, database, features, device, bar, lens)}
 
     def refuse_damaged(facts: Facts) -> Facts:
         if not is_database(database):
             raise ValueError(f"{database.name} is no database of features")
         return facts
 
-    stages.run("features", [names, asdict(features)], [database], extract_features, refuse_damaged)
+    # Both are no part of the key of scenes that have neither.
+    masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
+    stages.run("features", [names, asdict(features), *masks, *kind], [database], extract_features, refuse_damaged)
     pairs = stages.run(
         "pairs",
         {},
@@ -142,7 +146,7 @@ def prepare(
             raise ValueError("the model has other photographs")
         return models, _lens_from_json(facts["lens"])
 
-    models, lens = stages.run(
+    models, choice = stages.run(
         "poses", {}, model_files(model), lambda _: estimate_poses(survey, database, model, console), read_poses
     )
 
@@ -166,6 +170,7 @@ def prepare(
         {"colour": colour},
         [
             *(images / photograph.name for photograph in placed),
+            *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
             *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
         ],
         lambda _: write_scene(placed, scene, colour, console),
@@ -181,7 +186,7 @@ def prepare(
     if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
         files = [scene / folder / name for folder in reduced for name in models[0]]
         stages.run("downscale", {"factors": list(downscale)}, files, reduce)
-    return Prepared(survey, verdicts, frozenset(names), models, lens, located, correction, stages.seconds)
+    return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
 
 
 def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
@@ -196,11 +201,11 @@ def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Con
 
 def estimate_poses(survey: Survey, database: Path, folder: Path, console: Console) -> Facts:
     """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder."""
+    known = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Estimating poses") as bar:
-        models = reconstruct(database, folder.with_name("models"), bar)
-    has_prior = all(photograph.lens is not None for photograph in survey.photographs)
+        models = reconstruct(database, folder.with_name("models"), bar, known)
     with ProgressBar(console, "Choosing a lens") as bar:
-        choice = choose_lens(models[0], survey.photographs, has_prior, bar)
+        choice = choose_lens(models[0], survey.photographs, known, bar)
     write_model(models[0], folder)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
@@ -234,6 +239,9 @@ def write_scene(
     cameras = [camera_of[photograph.name] for photograph in photographs]
     with ProgressBar(console, "Writing photographs") as bar:
         write_images(photographs, images, None, cameras, bar)
+    masks = any(photograph.mask is not None for photograph in photographs)
+    if masks:
+        write_masks(photographs, scene / "masks")
     correction = None
     if colour != "off":
         with ProgressBar(console, "Measuring exposures") as bar:
@@ -244,7 +252,7 @@ def write_scene(
                 write_images(photographs, images, correction, cameras, bar)
     model.extract_colors_for_all_images(images)
     write_model(model, sparse)
-    write_transforms(scene, model, z_is_up=True, overwrite=True)
+    write_transforms(scene, model, masks=masks, z_is_up=True, overwrite=True)
     return {"evening": _to_json(correction)}
 
 
@@ -270,6 +278,12 @@ def _fingerprint(survey: Survey) -> list:
         position, lens = repr(photograph.position), repr(photograph.lens)
         fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens])
     return fingerprint
+
+
+def _masks_fingerprint(survey: Survey) -> list:
+    """Identify the masks of photographs; empty if no photograph has one."""
+    masks = [(p.name, p.mask.stat()) for p in survey.photographs if p.mask is not None]
+    return [[name, state.st_size, state.st_mtime_ns] for name, state in masks]
 
 
 def _to_json(value: Any) -> Any:

@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 Facts = dict[str, Any]
 """Result of a stage, as JSON."""
 
-_OWN_FOLDERS = ("prepare", "sparse", "images")
+_OWN_FOLDERS = ("prepare", "sparse", "images", "masks")
 _DAMAGE = (
     ValueError,
     LookupError,

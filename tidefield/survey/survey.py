@@ -65,7 +65,7 @@ class Photograph:
 
     Attributes:
         path: the file.
-        name: its path relative to the survey's folder, with forward slashes; unique.
+        name: its path relative to the survey's folder, with forward slashes; unique. Ends in .jpg for HEIC files.
         width, height: pixels of the upright photograph.
         orientation: EXIF's, 1 to 8; 1 is stored upright.
         camera: make and model; empty if unknown. Photographs of one camera, size and focal length share a lens.
@@ -76,6 +76,7 @@ class Photograph:
         position: of the camera, or None.
         relative_altitude_m: height above take-off; NaN if unknown.
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
+        mask: a picture of the upright photograph's size that is black where the photograph is not to be used, or None.
     """
 
     path: Path
@@ -91,6 +92,7 @@ class Photograph:
     position: Position | None
     relative_altitude_m: float
     gimbal_deg: tuple[float, float, float] | None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)

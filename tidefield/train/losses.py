@@ -94,6 +94,9 @@ class BatchLoss(nn.Module):
         network = self.network
         with mixed_precision(priors.device, precision):
             encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
+        if batch.image_used:
+            masks = zip(encoded, batch.image_used, batch.image_corner_px, strict=True)
+            encoded = [one.masked(used, corner_px) for one, used, corner_px in masks]
         neighbours = cameras[batch.neighbours.reshape(-1)]
         views = Views(neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
         tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)

@@ -19,6 +19,7 @@ from torch.nn.parallel import DistributedDataParallel
 from tidefield.config import Config
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.errors import RunError
 from tidefield.evaluation.curves import make_curve
 from tidefield.files import read_json, write_text
 from tidefield.model.renderer import Renderer
@@ -141,6 +142,10 @@ class Validation:
         self.scenes, self.file = scenes, folder / VALIDATION_FILE
         self.curves = {name: make_curve(scene, smaller=1) for name, scene in scenes.items()}
         self.points: list[dict] = read_json(self.file) or []
+        if not isinstance(self.points, list) or not all(
+            isinstance(point, dict) and isinstance(point.get("step"), int) for point in self.points
+        ):
+            raise RunError(f"{self.file} is damaged: expected what training wrote; delete it to start it again")
 
     def __call__(self, trainer: Trainer, share: float) -> None:
         step = trainer.progress.step

@@ -12,7 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,7 +20,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from tidefield.baselines.nerfstudio.environment import WORKER, python
-from tidefield.config import Budget
+from tidefield.config import Budget, Range, from_json
+from tidefield.data.images import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -38,6 +39,9 @@ KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_T
 """What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """A worker may take so long to end."""
+_TRAINED = tuple[Annotated[int, Range(0, (1 << 63) - 1)], Annotated[float, Range(0, 1e12)]]
+_FACTOR = tuple[(Annotated[float, Range(1e-9, 1)],) * 3]
+"""Types of what job.json holds."""
 
 
 def delete_training(folder: Path) -> None:
@@ -125,7 +129,7 @@ def progress_of(folder: Path) -> TrainingProgress:
     Raises:
         RunError: not to its end.
     """
-    step, seconds = _read_job(folder)["trained"]
+    step, seconds = _read_job(folder)[0]
     return TrainingProgress(step, seconds)
 
 
@@ -136,7 +140,7 @@ def renderer(folder: Path) -> Iterator[Render]:
     Raises:
         RunError: nerfstudio is not installed, or fails.
     """
-    factor = torch.tensor(_read_job(folder)["factor"])
+    factor = torch.tensor(_read_job(folder)[1])
     with _worker("render", folder) as worker:
         worker.answer()  # once it has loaded
 
@@ -215,15 +219,20 @@ def _failed(folder: Path) -> RunError:
     )
 
 
-def _read_job(folder: Path) -> dict[str, Any]:
-    job = read_json(folder / JOB_FILE) or {}
+def _read_job(folder: Path) -> tuple[tuple[int, float], tuple[float, ...]]:
+    """Steps and seconds of a training that is complete, and the factor of its scene."""
+    path = folder / JOB_FILE
+    job = read_json(path) or {}
+    if not isinstance(job, dict):
+        raise RunError(f"{path} is damaged: expected what training wrote; train it with --overwrite")
     if "trained" not in job:
         raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
-    return job
+    factor = from_json(_FACTOR, job.get("factor"), f"{path}: factor")
+    return from_json(_TRAINED, job["trained"], f"{path}: trained"), factor
 
 
 def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
-    """Write photographs (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
+    """Write photographs and masks (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
     Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
 
@@ -236,6 +245,9 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
     for index, file in enumerate(files):
         colour = scene.photographs[index].float() / cameras.gain[index] * factor
         Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+    masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
+    for index, mask in enumerate(masks):
+        write_mask(folder / mask, scene.photographs.used(index).numpy())
     columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
     lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
     points = scene.points
@@ -247,6 +259,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
         _point_colours(scene),
+        masks=masks,
         overwrite=True,
     )
     return factor

@@ -16,10 +16,10 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float64, Int
 
-from tidefield.data.readers.files import in_range, inside, keep_present, naming, opened
+from tidefield.data.readers.files import in_range, inside, keep_present, masks_beside, naming, opened
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, Lens, lens_from_colmap
+from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, LensModel, lens_from_colmap
 
 _NO_POINT = -1
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
@@ -69,12 +69,14 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     paths = [inside(root / "images", image.name, images_file) for image in images]
     present = keep_present(paths, images_file, allow_missing)
     images = [images[i] for i in present]
+    names = tuple(image.name for image in images)
     return PosedPhotographs(
-        names=tuple(image.name for image in images),
+        names=names,
         paths=tuple(paths[i] for i in present),
         lenses=tuple(lenses[image.camera] for image in images),
         T_world_camera=_poses(images),
         points=_observations(images, points),
+        masks=masks_beside(root, names, images_file),
     )
 
 
@@ -138,7 +140,7 @@ class _Reader:
             raise ValueError(f"it goes on for {len(self.bytes) - self.at} bytes after its last record")
 
 
-def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, LensModel]]:
     reader = _Reader(file)
     for _ in reader.records(24):
         camera, model, width, height = reader.take("IiQQ")
@@ -176,7 +178,7 @@ def _lines(file: BinaryIO) -> Iterator[str]:
     return (line.strip() for line in file.read().decode().splitlines() if not line.startswith("#"))
 
 
-def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, LensModel]]:
     for line in filter(None, _lines(file)):
         camera, model, width, height, *parameters = line.split()
         yield int(camera), lens_from_colmap(model, int(width), int(height), [float(p) for p in parameters])

@@ -171,6 +171,15 @@ def keep_present(paths: Sequence[Path], named_by: Path, allow_missing: bool) -> 
     return present
 
 
+def masks_beside(root: Path, names: Sequence[str], named_by: Path) -> tuple[Path | None, ...]:
+    """Find the masks of photographs where COLMAP and OpenSfM look for them: masks/NAME.png; empty if there is none."""
+    if not (root / "masks").is_dir():
+        return ()
+    masks = [inside(root / "masks", f"{name}.png", named_by) for name in names]
+    found = tuple(mask if mask.is_file() else None for mask in masks)
+    return found if any(found) else ()
+
+
 def read_json(file: Path, kind: type[T] = dict, megabytes: int = _JSON_MEGABYTES) -> T:
     """Read a JSON file that holds an object, or a list.
 

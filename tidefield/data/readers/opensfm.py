@@ -37,6 +37,7 @@ from tidefield.data.readers.files import (
     in_range,
     inside,
     keep_present,
+    masks_beside,
     naming,
     number,
     numbers,
@@ -46,7 +47,7 @@ from tidefield.data.readers.files import (
 )
 from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
 from tidefield.errors import SceneError, list_names
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 
 Object = dict[str, Any]
 
@@ -54,13 +55,16 @@ _MEGABYTES, _LIST_MEGABYTES, _TRACKS_MEGABYTES = 2_000, 64, 8_000
 _TOPOCENTRIC = "reconstruction.topocentric.json"
 _TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
 _TRACKS_COLUMNS = {"0": 8, "1": 9, "2": 11}
-# Projection type -> its distortion terms, for the pinhole cameras.
+# Projection type -> its distortion terms.
 _TERMS = {
     "perspective": ("k1", "k2"),
     "simple_radial": ("k1",),
     "radial": ("k1", "k2"),
     "brown": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
 }
+_ONE_FOCAL = ("perspective", "fisheye")
 # Reprojection error as a share of the photograph's longer side above which OpenSfM rejects an observation (its
 # bundle_outlier_fixed_threshold), but keeps it in tracks.csv.
 _OUTLIER = 0.006
@@ -78,8 +82,8 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
     """Read the largest reconstruction of a project.
 
     Raises:
-        SceneError: a file is damaged, a lens is not a pinhole camera with Brown's distortion, or photographs are
-            missing.
+        SceneError: a file is damaged, a lens is neither a pinhole camera with Brown's distortion nor a fisheye, or
+            photographs are missing.
     """
     reconstruction = _largest(file)
     shots, cameras = _objects(reconstruction, "shots", file), _objects(reconstruction, "cameras", file)
@@ -100,6 +104,7 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
         T_world_camera=T_world_camera,
         points=points,
         reference=_reference(file, reconstruction),
+        masks=masks_beside(root, names, file) or masks_beside(file.parent, names, file),
     )
 
 
@@ -148,7 +153,7 @@ def _listed(root: Path, image_list: Path) -> dict[str, str]:
     return {path.name: posixpath.join(here, path) for path in paths if not path.is_absolute()}
 
 
-def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, file: Path) -> Lens:
+def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, file: Path) -> LensModel:
     camera = cameras.get(str(shot.get("camera")))
     if camera is None:
         raise SceneError(
@@ -164,13 +169,13 @@ def _lens(name: str, shot: Object, cameras: Mapping[str, Object], path: Path, fi
     if not (width and height):
         width, height, _ = read_header(path)
     longer = max(width, height)
-    focal = ("focal", "focal") if kind == "perspective" else ("focal_x", "focal_y")
+    focal = ("focal", "focal") if kind in _ONE_FOCAL else ("focal_x", "focal_y")
     fx, fy = (number(camera, key, file) for key in focal)
-    # A perspective camera's principal point is the middle; other values are ignored.
-    cx, cy = (0.0 if kind == "perspective" else number(camera, key, file, 0.0) for key in ("c_x", "c_y"))
+    # The principal point of cameras with one focal length is the middle; other values are ignored.
+    cx, cy = (0.0 if kind in _ONE_FOCAL else number(camera, key, file, 0.0) for key in ("c_x", "c_y"))
     terms = {term: number(camera, term, file, 0.0) for term in _TERMS[kind]}
     with naming(f"{file}, {name}"):
-        return Lens(
+        return (FisheyeLens if kind.startswith("fisheye") else Lens)(
             width,
             height,
             fx=fx * longer,
@@ -206,7 +211,7 @@ def _points(
 
 
 def _read_tracks(
-    file: Path, names: Sequence[str], points: Sequence[str], lenses: Sequence[Lens]
+    file: Path, names: Sequence[str], points: Sequence[str], lenses: Sequence[LensModel]
 ) -> tuple[Int[np.ndarray, " O"], Int[np.ndarray, " O"], Float64[np.ndarray, "O 2"]]:
     """Read the observations of these points in these photographs: point, photograph and pixel of each."""
     photograph_of, point_of = ({name: i for i, name in enumerate(each)} for each in (names, points))
@@ -243,7 +248,7 @@ def _read_tracks(
 
 
 def _inliers(
-    seen: Observations, lenses: Sequence[Lens], T_world_camera: Float64[np.ndarray, "V 3 4"]
+    seen: Observations, lenses: Sequence[LensModel], T_world_camera: Float64[np.ndarray, "V 3 4"]
 ) -> Observations | None:
     """The observations that OpenSfM accepted as inliers; None without any."""
     good = np.zeros(len(seen.uv_px), dtype=bool)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64, Int, UInt8
 
 from tidefield.data.readers.files import LARGEST, in_range
 from tidefield.errors import SceneError
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import LensModel
 
 
 def _no_indices() -> Int[np.ndarray, " O"]:
@@ -71,17 +71,19 @@ class PosedPhotographs:
         split: names of the training and the held-out photographs, where the format has a split.
         background_rgb: the background of photographs with alpha, where the format states it.
         reference: the geographic origin, where the format states it.
+        masks: of each photograph (`PhotographFile.mask`), or None; empty if no photograph has one.
     """
 
     names: tuple[str, ...]
     paths: tuple[Path, ...]
-    lenses: tuple[Lens, ...]
+    lenses: tuple[LensModel, ...]
     T_world_camera: Float64[np.ndarray, "V 3 4"]
     points: Observations | None = None
     near_far: Float64[np.ndarray, "V 2"] | None = None
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background_rgb: tuple[float, float, float] | None = None
     reference: Reference | None = None
+    masks: tuple[Path | None, ...] = ()
 
 
 def proper_rotations(

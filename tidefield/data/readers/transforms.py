@@ -1,9 +1,9 @@
 """Read and write `transforms.json` of nerfstudio and instant-ngp; read the Blender scenes of the original NeRF.
 
 Poses are camera-to-world with OpenGL's axes (+x right, +y up, -z forward). Calibration stands in a frame or, for all
-frames, at the top: fl_x, fl_y, cx, cy, w, h, k1, k2, k3, p1, p2, or camera_angle_x. The split is in `train_filenames`
-and the like. nerfstudio's `applied_transform` has been applied to the poses and to the points of `ply_file_path` alike,
-so it is ignored here; instant-ngp's aabb_scale, scale and offset belong to its own grid.
+frames, at the top: fl_x, fl_y, cx, cy, w, h, k1, k2, k3, p1, p2 (of a fisheye k1 to k4), or camera_angle_x. The split
+is in `train_filenames` and the like. nerfstudio's `applied_transform` has been applied to the poses and to the points
+of `ply_file_path` alike, so it is ignored here; instant-ngp's aabb_scale, scale and offset belong to its own grid.
 (https://docs.nerf.studio/quickstart/data_conventions.html)
 
 Blender scenes have one file per part, `transforms_{train,val,test}.json`, and pictures of an object with alpha.
@@ -28,7 +28,7 @@ from tidefield.data.readers.files import LARGEST, inside, keep_present, naming, 
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.files import completed_file
-from tidefield.geometry.lenses import Lens
+from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 
 # Blender cameras lie on a sphere around the object at the origin and point at it. The original NeRF samples from 2 to
 # 6 at a radius of 4.
@@ -36,7 +36,8 @@ _BLENDER_NEAREST, _BLENDER_FARTHEST = 0.5, 1.5
 _WHITE = (1.0, 1.0, 1.0)
 _FILE, _CLOUD = "transforms.json", "sparse_pc.ply"
 _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE = "OPENCV_FISHEYE"
+_DISTORTION, _FISHEYE_DISTORTION = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
 
 
 def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
@@ -82,7 +83,14 @@ def read_blender(root: Path, allow_missing: bool) -> PosedPhotographs:
         near_far=np.stack([_BLENDER_NEAREST * distance, _BLENDER_FARTHEST * distance], axis=1),
         split=(train, test[0] - train) if test else None,
         background_rgb=_WHITE,
+        masks=_joined(parts),
     )
+
+
+def _joined(parts: Sequence[PosedPhotographs]) -> tuple[Path | None, ...]:
+    """The masks of several parts of a scene; empty if none has any."""
+    masks = sum((part.masks or (None,) * len(part.names) for part in parts), ())
+    return masks if any(masks) else ()
 
 
 def _photographs(
@@ -113,19 +121,39 @@ def _photographs(
         paths=paths,
         lenses=tuple(_lens({**top, **frame}, path, file) for _, path, frame in found),
         T_world_camera=_poses([frame for _, _, frame in found], file),
+        masks=_masks([frame for _, _, frame in found], root, file, allow_missing),
     )
 
 
-def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
+def _masks(frames: Sequence[Mapping[str, Any]], root: Path, file: Path, allow_missing: bool) -> tuple[Path | None, ...]:
+    """The masks that frames name; empty if none does."""
+    masks: list[Path | None] = []
+    for frame in frames:
+        name = frame.get("mask_path")
+        path = None if name is None else inside(root, str(name), file)
+        if path is not None and not path.is_file():
+            if not allow_missing:
+                raise SceneError(
+                    f"{file} names the mask {name}, which is missing: add it, or use --allow-missing to use the whole "
+                    "photograph"
+                )
+            path = None
+        masks.append(path)
+    return tuple(masks) if any(masks) else ()
+
+
+def _lens(values: Mapping[str, Any], path: Path, file: Path) -> LensModel:
     """The lens of a frame, whose values override those of the whole file."""
-    model = values.get("camera_model", "OPENCV")
-    higher = [key for key in ("k4", "k5", "k6") if number(values, key, file, 0.0)]
-    fisheye = values.get("is_fisheye") or "ftheta_p0" in values or "latlong" in values
-    if model not in _MODELS or higher or fisheye:
-        found = f"the term {higher[0]}" if higher else f"the camera model {'fisheye' if fisheye else model}"
+    # instant-ngp has is_fisheye instead of a model's name.
+    model = _FISHEYE if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
+    terms = _FISHEYE_DISTORTION if model == _FISHEYE else _DISTORTION
+    higher = [key for key in ("k4", "k5", "k6") if key not in terms and number(values, key, file, 0.0)]
+    other = next((name for key, name in (("ftheta_p0", "F-Theta"), ("latlong", "latlong")) if key in values), None)
+    if model not in (*_MODELS, _FISHEYE) or higher or other:
+        found = f"the term {higher[0]}" if higher else f"the camera model {other or model}"
         raise SceneError(
-            f"{file} has {found} for {path.name}: expected one of {', '.join(_MODELS)} with k1, k2, k3, p1, p2; "
-            "undistort the photographs first (COLMAP's image_undistorter does)"
+            f"{file} has {found} for {path.name}: expected one of {', '.join(_MODELS)} with k1, k2, k3, p1, p2, or "
+            f"{_FISHEYE} with k1, k2, k3, k4; undistort the photographs first (COLMAP's image_undistorter does)"
         )
     width, height = (int(number(values, key, file, 0.0)) for key in ("w", "h"))
     if not (width and height):
@@ -134,9 +162,10 @@ def _lens(values: Mapping[str, Any], path: Path, file: Path) -> Lens:
     if fx is None:
         raise SceneError(f"{file} has neither fl_x nor camera_angle_x for {path.name}: expected one; export it again")
     cx, cy = number(values, "cx", file, width / 2), number(values, "cy", file, height / 2)
-    terms = {key: number(values, key, file, 0.0) for key in _DISTORTION}
+    distortion = {key: number(values, key, file, 0.0) for key in terms}
     with naming(f"{file}, {path.name}"):
-        return Lens(width, height, fx, fx if fy is None else fy, cx, cy, **terms)
+        kind = FisheyeLens if model == _FISHEYE else Lens
+        return kind(width, height, fx, fx if fy is None else fy, cx, cy, **distortion)
 
 
 def _poses(frames: Sequence[Mapping[str, Any]], file: Path) -> Float64[np.ndarray, "V 3 4"]:
@@ -190,18 +219,20 @@ def _cloud(top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool) 
 def write_transforms_file(
     folder: Path,
     files: Sequence[str],
-    lenses: Sequence[Lens],
+    lenses: Sequence[LensModel],
     T_world_camera: Float64[np.ndarray, "V 3 4"],
     split: tuple[Sequence[int], Sequence[int]],
     xyz_world: Float64[np.ndarray, "P 3"],
     rgb: UInt8[np.ndarray, "P 3"],
     *,
+    masks: Sequence[str] = (),
     header: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write `transforms.json` and, if there are points, `sparse_pc.ply`.
 
-    A calibration that all photographs share is written once, at the top.
+    A calibration that all photographs share is written once, at the top. nerfstudio reads the camera model there alone:
+    it cannot open a scene of fisheye and other lenses.
 
     Args:
         folder: the scene.
@@ -210,6 +241,8 @@ def write_transforms_file(
         T_world_camera: poses with OpenCV's axes.
         split: indices of the training and of the held-out photographs.
         xyz_world, rgb: the sparse points.
+        masks: of each photograph, relative to the folder; empty if no photograph has one. nerfstudio reads masks of all
+            photographs or of none.
         header: further entries at the top.
         overwrite: replace existing files.
 
@@ -219,7 +252,8 @@ def write_transforms_file(
     calibrations = [_calibration(lens) for lens in lenses]
     is_shared = len(set(lenses)) == 1
     train, test = ([files[i] for i in part] for part in split)
-    top: dict[str, Any] = {"camera_model": "OPENCV", **(calibrations[0] if is_shared else {}), **(header or {})}
+    model = _FISHEYE if all(isinstance(lens, FisheyeLens) for lens in lenses) else "OPENCV"
+    top: dict[str, Any] = {"camera_model": model, **(calibrations[0] if is_shared else {}), **(header or {})}
     if len(xyz_world):
         write_ply(folder / _CLOUD, xyz_world, rgb, overwrite)
         top["ply_file_path"] = _CLOUD
@@ -227,16 +261,19 @@ def write_transforms_file(
     top["frames"] = [
         {
             "file_path": file,
+            **({"mask_path": masks[i]} if masks else {}),
             "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
             **({} if is_shared else calibration),
         }
-        for file, pose, calibration in zip(files, _flip_axes(T_world_camera), calibrations, strict=True)
+        for i, (file, pose, calibration) in enumerate(zip(files, _flip_axes(T_world_camera), calibrations, strict=True))
     ]
     with completed_file(folder / _FILE, overwrite=overwrite) as partial:
         partial.write_text(json.dumps(top, indent=1, allow_nan=False), encoding="utf-8")
 
 
-def _calibration(lens: Lens) -> dict[str, int | float]:
+def _calibration(lens: LensModel) -> dict[str, Any]:
     """The keys of a frame's lens."""
     pinhole = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    if isinstance(lens, FisheyeLens):
+        return {"camera_model": _FISHEYE} | pinhole | {key: getattr(lens, key) for key in _FISHEYE_DISTORTION}
     return pinhole | {key: getattr(lens, key) for key in _DISTORTION}

@@ -36,8 +36,11 @@ _IMAGES_OF_A_LENS = 8
 """A lens that took fewer photographs is kept."""
 _MISMATCH = 2.0
 """Observations whose error is this many times the median are removed."""
-_SIMPLER = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-"""COLMAP's models that OPENCV contains."""
+_GENERAL = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
+    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
+}
+"""COLMAP's models by the one that contains them."""
 _STEPS = 200
 _TOLERANCE = 1e-7
 
@@ -178,17 +181,18 @@ def all_images(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfi
 
 
 def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, free: bool) -> None:
-    """Convert lenses that are to be adjusted to OPENCV; fix all others, and those of few photographs."""
+    """Convert lenses that are to be adjusted to OPENCV or OPENCV_FISHEYE; fix others, and those of few photographs."""
     taken = Counter(model.image(number).camera_id for number in model.reg_image_ids())
     for number, camera in model.cameras.items():
         if not taken[number]:
             continue
         if not free or taken[number] < _IMAGES_OF_A_LENS:
             config.set_constant_cam_intrinsics(number)
-        elif camera.model.name in _SIMPLER:
+        elif camera.model.name in _GENERAL:
+            general = _GENERAL[camera.model.name]
             lens = lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = colmap_parameters(lens, "OPENCV")
+            camera.model = getattr(pycolmap.CameraModelId, general)
+            camera.params = colmap_parameters(lens, general)
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import mmap
 import struct
@@ -29,6 +30,9 @@ _READERS: dict[bytes, Callable[[str], Image.Image]] = {
     b"II+\0": TiffImagePlugin.TiffImageFile,
     b"MM\0+": TiffImagePlugin.TiffImageFile,
 }
+HEIFS = (".heic", ".heif")
+"""Suffixes of High Efficiency Image files, which pillow-heif reads (the extra `heic`)."""
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _DAMAGE = (
     *(OSError, SyntaxError, ValueError, KeyError, IndexError, TypeError, EOFError, struct.error),
     Image.DecompressionBombError,  # of TIFFs, whose reader has a limit of its own
@@ -61,8 +65,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         if path.exists() and not path.is_file():  # a named pipe would be waited for
             raise ValueError("it is no regular file")
         with path.open("rb") as file:
-            start = file.read(8)
+            start = file.read(12)
         reader = next((reader for magic, reader in _READERS.items() if start.startswith(magic)), None)
+        if start[4:8] == b"ftyp" and start[8:] in _HEIF_BRANDS:
+            reader = _open_heif
         if reader is None:
             raise ValueError("it is empty" if not start else "it is not a JPEG, PNG or TIFF, whatever its suffix")
         with reader(str(path)) as image:
@@ -75,6 +81,13 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         raise SurveyError(
             f"{path} cannot be read ({reason}): expected a whole JPEG, PNG or TIFF; copy it again from the camera"
         ) from error
+
+
+def _open_heif(path: str) -> Image.Image:
+    """Open an HEIF file; the decoder applies its orientation, and its EXIF then states 1."""
+    from pillow_heif import HeifImageFile
+
+    return HeifImageFile(io.BytesIO(Path(path).read_bytes()))  # an open file would stay open
 
 
 def refuse_truncated(path: Path, image: Image.Image) -> None:
@@ -92,7 +105,7 @@ def refuse_truncated(path: Path, image: Image.Image) -> None:
         starts, lengths = (np.atleast_1d(tags.get(strips) or tags.get(tiles) or 0) for strips, tiles in _TIFF_PARTS)
         if len(starts) != len(lengths) or (starts + lengths).max() > path.stat().st_size:
             raise OSError("its end is missing")
-    else:
+    elif isinstance(image, JpegImagePlugin.JpegImageFile):  # the parts of an HEIF are checked when it is opened
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             at = 2
             while content[at + 1] != 0xDA:  # to the scan, where the segments end

@@ -8,38 +8,47 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from PIL import ExifTags
 
+from tidefield.data.images import check_mask
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control
-from tidefield.survey.io.image_decoding import open_image, refuse_truncated, stored_size, upright_size
+from tidefield.survey.io.image_decoding import HEIFS, open_image, refuse_truncated, stored_size, upright_size
 from tidefield.survey.io.lens_prior import lens_prior
 from tidefield.survey.io.metadata import read_metadata
 from tidefield.survey.io.positions import locate_photographs
 from tidefield.survey.io.text_files import find_file, normalise_name
 from tidefield.survey.survey import Photograph, Survey
 
+MASKS = "masks"
+"""Folder of masks next to the photographs, and in a scene."""
 FEWEST = 3
 """Fewest photographs of a survey: with two, no third view verifies the poses."""
 
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff")
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", *HEIFS)
 _RAWS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mef", ".mos"),
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
-_OTHER_IMAGES = (".heic", ".heif", ".avif", ".webp", ".jp2", ".jxl", ".bmp")
+_OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp")
 # Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
 _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
 
 
 def read_survey(
-    folder: Path, gps: Path | None = None, control: Path | None = None, *, find_control: bool = True
+    folder: Path,
+    gps: Path | None = None,
+    control: Path | None = None,
+    *,
+    find_control: bool = True,
+    masks: Path | None = None,
 ) -> Survey:
-    """Read all photographs (JPEG, PNG, TIFF) in a folder and its sub-folders, with positions and ground control.
+    """Read all photographs (JPEG, PNG, TIFF, HEIC) in a folder and its sub-folders, with positions and ground control.
 
     Hidden folders, scenes (folders with a `sparse` folder or a `georeference.json`) and OpenDroneMap's results are
     skipped. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose
@@ -50,21 +59,27 @@ def read_survey(
         gps: a file of positions, which have priority over EXIF.
         control: a file of ground control in the format of ODM's gcp_list.txt.
         find_control: use such a file in the folder where none is given; one that does not fit is only remarked.
+        masks: a folder with NAME.png for photographs called NAME; without it, `masks` in the folder, if it has any.
 
     Raises:
         SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
             positions or the given ground control cannot be parsed.
     """
     paths, raws = _list_photographs(folder)
-    names = [path.relative_to(folder).as_posix() for path in paths]
-    _refuse_collisions(names)
-    remarks = []
+    mask_of, remarks = _find_masks(folder, paths, masks)
+    home = masks or folder / MASKS
+    if mask_of:  # they are no photographs
+        own = set(mask_of.values())
+        paths = [path for path in paths if path not in own and (home == folder or not path.is_relative_to(home))]
+    _refuse_collisions([path.relative_to(folder).as_posix() for path in paths])
+    _refuse_unreadable([path for path in paths if path.suffix.casefold() in HEIFS])
+    names = [_name(path.relative_to(folder)) for path in paths]
     if raws:
         remarks.append(f"{len(raws)} camera raw files are not read ({list_names(raws)}): develop them first.")
     with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
         # Pillow warns of tags that it cannot read, without the name of the file; they count as unknown.
         warnings.simplefilter("ignore", UserWarning)
-        read = list(pool.map(_read, paths, names))
+        read = list(pool.map(_read, paths, names, [mask_of.get(path) for path in paths]))
     photographs = [photograph for photograph in read if isinstance(photograph, tuple)]
     unread = [f"Left out: {problem}" for problem in read if isinstance(problem, str)]
     if len(photographs) < FEWEST:
@@ -166,7 +181,43 @@ def _refuse_collisions(names: Sequence[str]) -> None:
         )
 
 
-def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
+def _refuse_unreadable(heifs: Sequence[Path]) -> None:
+    if heifs and find_spec("pillow_heif") is None:
+        raise SurveyError(
+            f"{len(heifs)} photographs are HEIC files ({list_names([path.name for path in heifs])}): expected the "
+            "library that reads them; pip install 'tidefield[heic]', or export them as JPEG"
+        )
+
+
+def _name(path: Path) -> str:
+    """The name of a photograph in a scene: other programs read no HEIC, so it is written as JPEG there."""
+    return (path.with_suffix(".jpg") if path.suffix.casefold() in HEIFS else path).as_posix()
+
+
+def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -> tuple[dict[Path, Path], list[str]]:
+    """Find the masks of photographs, and say what is to be said of them.
+
+    Raises:
+        SurveyError: there is no mask where they were asked for.
+    """
+    home = masks or folder / MASKS
+    candidates = {path: home / f"{path.relative_to(folder)}.png" for path in photographs}
+    found = {path: mask for path, mask in candidates.items() if mask.is_file()}
+    count = len([path for path in photographs if path not in set(found.values())])
+    if masks is not None and not found:
+        example = next(iter(candidates.values())).relative_to(home).as_posix()
+        raise SurveyError(
+            f"{masks} has no mask of any photograph in {folder}: expected a PNG called like its photograph, such as "
+            f"{example}, that is black where the photograph is not to be used; give the folder of the masks, or leave "
+            "--masks out"
+        )
+    if masks is not None:
+        some = [f"{len(found)} of the photographs have masks in {masks}, the others are used whole."]
+        return found, some if len(found) < count else []
+    return found, [f"{home} has masks of {len(found)} photographs: what is black there is not used."] if found else []
+
+
+def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, tuple[str, ...]] | str:
     """Read a photograph and which blocks of its metadata are damaged, or return why it cannot be read."""
     try:
         with open_image(path) as image:
@@ -190,5 +241,8 @@ def _read(path: Path, name: str) -> tuple[Photograph, tuple[str, ...]] | str:
         position=metadata.position,
         relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
+        mask=mask,
     )
+    if mask is not None:
+        check_mask(mask, (width, height), path)
     return photograph, metadata.damaged

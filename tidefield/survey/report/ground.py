@@ -15,6 +15,7 @@ from scipy import ndimage
 from shapely import Polygon
 from shapely.geometry.polygon import orient
 
+from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.survey.report.block import Block
 
 POINTS_A_CELL = 16  # on average: enough for a median
@@ -95,10 +96,11 @@ def footprints(block: Block, ground: Ground) -> tuple[Polygon, ...]:
 
 
 def _border_directions(camera: pycolmap.Camera) -> Float64[np.ndarray, "K 3"]:
-    """Unit directions, in the camera's frame, along the border of its image."""
+    """Unit directions, in the camera's frame, along the border of its image, or of a fisheye's pinhole."""
     border = shapely.segmentize(shapely.box(0, 0, 1, 1), 1 / BORDER_POINTS)
     uv = shapely.get_coordinates(border)[:-1] * (camera.width, camera.height)
-    xy = np.asarray(camera.cam_from_img(uv))
+    lens = lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params)
+    xy = lens.pinhole().unproject(uv) if isinstance(lens, FisheyeLens) else np.asarray(camera.cam_from_img(uv))
     xy = xy[np.isfinite(xy).all(1)]  # a strong distortion need not be invertible at the corners
     directions = np.c_[xy, np.ones(len(xy))]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)

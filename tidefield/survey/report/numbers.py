@@ -20,6 +20,7 @@ from shapely.geometry import mapping
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
+from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report.findings import Comparison, Findings
 from tidefield.survey.report.geopackage import Layer
@@ -393,9 +394,14 @@ def _lenses(statistics: Statistics) -> tuple[list[Numbers], dict[str, Numbers]]:
 
 
 def _corner_distortion(camera: pycolmap.Camera) -> float:
-    """Largest displacement of an image corner by the distortion, in pixels."""
+    """Largest displacement of an image corner, or of that of a fisheye's pinhole, by the distortion, in pixels."""
     corners = np.array([(0, 0), (camera.width, 0), (0, camera.height), (camera.width, camera.height)], dtype=float)
-    straight = np.asarray(camera.cam_from_img(corners)) * (camera.focal_length_x, camera.focal_length_y)
+    rays = np.asarray(camera.cam_from_img(corners))
+    lens = lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params)
+    if isinstance(lens, FisheyeLens):
+        rays = lens.pinhole().unproject(corners)
+        corners = lens.project(np.c_[rays, np.ones(len(rays))])
+    straight = rays * (camera.focal_length_x, camera.focal_length_y)
     straight += (camera.principal_point_x, camera.principal_point_y)
     return float(np.linalg.norm(straight - corners, axis=1).max())
 

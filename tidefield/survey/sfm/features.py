@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 from urllib.parse import quote, unquote
 
 import cv2
@@ -20,6 +21,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
+from tidefield.data.images import read_mask
 from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
@@ -31,7 +33,10 @@ Keypoints = Float32[np.ndarray, "K 4"]
 Descriptors = UInt8[np.ndarray, "K 128"]
 
 DEFAULT_FOCAL = 1.2
-"""Focal length in widths of the photograph where no prior exists: COLMAP's default."""
+"""Focal length in widths of the photograph where no prior exists: COLMAP's default. A fisheye's is that of 180 degrees
+along the diagonal."""
+LensKind = Literal["pinhole", "fisheye"]
+"""What the lens model of a survey starts from: COLMAP's OPENCV, or its OPENCV_FISHEYE."""
 
 
 OPTION_RANGE = (100, 50_000)
@@ -103,9 +108,20 @@ def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
     return [numbers[kind] for kind in kinds]
 
 
-def initial_camera(photograph: Photograph) -> pycolmap.Camera:
-    """Make an OPENCV camera of COLMAP from the lens prior."""
+def initial_camera(photograph: Photograph, kind: LensKind = "pinhole") -> pycolmap.Camera:
+    """Make an OPENCV or OPENCV_FISHEYE camera of COLMAP from the lens prior.
+
+    Makers calibrate no fisheyes: of their priors, the focal length alone is used.
+    """
     lens, width, height = photograph.lens, photograph.width, photograph.height
+    if kind == "fisheye":
+        focal = lens.focal_px if lens else np.hypot(width, height) / np.pi
+        number = pycolmap.INVALID_CAMERA_ID
+        camera = pycolmap.Camera.create_from_model_name(number, "OPENCV_FISHEYE", focal, width, height)
+        camera.has_prior_focal_length = (
+            True  # so that pairs are verified by rays: pixels of a fisheye fit no epipolar line
+        )
+        return camera
     focal = lens.focal_px if lens else DEFAULT_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(pycolmap.INVALID_CAMERA_ID, "OPENCV", focal, width, height)
     if lens and lens.principal_px:
@@ -129,6 +145,7 @@ def extract(
     options: FeatureOptions,
     device: pycolmap.Device,
     progress: Progress,
+    kind: LensKind = "pinhole",
 ) -> int:
     """Write cameras, photographs and their features to a database; what it contains already is kept.
 
@@ -137,7 +154,7 @@ def extract(
     """
     with pycolmap.Database.open(database) as db:
         todo = []
-        for photograph, camera_id in zip(photographs, _write_cameras(db, photographs), strict=True):
+        for photograph, camera_id in zip(photographs, _write_cameras(db, photographs, kind), strict=True):
             image = db.read_image_with_name(encode_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
                 todo.append((photograph, camera_id))
@@ -179,18 +196,20 @@ def _features(
     if scale < 1:
         size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = find_features(grey, options.count, device)
+    size = photograph.width, photograph.height
+    used = None if photograph.mask is None else read_mask(photograph.mask, size, photograph.path)
+    keypoints, descriptors = find_features(grey, options.count, device, used)
     keypoints[:, :3] *= photograph.width / grey.shape[1]
     return keypoints, descriptors
 
 
-def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph]) -> list[int]:
+def _write_cameras(db: pycolmap.Database, photographs: Sequence[Photograph], kind: LensKind) -> list[int]:
     """Write the cameras that the database lacks, each with its rig; return the camera of each photograph."""
     groups = lens_groups(photographs)
     # The photographs' order is fixed, so cameras have the same numbers when an interrupted run continues.
     for group in sorted(set(groups)):
         if not db.exists_camera(group + 1):
-            camera = initial_camera(photographs[groups.index(group)])
+            camera = initial_camera(photographs[groups.index(group)], kind)
             camera.camera_id = group + 1
             db.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=group + 1)

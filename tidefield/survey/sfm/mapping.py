@@ -36,6 +36,8 @@ MIN_PHOTOGRAPHS = 3
 """Photographs of the smallest model."""
 TERMS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}
 """Lens models of COLMAP, the simplest first, and their terms of distortion."""
+FISHEYE_TERMS = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4}
+"""The same of fisheyes."""
 MAX_ERROR_RATIO = 0.99
 """More terms must reduce the reprojection error to this share, ..."""
 MAX_POSITION_RATIO = 1.03
@@ -105,11 +107,12 @@ class LensChoice:
     heights: Heights | None = None
 
 
-def reconstruct(database: Path, folder: Path, progress: Progress) -> list[pycolmap.Reconstruction]:
+def reconstruct(database: Path, folder: Path, progress: Progress, known: bool) -> list[pycolmap.Reconstruction]:
     """Run incremental mapping on the matches of a database.
 
     Args:
         folder: where pycolmap may write; created if it does not exist.
+        known: whether all focal lengths have a prior, and are held to it.
 
     Returns:
         The models that nothing connects, the one with the most photographs first, with the photographs' own names.
@@ -119,10 +122,9 @@ def reconstruct(database: Path, folder: Path, progress: Progress) -> list[pycolm
     """
     with pycolmap.Database.open(database) as db:
         count = db.num_images()
-        has_prior = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not has_prior
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
     registered = 0
 
     def count_image() -> None:
@@ -185,14 +187,16 @@ def choose_lens(
     spread = float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
     light, trials = thinned(model), []
     try_focal = known and spread >= MIN_SPREAD_DEG
-    steps = len(TERMS) + 1 + try_focal
+    is_fisheye = any(camera.model_name in FISHEYE_TERMS for camera in model.cameras.values())
+    lenses = FISHEYE_TERMS if is_fisheye else TERMS
+    steps = len(lenses) + 1 + try_focal
 
     def attempt(lens: str, refine_focal: bool) -> LensTrial:
         trials.append(_try_lens(light, photographs, lens, refine_focal))
         progress(len(trials), steps)
         return trials[-1]
 
-    best = best_of([attempt(lens, not known) for lens in TERMS])
+    best = best_of([attempt(lens, not known) for lens in lenses])
     freed = not known
     if try_focal:
         refined = attempt(best.lens, True)
@@ -302,12 +306,14 @@ def lens_notes(choice: LensChoice) -> tuple[str, ...]:
             f"{used[0]} one was used. The drone's height is above take-off, not above the ground."
         )
     # Why there are no more terms of distortion, where positions were the reason.
-    richer = [t for t in others if TERMS[t.lens] > TERMS[best.lens] and t.error_px < MAX_ERROR_RATIO * best.error_px]
+    terms_of = TERMS | FISHEYE_TERMS
+    more = [t for t in others if terms_of[t.lens] > terms_of[best.lens]]
+    richer = [t for t in more if t.error_px < MAX_ERROR_RATIO * best.error_px]
     if richer and best.off_m is not None:
-        other, terms = min(richer, key=lambda trial: trial.error_px), TERMS[best.lens]
+        other, terms = min(richer, key=lambda trial: trial.error_px), terms_of[best.lens]
         notes.append(
-            f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {TERMS[other.lens]} the matches would "
-            f"fit better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras fit their positions "
-            f"worse ({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be curved."
+            f"The lens has {terms} term{'s' * (terms > 1)} of distortion. With {terms_of[other.lens]} the matches "
+            f"would fit better ({other.error_px:.2f} px instead of {best.error_px:.2f}), but the cameras fit their "
+            f"positions worse ({other.off_m:.2f} m instead of {best.off_m:.2f}): the model would be curved."
         )
     return tuple(notes)
