@@ -44,6 +44,7 @@ def describe() -> dict[str, Any]:
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "version": __version__,
+        "commit": commit(),
         "machine": {
             "processor": _processor(),
             "cores": cores(),
@@ -53,6 +54,18 @@ def describe() -> dict[str, Any]:
             "torch": version("torch"),
         },
     }
+
+
+def commit() -> str | None:
+    """The commit of the sources that run, with a + if they have been changed; None for an installed package."""
+    root = Path(__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):  # without git, or in another user's folder
+        return None
 
 
 def _processor() -> str:

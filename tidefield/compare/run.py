@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tidefield.config import PROTOCOL
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
@@ -66,6 +67,7 @@ class Settings:
         seed: of weights and batches.
         preset: that "tidefield" stands for, and that variants change.
         from_scratch: whether our presets start from random weights.
+        protocol: of the evaluations.
     """
 
     minutes: float | None
@@ -75,6 +77,7 @@ class Settings:
     seed: int
     preset: str = "swift"
     from_scratch: bool = False
+    protocol: str = PROTOCOL
 
 
 def mipnerf360(folder: Path, out: Path) -> dict[str, Path]:

@@ -11,7 +11,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,6 +48,8 @@ OFF_LINE = 1 / 400
 """Of a match from its epipolar line, as a share of the longer side: poses of phones are good to some pixels."""
 MAX_RATIO, MAX_ANGLE_RAD = 0.8, 0.7
 """Limits on the angle between matching descriptors, relative to the second nearest and absolute: COLMAP's values."""
+WORTH_PROCESSES_PX = 5_000_000
+"""Pixels of all photographs above which it pays to start processes for them, which takes some seconds."""
 LEAST_ANGLE_DEG = 0.5
 """Between the rays of a point, whose depth is otherwise a guess."""
 _STEPS = 5
@@ -163,8 +165,11 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     paths, lenses = [posed.paths[i] for i in used], [posed.lenses[i] for i in used]
     masks = [posed.masks[i] if posed.masks else None for i in used]
     features: list[Features] = []
-    with worker_processes(max(1, min(cores(), len(used))), _quiet) as pool:
-        for found in pool.map(find_photograph_features, paths, lenses, masks):
+    with ExitStack() as stack:
+        run = map
+        if sum(lens.width * lens.height for lens in lenses) > WORTH_PROCESSES_PX:
+            run = stack.enter_context(worker_processes(min(cores(), len(used)), _quiet)).map
+        for found in run(find_photograph_features, paths, lenses, masks):
             features.append(found)
             if progress:
                 progress(len(features), len(used))

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tidefield import __version__
+from tidefield.config import PROTOCOL
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
@@ -27,6 +28,7 @@ from tidefield.evaluation.lpips import Lpips, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
+from tidefield.machine import commit
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar, make_console
 
@@ -112,6 +114,8 @@ def evaluate(
         "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
         "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
         "version": __version__,
+        "commit": commit(),
+        "protocol": PROTOCOL,
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
     }
