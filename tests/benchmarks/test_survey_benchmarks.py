@@ -66,7 +66,9 @@ def test_the_page_shows_model_training_and_time(tmp_path: Path) -> None:
         trained = {"trained": {"steps": 1500, "seconds": 600.0}}
         evaluation = tmp_path / folder / "runs" / scene / "tidefield" / "evaluation.json"
         speed = {"rays_per_second": 1.0, "seconds_per_frame": 1.0}
-        write_json(evaluation, {"mean": mean, "configuration": trained, "per_photograph": {}, **speed})
+        write_json(
+            evaluation, {"mean": mean, "configuration": trained, "per_photograph": {"a.jpg": {"psnr": psnr}}, **speed}
+        )
     write_page(runs, ["swindale"], tmp_path / "a", tmp_path / "b", tmp_path / "page.md")
     lines = (tmp_path / "page.md").read_text().splitlines()
     for line in (
