@@ -58,7 +58,8 @@ def looking(
     start = own.start_intervals(tiles, prior.expand(len(corners), -1, -1, -1))
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
     blend_weight, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
-    return tiles, FeatureCache(own, at, CPU).views(Neighbours(neighbours, blend_weight), middle), start
+    views = FeatureCache(own, at, CPU).views(at.cameras[TARGET], Neighbours(neighbours, blend_weight), middle)
+    return tiles, views, start
 
 
 def outputs(rendering: TileRendering) -> list[Tensor]:

@@ -39,7 +39,7 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     view = at.cameras[1]
     middle = view.position_world + 5 * view.directions_world(seen_uv[None])[0]
     neighbours = torch.full((len(seen_uv), 1), 1)
-    views = FeatureCache(network, at, CPU).views(Neighbours(neighbours, torch.ones(4, 1, 4)), middle)
+    views = FeatureCache(network, at, CPU).views(view, Neighbours(neighbours, torch.ones(4, 1, 4)), middle)
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
@@ -67,7 +67,7 @@ def test_more_blocks_than_slots_are_refused(network: Network):
     cramped = FeatureCache(network, scene(), CPU, budget_bytes=1)
     neighbours = torch.tensor([[0, 1, 2, 4, 5], [6, 1, 2, 4, 3]])
     with pytest.raises(CacheFull):
-        cramped.views(Neighbours(neighbours, torch.ones(2, 5, 4)), torch.zeros(2, 3))
+        cramped.views(scene().cameras[TARGET], Neighbours(neighbours, torch.ones(2, 5, 4)), torch.zeros(2, 3))
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -80,7 +80,7 @@ def test_masked_pixels_are_no_valid_samples(network: Network):
         directions = view.directions_world(seen_uv[None])[0]
         middle = view.position_world + 5 * directions
         neighbours = Neighbours(torch.full((4, 1), index), torch.ones(4, 1, 4))
-        views = FeatureCache(network, at, CPU).views(neighbours, middle)
+        views = FeatureCache(network, at, CPU).views(view, neighbours, middle)
         for stride, coarse in ((4, True), (1, False)):
             found = views.read(stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), coarse)
             assert found.valid[:, 0, 0].tolist() == expected

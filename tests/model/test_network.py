@@ -111,9 +111,8 @@ def test_what_one_view_alone_sees_is_not_smeared_over_the_depths_it_might_have()
     with torch.inference_mode():
         tiles, _, start = looking(own, at, 16, ((40, 28),))
         wide = replace(start, inv_near=start.inv_expected * 1.5, inv_far=start.inv_expected / 1.5)
-        views = FeatureCache(own, at, CPU).views(
-            Neighbours(torch.tensor([[0]]), torch.ones(1, 1, 4)), torch.zeros(1, 3)
-        )
+        alone = Neighbours(torch.tensor([[0]]), torch.ones(1, 1, 4))
+        views = FeatureCache(own, at, CPU).views(at.cameras[TARGET], alone, torch.zeros(1, 3))
         found = own(tiles, views, wide, True).colour.reshape(16, 16, 3)
     truth = at.photographs[TARGET][28:44, 40:56] / 255
     assert -10 * (found - truth).square().mean().log10() > 42

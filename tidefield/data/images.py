@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -54,11 +54,15 @@ class Photographs:
         alphas: their opacity, None for opaque photographs. Colours are already composited on the background.
         masks: False for pixels that are not to be used, whose colours are those of the nearest used pixels; None for
             photographs without a mask. Empty if no photograph has one.
+        files: where they were read; empty where they come from no files. Without them photographs have no other size.
+        background_rgb: colour on which photographs with alpha are composited, in [0, 1].
     """
 
     colours: tuple[UInt8[Tensor, "_ _ 3"], ...]
     alphas: tuple[UInt8[Tensor, "_ _"] | None, ...] = ()
     masks: tuple[Bool[Tensor, "_ _"] | None, ...] = ()
+    files: tuple[PhotographFile, ...] = ()
+    background_rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         assert len(self.alphas) in (0, len(self.colours)), "one alpha (or None) per photograph"
@@ -69,6 +73,10 @@ class Photographs:
 
     def __getitem__(self, index: int) -> UInt8[Tensor, "H W 3"]:
         return self.colours[index]
+
+    def finest_width(self, index: int) -> int:
+        """Return the width of a photograph's file, or of the photograph where it comes from none."""
+        return self.files[index].lens.width if self.files else self.colours[index].shape[1]
 
     def alpha(self, index: int) -> UInt8[Tensor, "H W"] | None:
         return self.alphas[index] if self.alphas else None
@@ -158,7 +166,7 @@ def open_photographs(
             "this user has no home folder for a cache: photographs are held in memory and decoded again next time; "
             "set XDG_CACHE_HOME to a writable folder"
         )
-        return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
+        return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files, background_rgb)
     store = folder / f"{_key(files, background_rgb)}{SUFFIX}"
     expected = sum(file.bytes for file in files)
     try:
@@ -172,7 +180,7 @@ def open_photographs(
                 for picture in _decoded(files, background_rgb, progress):
                     file.write(picture.data)
         # Copy-on-write: changes to a view do not reach the file.
-        return _views(np.memmap(store, dtype=np.uint8, mode="c"), files)
+        return _views(np.memmap(store, dtype=np.uint8, mode="c"), files, background_rgb)
     except (OSError, RunError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         assert isinstance(cause, OSError), "completed_file tells what failed"
@@ -190,7 +198,7 @@ def open_photographs(
             store.parent,
             cause.strerror,
         )
-    return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files)
+    return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files, background_rgb)
 
 
 def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
@@ -207,7 +215,19 @@ def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, fl
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) -> Photographs:
+def read_at_size(
+    photographs: Photographs, index: int, width: int, height: int
+) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+    """Read a photograph from its file at another size, and its mask if it has one."""
+    file = replace(photographs.files[index], width=width, height=height)
+    with quiet_pillow():
+        one = _views(_decode(file, photographs.background_rgb), [file], photographs.background_rgb)
+    return one[0], one.masks[0] if one.masks else None
+
+
+def _views(
+    store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]
+) -> Photographs:
     """Photographs as views of a store's bytes."""
     colours, alphas, masks, start = [], [], [], 0
     for file in files:
@@ -218,7 +238,8 @@ def _views(store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile]) 
         alphas.append(single.pop(0) if file.has_alpha else None)
         masks.append(single.pop().view(torch.bool) if file.mask is not None else None)
         start += file.bytes
-    return Photographs(tuple(colours), tuple(alphas), tuple(masks) if any(m is not None for m in masks) else ())
+    masks = masks if any(mask is not None for mask in masks) else ()
+    return Photographs(tuple(colours), tuple(alphas), tuple(masks), tuple(files), background_rgb)
 
 
 def _decoded(

@@ -124,13 +124,22 @@ class Cameras:
 
     def resized(self, width: int, height: int) -> Cameras:
         """Scale the images to width x height pixels."""
-        size = self.size_px.new_tensor([width, height]).expand_as(self.size_px)
-        ratio = size / self.size_px
-        return replace(self, focal_px=self.focal_px * ratio, principal_px=self.principal_px * ratio, size_px=size)
+        return self.resized_each(self.size_px.new_tensor([width, height]).expand_as(self.size_px))
+
+    def resized_each(self, size_px: Int[Tensor, "V 2"]) -> Cameras:
+        """Scale each image to a size of its own."""
+        ratio = size_px / self.size_px
+        return replace(self, focal_px=self.focal_px * ratio, principal_px=self.principal_px * ratio, size_px=size_px)
 
     def cropped(self, width: int, height: int) -> Cameras:
         """Crop or extend the images at the right and the bottom."""
         return replace(self, size_px=self.size_px.new_tensor([width, height]).expand_as(self.size_px))
+
+
+def concatenate(cameras: Sequence[Cameras]) -> Cameras:
+    """Join cameras into one set, without their names."""
+    parts = {name: torch.cat([getattr(one, name) for one in cameras]) for name in _TENSORS}
+    return Cameras(**parts, names=())
 
 
 _TENSORS = tuple(f.name for f in fields(Cameras) if f.name != "names")

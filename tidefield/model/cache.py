@@ -1,4 +1,5 @@
-"""Features of the training photographs, encoded block by block when first needed; least recently used blocks go first.
+"""Features of the training photographs at the sizes they are needed in, encoded block by block when first needed; least
+recently used blocks go first.
 
 Alphabet: T tiles, N views.
 """
@@ -7,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
+from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
 
@@ -24,6 +27,15 @@ OVERLAP_PX = 384
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
 BUDGET_BYTES = 1_500_000_000
 """Memory for features."""
+
+
+class Block(NamedTuple):
+    """A part of a photograph at a level of the pyramid: which column and row of blocks."""
+
+    photograph: int
+    level: int
+    column: int
+    row: int
 
 
 class CacheFull(Exception):
@@ -37,39 +49,65 @@ class FeatureCache:
         network: whose encoder is used, on `device`.
         scene: the photographs.
         device: where features are computed and kept.
+        cones: read photographs at the size that a view shows them in, not at the scene's own (`data.pyramid`).
         budget_bytes: memory for features; a few blocks are kept even if they need more.
     """
 
-    def __init__(self, network: Network, scene: Scene, device: torch.device, budget_bytes: int = BUDGET_BYTES) -> None:
-        self.network, self.scene, self.device = network, scene, device
-        self.cameras = scene.cameras.to(device)
-        size = scene.cameras.size_px[list(scene.train)]
-        self._side = tuple(int(x) for x in size.clamp(max=BLOCK_PX).amax(0))
-        blocks = int(_block_counts(size).prod(-1).sum())
+    def __init__(
+        self,
+        network: Network,
+        scene: Scene,
+        device: torch.device,
+        cones: bool = True,
+        budget_bytes: int = BUDGET_BYTES,
+    ) -> None:
+        self.network, self.scene, self.device, self.budget_bytes = network, scene, device, budget_bytes
+        self.pyramid = Pyramid(scene)
+        self._cones = cones
+        self._cameras = self.pyramid.cameras.to(device)
         patch = torch.zeros(1, 3, 32, 32, device=device)
         with torch.no_grad():
-            like = network.encode(patch)
+            self._like = network.encode(patch)
         if scene.photographs.masks:
-            like = like.masked(patch[:, :1], torch.zeros(1, 2, device=device))
+            self._like = self._like.masked(patch[:, :1], torch.zeros(1, 2, device=device))
+        size = scene.cameras.size_px[list(scene.train)]
+        # Twice as many as the scene has at its own size: a moving camera reads some photographs at two.
+        self._blocks = 2 * int(_block_counts(size).prod(-1).sum())
+        self._make_slots(tuple(int(x) for x in size.clamp(max=BLOCK_PX).amax(0)))
+
+    def _make_slots(self, side: tuple[int, ...]) -> None:
+        """Make empty slots for blocks of at most a size."""
+        self._side = side
+        like = self._like
         texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
-        self.slots = max(min(blocks, budget_bytes // texel_bytes), network.config.views + EXTRA_VIEWS)
+        blocks = min(self._blocks, self.budget_bytes // texel_bytes)
+        self.slots = max(blocks, self.network.config.views + EXTRA_VIEWS)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
         used = None if like.used is None else self._empty(like.used)
         self._encoded = Encoded(features, self._empty(like.photographs), like.with_colours, used)
-        self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
+        self._slots: OrderedDict[Block, int] = OrderedDict()
 
-    def views(self, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
-        """Encode the neighbours of tiles around what each tile shows.
+    def views(self, camera: Cameras, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
+        """Encode the neighbours of a camera's tiles around what each tile shows, at the size it shows it in.
 
         Args:
+            camera: of the tiles.
             neighbours: photographs and their blend weights.
             middle_world: the surface in the middle of each tile.
 
         Raises:
             CacheFull: these tiles need more blocks than the cache holds.
         """
-        keys = self._blocks(neighbours.index, middle_world)
+        photographs = neighbours.index
+        levels = torch.zeros_like(photographs)
+        if self._cones:
+            levels = self.pyramid.levels(camera, photographs, middle_world)
+        rows = self.pyramid.row(photographs, levels).reshape(-1)
+        keys = self._blocks_of(photographs.reshape(-1), levels.reshape(-1), rows, middle_world)
         distinct = dict.fromkeys(keys)
+        largest = self.pyramid.cameras.size_px[rows].clamp(max=BLOCK_PX).amax(0).tolist()
+        if any(needed > own for needed, own in zip(largest, self._side, strict=True)):
+            self._make_slots(tuple(max(pair) for pair in zip(largest, self._side, strict=True)))
         if len(distinct) > self.slots:
             raise CacheFull
         for key in distinct:
@@ -78,41 +116,46 @@ class FeatureCache:
         for key in distinct:
             if key not in self._slots:
                 self._encode(key)
-        which = torch.tensor([self._slots[key] for key in keys], device=self.device).reshape(neighbours.index.shape)
-        cameras = self.cameras[neighbours.index.reshape(-1).to(self.device)]
-        return Views(cameras, which, neighbours.blend_weight.to(self.device), self._encoded)
+        which = torch.tensor([self._slots[key] for key in keys], device=self.device).reshape(photographs.shape)
+        blend_weight = neighbours.blend_weight.to(self.device)
+        return Views(self._cameras[rows.to(self.device)], which, blend_weight, self._encoded)
 
-    def _blocks(self, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"]) -> list[tuple[int, int, int]]:
-        """(photograph, column, row) of the block whose middle is nearest to where each view sees the tile's middle."""
-        photographs = neighbours.reshape(-1)
-        cameras = self.scene.cameras[photographs]
-        points = middle_world.repeat_interleave(neighbours.shape[1], 0)
+    def _blocks_of(
+        self,
+        photographs: Int[Tensor, " K"],
+        levels: Int[Tensor, " K"],
+        rows: Int[Tensor, " K"],
+        middle_world: Float[Tensor, "T 3"],
+    ) -> list[Block]:
+        """The block of each view whose middle is nearest to where the view sees the tile's middle."""
+        cameras = self.pyramid.cameras[rows]
+        points = middle_world.repeat_interleave(len(rows) // len(middle_world), 0)
         uv = cameras.project(points[:, None])[0][:, 0]
         last = _block_counts(cameras.size_px) - 1
         free = (cameras.size_px - BLOCK_PX).clamp(min=1)
         index = torch.minimum(((uv - BLOCK_PX / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
-        return [(i, *at) for i, at in zip(photographs.tolist(), index.tolist(), strict=True)]
+        parts = zip(photographs.tolist(), levels.tolist(), index.tolist(), strict=True)
+        return [Block(photograph, level, *at) for photograph, level, at in parts]
 
-    def _encode(self, key: tuple[int, int, int]) -> None:
-        photograph, column, row = key
+    def _encode(self, block: Block) -> None:
         slot = self._slots.popitem(last=False)[1] if len(self._slots) == self.slots else len(self._slots)
-        size = self.scene.cameras.size_px[photograph]
+        colours, mask = self.pyramid.read(block.photograph, block.level)
+        size = torch.tensor([colours.shape[1], colours.shape[0]])
         last = (_block_counts(size) - 1).clamp(min=1)
-        corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([column, row]) / last).floor().long()
-        (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size.long()).tolist()
-        colours = to_common_exposure(self.scene, photograph, slice(top, bottom), slice(left, right)).permute(2, 0, 1)[
-            None
-        ]
-        corner_px = corner[None].to(colours).to(self.device)
-        encoded = self.network.encode(colours.to(self.device), corner_px)
+        corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
+        (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
+        part = colours[top:bottom, left:right].float() / (255 * self.scene.cameras.gain[block.photograph])
+        corner_px = corner[None].to(part).to(self.device)
+        encoded = self.network.encode(part.permute(2, 0, 1)[None].to(self.device), corner_px)
         if self.scene.photographs.masks:
-            used = self.scene.photographs.used(photograph)[None, None, top:bottom, left:right]
-            encoded = encoded.masked(used.to(colours).to(self.device), corner_px)
-        for maps, block in zip(_maps(self._encoded), _maps(encoded), strict=True):
+            used = torch.ones(size.flip(0).tolist(), dtype=torch.bool) if mask is None else mask
+            used = used[None, None, top:bottom, left:right].to(part)
+            encoded = encoded.masked(used.to(self.device), corner_px)
+        for maps, found in zip(_maps(self._encoded), _maps(encoded), strict=True):
             first = slot * self._texels(maps.stride)
-            maps.rows[first : first + len(block.rows)] = block.rows.to(maps.rows.dtype)
-            maps.size[slot], maps.origin_px[slot] = block.size[0], block.origin_px[0]
-        self._slots[key] = slot
+            maps.rows[first : first + len(found.rows)] = found.rows.to(maps.rows.dtype)
+            maps.size[slot], maps.origin_px[slot] = found.size[0], found.origin_px[0]
+        self._slots[block] = slot
 
     def _texels(self, stride: int | float) -> int:
         return math.prod(math.ceil(side / stride) for side in self._side)

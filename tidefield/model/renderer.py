@@ -45,11 +45,14 @@ class Renderer:
         scene: whose training photographs serve as neighbours, except for their own cameras' views.
         config: the run's.
         device: where to compute.
+        cones: read photographs at the size that a view shows them in, not at the scene's own (`data.pyramid`).
     """
 
-    def __init__(self, network: Network, scene: Scene, config: Config, device: torch.device) -> None:
+    def __init__(
+        self, network: Network, scene: Scene, config: Config, device: torch.device, cones: bool = True
+    ) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
-        self.cache = FeatureCache(network, scene, device)
+        self.cache = FeatureCache(network, scene, device, cones)
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, limit // gathered)
@@ -113,7 +116,7 @@ class Renderer:
         middle_world: Float[Tensor, "T 3"],
     ) -> Float[Tensor, "T R 6"]:
         try:
-            views = self.cache.views(neighbours, middle_world)
+            views = self.cache.views(camera, neighbours, middle_world)
         except CacheFull:
             if len(corners) == 1:
                 raise

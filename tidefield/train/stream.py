@@ -247,6 +247,8 @@ class Stream:
             points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))
         photographs = scene.photographs
         if own.channels != (0, 1, 2):
-            photographs = replace(photographs, colours=tuple(c[..., own.channels] for c in photographs.colours))
+            photographs = replace(
+                photographs, colours=tuple(c[..., own.channels] for c in photographs.colours), files=()
+            )
         augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
         return Drawn(augmented, DepthPriors(augmented, scene.points), cameras.to(self.device))

@@ -1,0 +1,78 @@
+"""Photographs at several sizes: which one a view reads, and what it holds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes_on_disk as disk
+import textured_wall as wall
+import torch
+from torch.nn import functional as F
+
+from tidefield.config import SWIFT
+from tidefield.data.load import load_scene
+from tidefield.data.pyramid import FINER, PER_OCTAVE, Pyramid
+from tidefield.model.network import make_network
+from tidefield.model.renderer import Renderer
+
+CPU = torch.device("cpu")
+MIDDLE = torch.tensor([[0.0, 0.0, wall.DEPTH]])
+HALF_STEP = 2 ** (0.5 / PER_OCTAVE)
+
+
+@pytest.mark.parametrize("share", [1 / 8, 1 / 3, 1 / 2, 1.0])
+def test_pixels_that_are_read_are_finer_than_the_cameras_own_by_as_much_as_they_should(share: float):
+    scene = wall.scene(wall.cameras(3, 256, 192))
+    pyramid = Pyramid(scene)
+    camera = scene.cameras[1].resized(round(256 * share), round(192 * share))
+    photographs = torch.tensor([[0, 2]])
+    level = pyramid.levels(camera, photographs, MIDDLE)
+    width = pyramid.cameras.size_px[pyramid.row(photographs, level)][..., 0]
+    expected = min(256, FINER * 256 * share)  # there are no files with more
+    assert ((width / expected > 0.99 / HALF_STEP) & (width / expected < 1.01 * HALF_STEP)).all()
+
+
+def test_a_photograph_from_twice_as_far_is_read_at_twice_the_size():
+    scene = wall.scene(wall.cameras(3, 256, 192))
+    scene.cameras.T_world_camera[2, 2, 3] = -wall.DEPTH
+    camera = scene.cameras[1].resized(64, 48)
+    level = Pyramid(scene).levels(camera, torch.tensor([[0, 2]]), MIDDLE)
+    assert (level[0, 1] - level[0, 0]).item() == PER_OCTAVE
+
+
+def test_finer_levels_are_read_from_the_files_without_distortion(tmp_path: Path):
+    disk.write_colmap(tmp_path, disk.survey(disk.BARREL.resized(128, 96)))
+    scene, whole = load_scene(tmp_path, width=32), load_scene(tmp_path)
+    pyramid = Pyramid(scene)
+    level = 2 * PER_OCTAVE
+    own = pyramid.cameras[pyramid.row(torch.tensor([4]), torch.tensor([level]))]
+    colours, mask = pyramid.read(4, level)
+    assert mask is None
+    assert torch.equal(colours, whole.photographs[4])
+    torch.testing.assert_close(own.focal_px, whole.cameras[4].focal_px)
+    assert torch.equal(pyramid.read(4, 0)[0], scene.photographs[4])
+
+
+def test_coarser_levels_are_means_and_use_only_what_is_used_in_full():
+    scene = wall.with_left_halves_masked(wall.scene(wall.cameras(3, 256, 192)), (1,))
+    colours, mask = Pyramid(scene).read(1, -2 * PER_OCTAVE)
+    means = F.avg_pool2d(scene.photographs[1].permute(2, 0, 1)[None].float(), 4)[0].permute(1, 2, 0)
+    np.testing.assert_allclose(colours.numpy(), means.numpy(), atol=1)
+    assert mask is not None
+    assert torch.equal(mask, (torch.arange(64) >= 32).expand(48, -1))
+
+
+def test_a_much_smaller_view_does_not_alias():
+    cameras = wall.cameras(5, 512, 384, step=0.25)
+    scene = wall.scene(cameras, (2,))
+    torch.manual_seed(0)
+    network = make_network(SWIFT.network).eval()
+    camera = cameras[2].resized(64, 48)
+    noisy = torch.randint(-90, 90, (384, 512, 1), generator=torch.Generator().manual_seed(0))
+    for i in range(5):
+        scene.photographs[i].copy_((scene.photographs[i].int() + noisy.roll(7 * i, 1)).clamp(0, 255).byte())
+    truth = F.avg_pool2d(wall.photograph(cameras[2]).permute(2, 0, 1)[None] / 255, 8)[0].permute(1, 2, 0)
+    errors = [
+        (Renderer(network, scene, SWIFT, CPU, cones)(camera).colour - truth).abs().mean() for cones in (True, False)
+    ]
+    assert errors[0] < 0.5 * errors[1]

@@ -1,0 +1,101 @@
+"""Photographs at several sizes: each is read where its pixels are about as large as those of the rendered picture.
+
+The paper's future work, cones instead of rays: a sample stands for what its pixel's cone covers there, and a pixel of a
+photograph that is as large as that footprint holds its mean. A single reading then neither aliases where a view shows
+more ground than the photographs do, nor blurs where it shows less, as far as the files have the detail. The levels are
+those of mip maps (Williams, Pyramidal parametrics, 1983), half an octave apart.
+
+Alphabet: V photographs, L levels, T tiles, N views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+
+import cv2
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from tidefield.data.images import read_at_size
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras, concatenate
+
+PER_OCTAVE = 2
+"""Levels per factor of 2 in size."""
+FINER = 2**0.5
+"""How much smaller than the footprint the pixels are that are read: interpolation between them blurs, too."""
+COARSEST_PX = 32
+"""Least width of a level."""
+KEPT_BYTES = 800_000_000
+"""Memory for decoded levels; those that were not read for the longest time go first."""
+
+
+class Pyramid:
+    """The photographs of a scene at all levels: 0 is the scene's own size, those above are finer, as far as files go.
+
+    Attributes:
+        first: the coarsest level of any photograph.
+        cameras: of all photographs at the first level, then at the next, and so on.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        width = scene.cameras.size_px[:, 0]
+        finest = torch.tensor([scene.photographs.finest_width(i) for i in range(len(width))])
+        octaves = torch.log2(torch.stack([COARSEST_PX / width, finest / width]).double())
+        coarsest, finest = (PER_OCTAVE * octaves[0]).ceil().clamp(max=0), (PER_OCTAVE * octaves[1] + 1e-3).floor()
+        self._range = torch.stack([coarsest, finest.clamp(min=0)]).long()
+        self.first, last = int(self._range[0].min()), int(self._range[1].max())
+        self.cameras = concatenate([self._cameras(level) for level in range(self.first, last + 1)])
+        self._kept: OrderedDict[tuple[int, int], tuple[Tensor, Tensor | None]] = OrderedDict()
+
+    def _cameras(self, level: int) -> Cameras:
+        """The cameras of all photographs at a level, or at the nearest one that they have."""
+        cameras = self.scene.cameras
+        own = torch.full((len(cameras),), level).clamp(self._range[0], self._range[1])
+        size = (cameras.size_px * 2.0 ** (own[:, None] / PER_OCTAVE)).round().long().clamp(min=1)
+        return cameras.resized_each(torch.where(own[:, None] == 0, cameras.size_px, size))
+
+    def row(self, photographs: Int[Tensor, "*B"], levels: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
+        """Return the indices in `cameras` of photographs at levels."""
+        return (levels - self.first) * len(self.scene.names) + photographs
+
+    def levels(
+        self, camera: Cameras, photographs: Int[Tensor, "T N"], points_world: Float[Tensor, "T 3"]
+    ) -> Int[Tensor, "T N"]:
+        """Choose the levels at which the pixels of photographs at a point are `FINER` than those of a camera."""
+        views = self.scene.cameras[photographs.reshape(-1)]
+        points = points_world.repeat_interleave(photographs.shape[1], 0)
+        depth = views.project(points[:, None])[1][:, 0]
+        own_depth = camera.project(points_world)[1][0].repeat_interleave(photographs.shape[1], 0)
+        finer = camera.focal_px.log2().mean() - own_depth.clamp(min=1e-6).log2()
+        finer = finer - (views.focal_px.log2().mean(1) - depth.clamp(min=1e-6).log2())
+        finer = torch.where((depth > 0) & (own_depth > 0), finer, 0.0)
+        lowest, highest = self._range[:, photographs.reshape(-1)]
+        level = torch.minimum(torch.maximum((PER_OCTAVE * (finer + math.log2(FINER))).round().long(), lowest), highest)
+        return level.reshape(photographs.shape)
+
+    def read(self, photograph: int, level: int) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+        """Read a photograph at a level, and where it is used if it has a mask."""
+        photographs = self.scene.photographs
+        own, mask = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
+        if level == 0:
+            return own, mask
+        key = photograph, level
+        if key not in self._kept:
+            width, height = self.cameras.size_px[self.row(torch.tensor(photograph), torch.tensor(level))].tolist()
+            if level < 0:
+                size = (width, height)
+                colours = torch.from_numpy(cv2.resize(own.numpy(), size, interpolation=cv2.INTER_AREA))
+                if mask is not None:
+                    grey = cv2.resize(255 * mask.byte().numpy(), size, interpolation=cv2.INTER_AREA)
+                    mask = torch.from_numpy(grey == 255)
+                self._kept[key] = colours, mask
+            else:
+                self._kept[key] = read_at_size(photographs, photograph, width, height)
+            while len(self._kept) > 1 and sum(one.nbytes for one, _ in self._kept.values()) > KEPT_BYTES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
