@@ -162,6 +162,20 @@ class Config:
 AnyConfig = Config | NerfConfig | NerfstudioConfig
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """How a pixel's footprint is sampled when a view is rendered; no part of what is learned."""
+
+    cones: bool = True
+    """Read photographs where their pixels are about as large as the footprint (`data.pyramid`), not at the size that
+    the scene was opened at."""
+    rays_per_side: int | None = None
+    """Rays of a pixel, in each direction. None is two where its footprint is much larger than the pixels of the
+    photographs at the scene's size, and one elsewhere."""
+
+
+USUAL_SAMPLING = Sampling()
+
 PAPER = Config(
     preset="paper",
     network=NetworkConfig(

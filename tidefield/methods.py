@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tidefield.config import PRESETS, AnyConfig, Config, NerfConfig, NerfstudioConfig
+from tidefield.config import PRESETS, USUAL_SAMPLING, AnyConfig, Config, NerfConfig, NerfstudioConfig, Sampling
 
 if TYPE_CHECKING:
     import torch
@@ -91,7 +91,9 @@ def make_trainer(
     return SceneTrainer(config, scene, seed, device, weights)
 
 
-def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device) -> tuple[Render, str]:
+def zero_shot(
+    config: Config, weights: Path, scene: Scene, device: torch.device, sampling: Sampling = USUAL_SAMPLING
+) -> tuple[Render, str]:
     """A preset with trained weights on a scene it was not trained on, and the SHA-256 of the weights.
 
     Raises:
@@ -104,25 +106,33 @@ def zero_shot(config: Config, weights: Path, scene: Scene, device: torch.device)
     network = make_network(config.network).to(device)
     read_weights(weights, network)
     network.eval()
-    return Renderer(network, scene, config, device), weights_sha256(weights)
+    return Renderer(network, scene, config, device, sampling), weights_sha256(weights)
 
 
 @contextmanager
-def trained(folder: Path, run: Run, scene: Scene, device: torch.device) -> Iterator[tuple[Render, TrainingProgress]]:
+def trained(
+    folder: Path, run: Run, scene: Scene, device: torch.device, sampling: Sampling = USUAL_SAMPLING
+) -> Iterator[tuple[Render, TrainingProgress]]:
     """The method of a run, while the block lasts, and how far it was trained.
 
     Raises:
         RunError: the run has not been trained, or is damaged.
     """
+    from tidefield.model.renderer import Renderer
+    from tidefield.model.rendering import with_rays
     from tidefield.train.checkpoint import load_network
+    from tidefield.train.loop import SceneTrainer
 
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver
 
         with driver.renderer(folder) as render:
-            yield render, driver.progress_of(folder)
+            yield with_rays(render, sampling.rays_per_side or 1), driver.progress_of(folder)
         return
     trainer = make_trainer(run.config, scene, run.seed, device)
     progress = load_network(folder, trainer.network)
     trainer.network.eval()
-    yield trainer.renderer(), progress
+    if isinstance(trainer, SceneTrainer):
+        yield Renderer(trainer.network, scene, trainer.config, device, sampling), progress
+    else:
+        yield with_rays(trainer.renderer(), sampling.rays_per_side or 1), progress

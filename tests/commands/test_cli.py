@@ -85,6 +85,23 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     assert video.stat().st_size > 0
 
 
+def test_a_run_is_evaluated_at_another_width_than_its_own_and_with_several_rays(
+    scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    psnr = {}
+    for rays in (1, 4):
+        out = tmp_path / str(rays)
+        call("evaluate", run, out, "--width", 32, "--rays-per-pixel", rays, "--device", "cpu", "-q")
+        report = json.loads((out / "evaluation.json").read_text())
+        assert (report["width"], report["configuration"]["trained_width"]) == (32, 64)
+        assert report["configuration"]["sampling"] == {"cones": True, "rays_per_side": rays**0.5}
+        with Image.open(out / "renderings" / "vegetation_0001.png") as picture:
+            assert picture.size == (32, 24)
+        psnr[rays] = report["mean"]["psnr_seen_cc"]
+    assert psnr[4] != psnr[1] > 20
+    assert "--width is given without OUT" in fails(capsys, "evaluate", run, "--width", 32)
+
+
 @pytest.mark.parametrize("source", ["run", "scene"])
 def test_the_view_of_a_training_photograph_is_made_from_the_others_unless_asked(
     source: str, scene: Path, tmp_path: Path, request: pytest.FixtureRequest

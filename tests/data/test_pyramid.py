@@ -9,11 +9,13 @@ import textured_wall as wall
 import torch
 from torch.nn import functional as F
 
-from tidefield.config import SWIFT
-from tidefield.data.load import load_scene
+from tidefield.config import SWIFT, Sampling
+from tidefield.data.load import at_width, load_scene
 from tidefield.data.pyramid import FINER, PER_OCTAVE, Pyramid
+from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import make_network
 from tidefield.model.renderer import Renderer
+from tidefield.model.rendering import Rendering, with_rays
 
 CPU = torch.device("cpu")
 MIDDLE = torch.tensor([[0.0, 0.0, wall.DEPTH]])
@@ -73,6 +75,38 @@ def test_a_much_smaller_view_does_not_alias():
         scene.photographs[i].copy_((scene.photographs[i].int() + noisy.roll(7 * i, 1)).clamp(0, 255).byte())
     truth = F.avg_pool2d(wall.photograph(cameras[2]).permute(2, 0, 1)[None] / 255, 8)[0].permute(1, 2, 0)
     errors = [
-        (Renderer(network, scene, SWIFT, CPU, cones)(camera).colour - truth).abs().mean() for cones in (True, False)
+        (Renderer(network, scene, SWIFT, CPU, Sampling(cones, 1))(camera).colour - truth).abs().mean()
+        for cones in (True, False)
     ]
     assert errors[0] < 0.5 * errors[1]
+
+
+def test_several_rays_give_the_mean_of_their_colours_and_of_their_inverse_depths():
+    def render(camera: Cameras) -> Rendering:
+        values = torch.arange(1.0, camera.width * camera.height + 1).reshape(camera.height, camera.width)
+        return Rendering(values[..., None].expand(-1, -1, 3) / 100, 1 / values, values / 100)
+
+    view = with_rays(render, 2)(wall.cameras(1, 4, 2))
+    assert view.colour.shape == (2, 4, 3)
+    first = torch.tensor([1.0, 2.0, 9.0, 10.0]).mean()
+    torch.testing.assert_close(view.colour[0, 0], first.expand(3) / 100)
+    torch.testing.assert_close((1 / view.depth)[0, 0], first)
+    torch.testing.assert_close(view.opacity[0, 0], first / 100)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(1.0, False), (0.8, False), (0.5, True)])
+def test_views_much_coarser_than_the_photographs_get_several_rays(share: float, expected: bool):
+    scene = wall.scene(wall.cameras(3, 256, 192))
+    assert Pyramid(scene).is_much_coarser(scene.cameras[1].resized(round(256 * share), round(192 * share))) == expected
+
+
+def test_a_scene_at_another_width_is_as_if_opened_at_it(tmp_path: Path):
+    disk.write_colmap(tmp_path, disk.survey(disk.BARREL.resized(128, 96)))
+    found, expected = at_width(load_scene(tmp_path, width=32), 64), load_scene(tmp_path, width=64)
+    assert found.points is not None
+    assert expected.points is not None
+    for name in ("focal_px", "principal_px", "size_px", "T_world_camera"):
+        torch.testing.assert_close(getattr(found.cameras, name), getattr(expected.cameras, name))
+    torch.testing.assert_close(found.points.uv_px, expected.points.uv_px, atol=1e-3, rtol=0)
+    for i in range(9):
+        assert torch.equal(found.photographs[i], expected.photographs[i])

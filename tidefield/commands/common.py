@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 from tyro.extras import literal_type_from_choices
 
-from tidefield.config import PRESETS, config_to_json
+from tidefield.config import PRESETS, USUAL_SAMPLING, Sampling, config_to_json
 from tidefield.errors import RunError
 from tidefield.methods import names
 
@@ -64,6 +65,23 @@ class ZeroShot:
     """Its weights, of `tidefield pretrain`; the installed ones if not given."""
 
 
+@dataclass(frozen=True)
+class Footprint:
+    """How pixels are sampled."""
+
+    rays_per_pixel: Literal[1, 4, 9, 16] | None = None
+    """Rays whose mean a pixel is. If not given, 4 where pixels show much more ground than those of the photographs at
+    the scene's or the run's width, else 1."""
+    no_cones: bool = False
+    """Read photographs at the scene's or the run's width only, instead of where their pixels are about as large as what
+    a pixel of the picture shows; for comparison."""
+
+    @property
+    def sampling(self) -> Sampling:
+        side = None if self.rays_per_pixel is None else math.isqrt(self.rays_per_pixel)
+        return Sampling(cones=not self.no_cones, rays_per_side=side)
+
+
 def load(scene: Path, width: int | None, allow_missing: bool, console: Console) -> Scene:
     """Read a scene, with progress while photographs are decoded."""
     from tidefield.data.load import load_scene
@@ -73,19 +91,25 @@ def load(scene: Path, width: int | None, allow_missing: bool, console: Console) 
         return load_scene(scene, width=width, allow_missing=allow_missing, progress=bar)
 
 
-def open_zero_shot(zero: ZeroShot, scene: Scene, device: torch.device) -> tuple[Render, dict[str, Any]]:
+def open_zero_shot(
+    zero: ZeroShot, scene: Scene, device: torch.device, sampling: Sampling = USUAL_SAMPLING
+) -> tuple[Render, dict[str, Any]]:
     """Trained weights as a method on a scene, and its record."""
     from tidefield.methods import zero_shot
     from tidefield.train.checkpoint import given_or_shipped
 
     config = PRESETS[zero.preset]
-    render, digest = zero_shot(config, given_or_shipped(zero.weights, zero.preset), scene, device)
-    return render, {**config_to_json(config), "weights": digest}
+    render, digest = zero_shot(config, given_or_shipped(zero.weights, zero.preset), scene, device, sampling)
+    return render, {**config_to_json(config), "weights": digest, "sampling": asdict(sampling)}
 
 
 @contextmanager
 def open_trained(
-    folder: Path, device: torch.device, allow_missing: bool, console: Console
+    folder: Path,
+    device: torch.device,
+    allow_missing: bool,
+    console: Console,
+    sampling: Sampling = USUAL_SAMPLING,
 ) -> Iterator[tuple[Scene, Render, dict[str, Any]]]:
     """The scene and the method of a run, while the block lasts, and its record."""
     from tidefield.data.load import is_scene
@@ -99,10 +123,7 @@ def open_trained(
         )
     run = read_run(folder)
     scene = load(run.scene, run.width, allow_missing, console)
-    with trained(folder, run, scene, device) as (render, progress):
-        done = {"steps": progress.step, "seconds": progress.seconds}
-        yield (
-            scene,
-            render,
-            {**config_to_json(run.config), "seed": run.seed, "weights": run.weights, "run": run.id, "trained": done},
-        )
+    with trained(folder, run, scene, device, sampling) as (render, progress):
+        record = {"seed": run.seed, "weights": run.weights, "run": run.id, "trained_width": scene.cameras.width}
+        record["trained"] = {"steps": progress.step, "seconds": progress.seconds}
+        yield scene, render, {**config_to_json(run.config), **record, "sampling": asdict(sampling)}

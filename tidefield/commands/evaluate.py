@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from tidefield.commands.common import (
     AllowMissing,
     Device,
+    Footprint,
     UntrainedMethod,
     Verbosity,
     ZeroShot,
@@ -42,8 +43,10 @@ class Evaluate:
     method: UntrainedMethod | None = None
     """Evaluate this method on a scene instead of a run."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
+    footprint: OmitArgPrefixes[Footprint] = Footprint()
     width: int | None = None
-    """Width of the photographs in pixels, with --method or --zero-shot; a run has its own."""
+    """Width of the photographs in pixels to compare at. With --method and --zero-shot the scene is opened at it; a run
+    renders from its own, and finer or coarser ones where they are better."""
     device: Device = "auto"
     download_lpips: bool = False
     """Download the weights that LPIPS needs (AlexNet 233 MB, VGG 528 MB) if they are missing."""
@@ -55,26 +58,35 @@ class Evaluate:
 
 def evaluate(options: Evaluate, console: Console) -> Evaluation:
     """Run `tidefield evaluate`."""
+    from tidefield.data.load import at_width
     from tidefield.device import choose_device
     from tidefield.evaluation.evaluate import evaluate as evaluate_method
     from tidefield.evaluation.lpips import download_lpips_weights
+    from tidefield.model.rendering import with_rays
 
     if options.download_lpips:
         download_lpips_weights()
     source, out, method, zero_shot = options.source, options.out, options.method, options.zero.zero_shot
+    sampling = options.footprint.sampling
     settings = {"overwrite": options.overwrite, "console": console}
     if method is not None and zero_shot:
         raise RunError("both --method and --zero-shot are given: expected one of them; leave one out")
     if method is None and not zero_shot:
-        if options.width is not None:
-            raise RunError("--width belongs to --method and --zero-shot: a run has its own width; leave it out")
-        with open_trained(source, choose_device(options.device), options.allow_missing, console) as opened:
-            scene, render, record = opened
-            return evaluate_method(render, scene, out or source, configuration=record, **settings)
+        if options.width is not None and out is None:
+            raise RunError(
+                f"--width is given without OUT: expected `tidefield evaluate {source} OUT --width {options.width}`, "
+                "as the run itself keeps the evaluation at its own width; name a folder"
+            )
+        opened = open_trained(source, choose_device(options.device), options.allow_missing, console, sampling)
+        with opened as (scene, render, record):
+            truth = scene if options.width is None else at_width(scene, options.width)
+            return evaluate_method(render, truth, out or source, configuration=record, **settings)
     if out is None:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
     scene = load(source, options.width, options.allow_missing, console)
     if method is not None:
-        return evaluate_method(untrained(method, scene), scene, out, configuration={"method": method}, **settings)
-    render, record = open_zero_shot(options.zero, scene, choose_device(options.device))
+        render = with_rays(untrained(method, scene), sampling.rays_per_side or 1)
+        record = {"method": method, "sampling": asdict(sampling)}
+        return evaluate_method(render, scene, out, configuration=record, **settings)
+    render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
     return evaluate_method(render, scene, out, configuration=record, **settings)

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.commands.common import (
+    AllowMissing,
+    Device,
+    Footprint,
+    Verbosity,
+    ZeroShot,
+    load,
+    open_trained,
+    open_zero_shot,
+)
 from tidefield.errors import RunError, TidefieldError
 from tidefield.files import require_writable
 
@@ -41,6 +50,7 @@ class Render:
     """With --camera, let a training photograph serve as a neighbour of its own view, which then hardly differs from it;
     without, its view is made from the others, as that of a held-out photograph."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
+    footprint: OmitArgPrefixes[Footprint] = Footprint()
     frames: int = 240
     """Frames of the video, 24 a second."""
     width: int | None = None
@@ -69,13 +79,13 @@ def render(options: Render, console: Console) -> None:
     if options.with_itself and camera is None:
         raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
-    device = choose_device(options.device)
+    device, sampling = choose_device(options.device), options.footprint.sampling
     with ExitStack() as stack:
         if options.zero.zero_shot:
             scene = load(options.source, None, options.allow_missing, console)
-            view, _ = open_zero_shot(options.zero, scene, device)
+            view, _ = open_zero_shot(options.zero, scene, device, sampling)
         else:
-            opened = open_trained(options.source, device, options.allow_missing, console)
+            opened = open_trained(options.source, device, options.allow_missing, console, sampling)
             scene, view, _ = stack.enter_context(opened)
         if camera is not None:
             own = scene.cameras[scene.index(camera)]

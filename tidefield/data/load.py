@@ -163,6 +163,32 @@ def load_scene(
     )
 
 
+def at_width(scene: Scene, width: int, progress: Progress | None = None, cache: Path | None = None) -> Scene:
+    """Open a scene's photographs at another width; everything else stays as it is, in other pixels.
+
+    Args:
+        scene: from `load_scene`.
+        width, progress, cache: see `load_scene`.
+    """
+    require_width(width)
+    files = []
+    for file in scene.photographs.files:
+        own = min(width, file.lens.width)
+        files.append(replace(file, width=own, height=max(1, round(file.lens.height * own / file.lens.width))))
+    size = torch.tensor([(file.width, file.height) for file in files])
+    ratio, points = size / scene.cameras.size_px, scene.points
+    if points is not None:
+        scale = ratio[points.camera_index.long()]
+        error = points.error_px * ratio.mean()
+        points = replace(points, uv_px=points.uv_px * scale.to(points.uv_px), error_px=error.to(points.error_px))
+    return replace(
+        scene,
+        cameras=scene.cameras.resized_each(size),
+        photographs=open_photographs(files, scene.photographs.background_rgb, progress, cache),
+        points=points,
+    )
+
+
 def require_width(width: int | None) -> None:
     """Raises: SceneError when photographs of a width in pixels are too small."""
     if width is not None and width < _SMALLEST_WIDTH:

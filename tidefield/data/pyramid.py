@@ -65,17 +65,39 @@ class Pyramid:
     def levels(
         self, camera: Cameras, photographs: Int[Tensor, "T N"], points_world: Float[Tensor, "T 3"]
     ) -> Int[Tensor, "T N"]:
-        """Choose the levels at which the pixels of photographs at a point are `FINER` than those of a camera."""
+        """Choose the levels at which photographs have pixels about as large at a point as those of a camera.
+
+        Below the scene's own size they are `FINER`: there photographs have what is needed without decoding.
+        """
+        octaves = self._octaves_finer(camera, photographs, points_world)
+        level = (PER_OCTAVE * octaves).round()
+        level = torch.maximum(level, (PER_OCTAVE * (octaves + math.log2(FINER))).round().clamp(max=0)).long()
+        lowest, highest = self._range[:, photographs.reshape(-1)].unflatten(1, photographs.shape)
+        return torch.minimum(torch.maximum(level, lowest), highest)
+
+    def is_much_coarser(self, camera: Cameras) -> bool:
+        """Whether most of a camera's pixels are more than `FINER` larger than those of the training photographs.
+
+        The ground is taken to be halfway between near and far, in inverse depth.
+        """
+        views = self.scene.cameras[list(self.scene.train)]
+
+        def pixels_per_unit(cameras: Cameras) -> Tensor:
+            return cameras.focal_px.log2().mean(1) + (1 / cameras.near_far).mean(1).log2()
+
+        return bool(pixels_per_unit(camera)[0] < pixels_per_unit(views).median() - math.log2(FINER))
+
+    def _octaves_finer(
+        self, camera: Cameras, photographs: Int[Tensor, "T N"], points_world: Float[Tensor, "T 3"]
+    ) -> Float[Tensor, "T N"]:
+        """How much smaller the footprints of a camera's pixels are than those of photographs, in powers of 2."""
         views = self.scene.cameras[photographs.reshape(-1)]
         points = points_world.repeat_interleave(photographs.shape[1], 0)
         depth = views.project(points[:, None])[1][:, 0]
         own_depth = camera.project(points_world)[1][0].repeat_interleave(photographs.shape[1], 0)
         finer = camera.focal_px.log2().mean() - own_depth.clamp(min=1e-6).log2()
         finer = finer - (views.focal_px.log2().mean(1) - depth.clamp(min=1e-6).log2())
-        finer = torch.where((depth > 0) & (own_depth > 0), finer, 0.0)
-        lowest, highest = self._range[:, photographs.reshape(-1)]
-        level = torch.minimum(torch.maximum((PER_OCTAVE * (finer + math.log2(FINER))).round().long(), lowest), highest)
-        return level.reshape(photographs.shape)
+        return torch.where((depth > 0) & (own_depth > 0), finer, 0.0).reshape(photographs.shape)
 
     def read(self, photograph: int, level: int) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
         """Read a photograph at a level, and where it is used if it has a mask."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tidefield.config import Config
+from tidefield.config import USUAL_SAMPLING, Config, Sampling
 from tidefield.data.depth_prior import surface_prior, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
@@ -21,7 +21,7 @@ from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.cache import CacheFull, FeatureCache
 from tidefield.model.network import Network
-from tidefield.model.rendering import Rendering, fill_unseen
+from tidefield.model.rendering import Rendering, fill_unseen, with_rays
 from tidefield.model.sampling import Tiles
 from tidefield.model.views import Views
 from tidefield.parallel import in_parallel
@@ -45,14 +45,20 @@ class Renderer:
         scene: whose training photographs serve as neighbours, except for their own cameras' views.
         config: the run's.
         device: where to compute.
-        cones: read photographs at the size that a view shows them in, not at the scene's own (`data.pyramid`).
+        sampling: of a pixel's footprint.
     """
 
     def __init__(
-        self, network: Network, scene: Scene, config: Config, device: torch.device, cones: bool = True
+        self,
+        network: Network,
+        scene: Scene,
+        config: Config,
+        device: torch.device,
+        sampling: Sampling = USUAL_SAMPLING,
     ) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
-        self.cache = FeatureCache(network, scene, device, cones)
+        self.cache = FeatureCache(network, scene, device, sampling.cones)
+        self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         self.tiles_at_once = max(1, limit // gathered)
@@ -63,9 +69,13 @@ class Renderer:
         lines = slice(None, None, BEHIND_STEP)
         self.mean_colours = {i: to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few}
 
-    @torch.inference_mode()
     def __call__(self, camera: Cameras) -> Rendering:
         """Render the view of one camera, at its own gain, from its sources (`Scene.sources`)."""
+        side = self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
+        return with_rays(self._render, side)(camera)
+
+    @torch.inference_mode()
+    def _render(self, camera: Cameras) -> Rendering:
         scene = self.scene
         sources = scene.sources(camera)
         if not sources:

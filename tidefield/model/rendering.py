@@ -56,3 +56,15 @@ def fill_unseen(colour: Float[Tensor, "H W 3"], seen: Bool[Tensor, "H W"]) -> Fl
 
 Render = Callable[[Cameras], Rendering]
 """A method: takes one camera (a `Cameras` of length 1) and returns its view in full size."""
+
+
+def with_rays(render: Render, side: int) -> Render:
+    """Render with side x side rays per pixel: the mean colour and opacity, and the depth of the mean inverse depth."""
+
+    def render_larger(camera: Cameras) -> Rendering:
+        view = render(camera.resized(side * camera.width, side * camera.height))
+        colour = F.avg_pool2d(view.colour.permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
+        inverse_depth, opacity = F.avg_pool2d(torch.stack([1 / view.depth, view.opacity])[None], side)[0]
+        return Rendering(colour=colour, depth=1 / inverse_depth, opacity=opacity)
+
+    return render if side == 1 else render_larger
