@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,8 +85,9 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
     scene = load(source, options.width, options.allow_missing, console)
     if method is not None:
-        render = with_rays(untrained(method, scene), sampling.rays_per_side or 1)
-        record = {"method": method, "sampling": asdict(sampling)}
+        side = sampling.rays_per_side or 1
+        record = {"method": method, **({"rays_per_side": side} if side > 1 else {})}
+        render = with_rays(untrained(method, scene), side)
         return evaluate_method(render, scene, out, configuration=record, **settings)
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
     return evaluate_method(render, scene, out, configuration=record, **settings)
