@@ -101,6 +101,15 @@ def test_what_is_nearer_covers_what_is_farther():
     assert behind.opacity.max() == 0
 
 
+def test_light_is_followed_until_hardly_any_is_left(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "AT_ONCE", 1)
+    splats = gaussians([[0.0, 0.0, 4.0 + k] for k in range(12)], 12 * [1e5], 12 * [0.6], 12 * [[1.0, 1.0, 1.0]])
+    opacity = render_splats(splats, camera(), BLACK, CPU).opacity
+    # The eleventh would leave too little.
+    assert 0.4**10 > 1e-4 > 0.4**11
+    torch.testing.assert_close(opacity, torch.full_like(opacity, 1 - 0.4**10), atol=1e-6, rtol=0)
+
+
 def test_the_colour_changes_with_the_direction_in_the_world_as_the_harmonics_say():
     """Kerbl's basis of degree 1: -C1 y, C1 z, -C1 x."""
     harmonics = torch.zeros(1, 3, 4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -29,7 +30,7 @@ def read_ply(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, 
     return (xyz[finite], None if rgb is None else rgb[finite]) if finite.any() else None
 
 
-def read_vertices(path: Path) -> np.ndarray:
+def read_vertices(path: Path) -> Any:
     """Read the element `vertex` as a structured array, inside `opened`, which bounds the size and names the file."""
     from plyfile import PlyData, PlyParseError
 
