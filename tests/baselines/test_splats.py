@@ -13,7 +13,7 @@ from torch import Tensor
 from tidefield.baselines import splats as module
 from tidefield.baselines.splats import Splats, read_splats, render_splats
 from tidefield.errors import SceneError
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
 
 CPU, BLACK = torch.device("cpu"), (0.0, 0.0, 0.0)
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -198,3 +198,17 @@ def test_enormous_and_tiny_gaussians_give_finite_pictures():
     assert view.colour.isfinite().all()
     assert view.depth.isfinite().all()
     assert view.opacity[0, 0] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_long_and_thin_gaussians_are_thin_in_the_picture():
+    """Lines through the middle, as long as they may be, are as wide as the dilation makes them."""
+    for turned in torch.arange(0.1, 1.5, 0.1):
+        c, s = math.cos(turned), math.sin(turned)
+        axes = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) * torch.tensor([4e14, 1e-3, 1e-3])
+        splats = Splats(torch.tensor([[0.0, 0, 5]]), axes[None], torch.tensor([0.9]), torch.zeros(1, 3, 1))
+        own = camera()
+        view = render_splats(splats, own, BLACK, CPU)
+        off = (pixel_grid(own.width, own.height) - own.principal_px) @ torch.tensor([-s, c])
+        expected = 0.9 * torch.exp(-0.5 * off**2 / (0.3 + (48 * 1e-3 / 5) ** 2))
+        expected = torch.where(expected < 1 / 255, 0.0, expected).reshape(own.height, own.width)
+        torch.testing.assert_close(view.opacity, expected, atol=5e-3, rtol=0)

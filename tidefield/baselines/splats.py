@@ -163,10 +163,7 @@ def render_splats(
 
 
 def _project(splats: Splats, camera: Cameras, device: torch.device) -> _Projected:
-    """Project Gaussians into the picture (Kerbl et al., eq. 5).
-
-    In float64, because the inverse of a long and thin covariance is a difference of nearly equal numbers.
-    """
+    """Project Gaussians into the picture (Kerbl et al., eq. 5), in float64: squares of sizes exceed float32."""
     camera = camera.to("cpu")
     pose, focal = camera.T_world_camera[0].double(), camera.focal_px[0].double()
     xyz = (splats.mean_world.double() - pose[:, 3]) @ pose[:, :3]
@@ -179,10 +176,11 @@ def _project(splats: Splats, camera: Cameras, device: torch.device) -> _Projecte
     slope = (xyz[:, :2] / z).clamp(-most, most)
     axes = pose[:, :3].T @ splats.axes_world[kept].double()
     spread_px = (focal / z)[..., None] * (axes[:, :2] - slope[..., None] * axes[:, 2:])
-    covariance = spread_px @ spread_px.mT + DILATION_PX2 * torch.eye(2, dtype=torch.float64)
-    variance = covariance.diagonal(dim1=1, dim2=2)
-    across = covariance[:, 0, 1]
-    determinant = variance.prod(1) - across.square()
+    variance = spread_px.square().sum(2) + DILATION_PX2
+    across = spread_px.prod(1).sum(1)
+    # |a|^2 |b|^2 - (a b)^2 = |a x b|^2: the difference would be lost to rounding where a Gaussian is long and thin.
+    area = torch.linalg.cross(spread_px[:, 0], spread_px[:, 1]).square().sum(1)
+    determinant = area + DILATION_PX2 * (variance.sum(1) - DILATION_PX2)
     conic = torch.stack([variance[:, 1], -across, variance[:, 0]], dim=-1) / determinant[:, None]
     reach = (2 * (opacity.double() / LEAST_ALPHA).log()[:, None] * variance).sqrt()
     uv = focal * xyz[:, :2] / z + camera.principal_px[0]
@@ -202,7 +200,7 @@ def _blend(tile: _Projected, uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 5"
         part = tile[slice(start, start + AT_ONCE)]
         x, y = (uv_px - part.uv_px[:, None]).unbind(-1)
         a, b, c = part.conic[:, :, None].unbind(1)
-        exponent = 0.5 * (a * x * x + c * y * y) + b * x * y
+        exponent = (0.5 * (a * x * x + c * y * y) + b * x * y).clamp(min=0)  # below by rounding
         alpha = (part.opacity[:, None] * torch.exp(-exponent)).clamp(max=MOST_ALPHA)
         alpha = torch.where(alpha < LEAST_ALPHA, 0.0, alpha)
         after = light * (1 - alpha).cumprod(0)
