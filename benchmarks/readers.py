@@ -180,6 +180,21 @@ def _nerfstudio_job(folder: Path) -> None:
     torch.tensor(_read_job(folder)[1])
 
 
+def _opensplat(folder: Path) -> None:
+    import torch
+
+    from tidefield.baselines.opensplat import progress_of, renderer
+    from tidefield.geometry.cameras import Cameras
+
+    progress_of(folder)
+    pose, size = torch.eye(3, 4)[None], torch.tensor([[16, 16]])
+    view = renderer(folder, torch.device("cpu"))(
+        Cameras(pose, 16.0 * torch.ones(1, 2), size / 2, size, torch.tensor([[1.0, 9.0]]), torch.ones(1, 3))
+    )
+    assert view.colour.isfinite().all()
+    assert view.depth.isfinite().all()
+
+
 def _demonstration(folder: Path) -> None:
     from tidefield.commands.demo import Made
 
@@ -258,6 +273,7 @@ READERS = (
     Reader("evaluation.json, replaced", "comparison", ("runs/flat/tidefield/evaluation.json",), _evaluation),
     Reader("validation.json", "small", ("validation.json",), _validation),
     Reader("job.json of nerfstudio", "small", ("job.json",), _nerfstudio_job),
+    Reader("job.json and splats of OpenSplat", "small", ("opensplat/job.json", "opensplat/splat.ply"), _opensplat),
     Reader("demonstration.json", "small", ("demonstration.json",), _demonstration),
     Reader("nerfstudio's camera path", "path", ("*.json",), _camera_path),
 )
@@ -451,8 +467,22 @@ def _make_runs(folder: Path, scene: Path) -> None:
     (small / "validation.json").write_text(json.dumps([{"step": 500, "seconds": 9.5, "psnr": {"flat": 20.5}}]))
     job = {"method": "nerfacto", "out": "x", "steps": 5, "factor": [1.0, 1.0, 1.0], "trained": [5, 1.5]}
     (small / "job.json").write_text(json.dumps(job))
+    (small / "opensplat").mkdir()
+    (small / "opensplat" / "job.json").write_text(json.dumps({"factor": [1.0, 1.0, 1.0], "trained": [5, 1.5]}))
+    _make_splats(small / "opensplat" / "splat.ply")
     made = {"files": ["scene/a", "view.mp4"], "unfinished": True}
     (small / "demonstration.json").write_text(json.dumps(made))
+
+
+def _make_splats(path: Path) -> None:
+    from plyfile import PlyData, PlyElement
+
+    prefixes = {"f_dc_": 3, "f_rest_": 9, "opacity": 1, "scale_": 3, "rot_": 4}
+    names = [*"xyz", *(f"{p}{k}" if p.endswith("_") else p for p, count in prefixes.items() for k in range(count))]
+    vertex = np.random.default_rng(0).normal(size=(20, len(names))).astype(np.float32)
+    vertex[:, 2] += 5
+    table = np.rec.fromarrays(vertex.T, dtype=[(name, "<f4") for name in names])
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(path)
 
 
 def _make_comparison(folder: Path, scene: Path) -> None:

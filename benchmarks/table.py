@@ -21,6 +21,7 @@ from tidefield.compare.tables import (
     lpips_weights,
     missing_metrics,
     nerfacto_limits,
+    opensplat_limits,
     paper_table,
     quality_tables,
     shown,
@@ -164,7 +165,8 @@ def notes(results: Results) -> list[str]:
     paper = [result for (_, method), result in results.by.items() if method == "paper"]
     from_random = paper and all(result.evaluation["configuration"].get("weights") is None for result in paper)
     random_start = "The column `paper` was trained from random weights, not from the shipped ones."
-    return [*nerfacto_limits(results), *([random_start] if from_random else []), *(["\n".join(marks)] if marks else [])]
+    limits = [*nerfacto_limits(results), *opensplat_limits(results)]
+    return [*limits, *([random_start] if from_random else []), *(["\n".join(marks)] if marks else [])]
 
 
 def marked(scene: str) -> str:

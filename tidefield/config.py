@@ -150,6 +150,15 @@ class NerfstudioConfig:
 
 
 @dataclass(frozen=True)
+class OpensplatConfig:
+    """OpenSplat, a baseline, with its defaults."""
+
+    version: str
+    """Of the program."""
+    method: Literal["opensplat"] = "opensplat"
+
+
+@dataclass(frozen=True)
 class Config:
     """All that a run needs to be repeated, besides its scene and its seed."""
 
@@ -159,7 +168,7 @@ class Config:
     method: Literal["tidefield"] = "tidefield"
 
 
-AnyConfig = Config | NerfConfig | NerfstudioConfig
+AnyConfig = Config | NerfConfig | NerfstudioConfig | OpensplatConfig
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tidefield.config import PRESETS, USUAL_SAMPLING, AnyConfig, Config, NerfConfig, NerfstudioConfig, Sampling
+from tidefield.config import (
+    PRESETS,
+    USUAL_SAMPLING,
+    AnyConfig,
+    Config,
+    NerfConfig,
+    NerfstudioConfig,
+    OpensplatConfig,
+    Sampling,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
     from tidefield.train.checkpoint import Run, TrainingProgress
     from tidefield.train.loop import Trainer
 
-Kind = Literal["preset", "zero-shot", "nerf", "nerfstudio", "untrained"]
+Kind = Literal["preset", "zero-shot", "nerf", "nerfstudio", "opensplat", "untrained"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Method:
 
     Attributes:
         kind: a preset of ours trained on the scene, one with trained weights as they are, classical NeRF, a method of
-            nerfstudio, or a baseline that needs no training.
+            nerfstudio, OpenSplat, or a baseline that needs no training.
         preset: of ours; None for the others.
     """
 
@@ -47,6 +56,7 @@ METHODS = {
     "nerf": Method("nerf"),
     "nerfacto": Method("nerfstudio"),
     "splatfacto": Method("nerfstudio"),
+    "opensplat": Method("opensplat"),
     "plane-sweep": Method("untrained"),
     "sparse-depth": Method("untrained"),
     "nearest": Method("untrained"),
@@ -58,8 +68,12 @@ def names(*kinds: Kind) -> tuple[str, ...]:
     return tuple(name for name, method in METHODS.items() if not kinds or method.kind in kinds)
 
 
-def configuration(name: str, preset: str = "swift") -> AnyConfig:
-    """What a run of a trained method stores; `preset` is what "tidefield" stands for."""
+def configuration(name: str, preset: str = "swift", program: Path | None = None) -> AnyConfig:
+    """What a run of a trained method stores; `preset` is what "tidefield" stands for, `program` is OpenSplat.
+
+    Raises:
+        RunError: the method is OpenSplat, which is not there.
+    """
     method = METHODS[name]
     if method.kind == "nerf":
         return NerfConfig()
@@ -67,6 +81,10 @@ def configuration(name: str, preset: str = "swift") -> AnyConfig:
         from tidefield.baselines.nerfstudio.environment import VERSION
 
         return NerfstudioConfig(name, VERSION)  # type: ignore[arg-type]
+    if method.kind == "opensplat":
+        from tidefield.baselines import opensplat
+
+        return OpensplatConfig(opensplat.version(opensplat.find(program)))
     assert method.kind == "preset", f"{name} is not trained"
     return PRESETS[preset if name == "tidefield" else name]
 
@@ -128,6 +146,12 @@ def trained(
 
         with driver.renderer(folder) as render:
             yield with_rays(render, sampling.rays_per_side or 1), driver.progress_of(folder)
+        return
+    if isinstance(run.config, OpensplatConfig):
+        from tidefield.baselines import opensplat
+
+        render = with_rays(opensplat.renderer(folder, device), sampling.rays_per_side or 1)
+        yield render, opensplat.progress_of(folder)
         return
     trainer = make_trainer(run.config, scene, run.seed, device)
     progress = load_network(folder, trainer.network)

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import opensplat_program
 import pytest
 import textured_wall as wall
 import torch
@@ -203,3 +204,18 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert {name for name in os.listdir(tmp_path / "out") if name.startswith(".")} == set()
     assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
+
+
+def test_opensplat_does_not_continue_and_is_replaced_with_all_that_it_left(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run, program = tmp_path / "run", opensplat_program.install(tmp_path)
+    start(scene, run, method="opensplat", opensplat=program)
+    with pytest.raises(RunError, match="opensplat cannot continue where it stopped: train it again, with --overwrite"):
+        start(scene, run, resume=True)
+    (run / "opensplat" / "words").unlink()
+    start(scene, run, overwrite=True)
+    assert not (run / "opensplat").exists()
+    with pytest.raises(RunError, match="none is no program"):
+        start(scene, tmp_path / "other", method="opensplat", opensplat=tmp_path / "none")
+    assert not (tmp_path / "other").exists(), "before a folder is made"

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import opensplat_program
 import pytest
 import textured_wall as wall
 from comparisons import SETTINGS, Children, quiet
@@ -21,13 +22,14 @@ from tidefield.commands.compare import Compare, make_settings
 from tidefield.commands.compare import compare as compare_command
 from tidefield.compare.figures import most_different, side_by_side
 from tidefield.compare.results import figures_of, read_figures, read_results
-from tidefield.compare.run import MIPNERF360, Settings, commands, compare, mipnerf360, named, tidal_flats
+from tidefield.compare.run import MIPNERF360, Settings, Usage, commands, compare, mipnerf360, named, tidal_flats
 from tidefield.compare.tables import (
     TABLE_2,
     TABLE_3,
     Table,
     cost_table,
     nerfacto_limits,
+    opensplat_limits,
     paper_table,
     quality_tables,
     write_comparison,
@@ -179,6 +181,49 @@ def test_the_limits_of_nerfacto_are_stated_where_it_ran_on_a_cpu(disk: Path, tmp
     assert nerfacto_limits(read_results(out, ["flats"], ["nearest"])) == []
 
 
+def test_the_limits_of_opensplat_are_stated(disk: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    compare({"flats": disk}, ("opensplat", "nearest"), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
+    (sentence,) = opensplat_limits(read_results(out, ["flats"], ["opensplat", "nearest"]))
+    assert "7 to 7 steps, 0.0% to 0.0% of its default of 30,000" in sentence
+    assert "the first 3,000 with photographs of a quarter of their size" in sentence
+    assert opensplat_limits(read_results(out, ["flats"], ["nearest"])) == []
+
+
+def test_opensplat_is_compared_with_the_program_that_is_named(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def run_here(command: list[str], environment: dict[str, str]) -> Usage:
+        with monkeypatch.context() as context:
+            for name, value in environment.items():
+                context.setenv(name, value)
+            context.setattr(sys, "argv", ["tidefield", *command[3:]])
+            cli.main()
+        return Usage(1.0, 1)
+
+    monkeypatch.setattr("tidefield.compare.run.run_measured", run_here)
+    out = tmp_path / "out"
+    options = Compare(
+        (disk,),
+        methods=("opensplat", "nearest"),
+        budget=Budget(steps=2),
+        width=48,
+        out=out,
+        device="cpu",
+        opensplat=opensplat_program.install(tmp_path),
+    )
+    compare_command(options, Console(quiet=True))
+    page = (out / "tables.md").read_text()
+    assert "| scene | opensplat | nearest |" in page
+    assert "| flats, opensplat | 0.0 | 2 |" in page
+    assert "Within the budget OpenSplat made 2 to 2 steps" in page
+    run = json.loads((out / "runs" / "flats" / "opensplat" / "run.json").read_text())
+    assert run["config"] == {"version": "1.1.4 (git commit 1234567)", "method": "opensplat"}
+    assert str(tmp_path) not in (out / "comparison.json").read_text()
+    process = (out / "runs" / "flats" / "opensplat" / "process.json").read_text()
+    assert "tidefield train SCENE RUN --method opensplat --steps 2" in process
+
+
 def test_a_table_in_every_form():
     table = Table("A & B", ["scene", "x_1"], [["a_b", "1%"], ["c, d", "-"]], frozenset({(0, 1)}))
     assert table.markdown().splitlines() == [
@@ -293,10 +338,12 @@ def test_missing_software_is_reported_before_anything_is_trained(
     disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("tidefield.compare.run.run_measured", lambda *_: pytest.fail("something was run"))
     for method, message in (
         ("nerfacto", "run `tidefield baselines install nerfacto`"),
         ("splatfacto", "expected CUDA"),
+        ("opensplat", "expected OpenSplat, which is not part of Tidefield"),
     ):
         options = Compare((disk,), methods=("tidefield", method), out=tmp_path / "out", device="cpu")
         with pytest.raises(RunError, match=message):

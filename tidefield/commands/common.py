@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 Preset = Literal["swift", "paper"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
+OpensplatProgram = Annotated[
+    Path | None,
+    arg(help="OpenSplat; if not given, the program that $TIDEFIELD_OPENSPLAT names, or opensplat of PATH."),
+]
 Downscale = Annotated[
     tuple[int, ...],
     arg(
@@ -38,7 +42,7 @@ Downscale = Annotated[
 if TYPE_CHECKING:
     TrainedMethod = UntrainedMethod = AnyMethod = str
 else:
-    TrainedMethod = literal_type_from_choices(["tidefield", *names("nerf", "nerfstudio")])
+    TrainedMethod = literal_type_from_choices(["tidefield", *names("nerf", "nerfstudio", "opensplat")])
     UntrainedMethod = literal_type_from_choices(names("untrained"))
     AnyMethod = literal_type_from_choices(names())
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AnyMethod, Device, Verbosity
+from tidefield.commands.common import AnyMethod, Device, OpensplatProgram, Verbosity
 from tidefield.config import Budget, checked_seed
 from tidefield.errors import RunError
 from tidefield.files import require_writable
@@ -37,8 +38,8 @@ class Compare:
     set."""
     methods: tuple[AnyMethod, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
     """Which, in the order of the tables. tidefield and paper are our presets, zero-shot and paper-zero-shot the same
-    without training on the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; the others need no
-    training."""
+    without training on the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; opensplat is the
+    program that you have installed; the others need no training."""
     budget: OmitArgPrefixes[Budget] = Budget()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
@@ -50,11 +51,13 @@ class Compare:
     """Folder for the runs, tables and figures."""
     device: Device = "auto"
     seed: int = 0
+    opensplat: OpensplatProgram = None
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 def compare(options: Compare, console: Console) -> None:
     """Run `tidefield compare`."""
+    from tidefield.baselines import opensplat
     from tidefield.baselines.nerfstudio import driver
     from tidefield.compare.tables import write_comparison
     from tidefield.device import choose_device
@@ -62,14 +65,19 @@ def compare(options: Compare, console: Console) -> None:
 
     if not options.methods:
         raise RunError("nothing to compare: expected methods; name some, or leave --methods out")
+    environment = {}
     for method in options.methods:  # before anything is trained
         if method in ("nerfacto", "splatfacto"):
             driver.require(method, choose_device(options.device))
         elif METHODS[method].kind == "zero-shot":
             given_or_shipped(None, str(METHODS[method].preset))
+        elif method == "opensplat":
+            program = opensplat.find(options.opensplat)
+            opensplat.version(program)
+            environment[opensplat.VARIABLE] = str(program)
     scenes = _scenes(options)
     settings = make_settings(options.budget, options.width, options.device, options.seed, options.from_scratch)
-    results = run_all(scenes, options.methods, settings, options.out, console)
+    results = run_all(scenes, options.methods, settings, options.out, console, environment)
     print_lines(console, write_comparison(results, scenes, settings, options.out))
 
 
@@ -87,9 +95,18 @@ def make_settings(
 
 
 def run_all(
-    scenes: Mapping[str, Path], methods: Sequence[str], settings: Settings, out: Path, console: Console
+    scenes: Mapping[str, Path],
+    methods: Sequence[str],
+    settings: Settings,
+    out: Path,
+    console: Console,
+    variables: Mapping[str, str] = MappingProxyType({}),
 ) -> Results:
-    """Train and evaluate what has not been done yet, and read all results."""
+    """Train and evaluate what has not been done yet, and read all results.
+
+    Args:
+        variables: additional ones of the environment of all processes.
+    """
     from tidefield.compare.results import read_results
     from tidefield.compare.run import PROCESS_FILE, check_scene, compare, run_measured
 
@@ -101,7 +118,7 @@ def run_all(
     quiet = ["--quiet"] if console.quiet else []
 
     def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
-        return run_measured([*command, *quiet], environment)
+        return run_measured([*command, *quiet], {**variables, **environment})
 
     compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]))
     return read_results(out, list(scenes), methods)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import Budget, Config, NerfstudioConfig, checked_seed, vary, warm_start
+from tidefield.commands.common import AllowMissing, Device, OpensplatProgram, Preset, TrainedMethod, Verbosity, load
+from tidefield.config import Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary, warm_start
 from tidefield.errors import RunError, SceneError
 from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
@@ -42,8 +42,8 @@ class Train:
     variant: str | None = None
     """Change one part of the preset, as `tidefield ablate` does."""
     method: TrainedMethod = "tidefield"
-    """Train another method instead: classical NeRF, or nerfstudio's nerfacto or splatfacto, which `tidefield baselines
-    install nerfacto` installs."""
+    """Train another method instead: classical NeRF; nerfstudio's nerfacto or splatfacto, which `tidefield baselines
+    install nerfacto` installs; or OpenSplat, which you install."""
     budget: OmitArgPrefixes[Budget] = Budget()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
@@ -58,6 +58,7 @@ class Train:
     """Continue the run in the folder; one that has saved nothing yet starts again."""
     overwrite: bool = False
     """Replace the run in the folder."""
+    opensplat: OpensplatProgram = None
     curve: bool = False
     """Render two held-out views at a quarter of their size from time to time, for a curve of quality against time; the
     time for it does not count."""
@@ -93,7 +94,7 @@ def _train(options: Train, console: Console) -> None:
             raise RunError(
                 f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
             )
-        if isinstance(run.config, NerfstudioConfig):
+        if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
         weights = _resumed_weights(options, run)
     else:
@@ -106,7 +107,8 @@ def _train(options: Train, console: Console) -> None:
     curve = make_curve(scene) if options.curve else None
     start = f", starting from {weights}" if weights else ""
     log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
-    if isinstance(run.config, NerfstudioConfig):
+    if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+        from tidefield.baselines import opensplat
         from tidefield.baselines.nerfstudio import driver
 
         _start(folder, run, scene)
@@ -115,7 +117,11 @@ def _train(options: Train, console: Console) -> None:
             def show(step: int, seconds: float) -> None:
                 bar(budget.share(step, seconds), 1, f"step {step}  {step / max(seconds, 1e-9):.2f} steps/s")
 
-            progress = driver.train(run.config.method, scene, folder, budget, run.seed, device, curve, show)
+            if isinstance(run.config, NerfstudioConfig):
+                progress = driver.train(run.config.method, scene, folder, budget, run.seed, device, curve, show)
+            else:
+                program = opensplat.find(options.opensplat)
+                progress = opensplat.train(program, scene, folder, budget, device, curve, show)
         stopped = None
     else:
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
@@ -139,14 +145,16 @@ def report_end(progress: TrainingProgress, stopped: int | None, folder: Path, co
 
 def _start(folder: Path, run: Run, scene: Scene) -> None:
     """Write run.json, after what an earlier run in the folder has left is deleted: it is not of this run."""
-    from tidefield.baselines.nerfstudio.driver import delete_training
+    from tidefield.baselines import opensplat
+    from tidefield.baselines.nerfstudio import driver
     from tidefield.evaluation.curves import CURVE_FILE
     from tidefield.evaluation.evaluate import delete_evaluation
     from tidefield.train.checkpoint import CHECKPOINT_FILE, write_run
 
     events = folder.glob("tensorboard/events.out.tfevents.*")
     delete_files(folder, [folder / CHECKPOINT_FILE, folder / CURVE_FILE, *events])
-    delete_training(folder)
+    driver.delete_training(folder)
+    opensplat.delete_training(folder)
     delete_evaluation(folder, scene.names)
     write_run(folder, run)
 
@@ -176,7 +184,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
-    weights, config = options.weights, configuration(options.method, options.preset)
+    weights, config = options.weights, configuration(options.method, options.preset, options.opensplat)
     if options.variant is not None:
         if not isinstance(config, Config):
             raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")

@@ -46,6 +46,8 @@ TABLE_3 = {
 NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
 """Nerfacto's default number of steps and of rays a batch in nerfstudio 1.1.5, and the rays a batch that it gets on CPUs
 (`baselines/nerfstudio/worker.py`)."""
+OPENSPLAT_STEPS, OPENSPLAT_SCHEDULE = 30_000, 3_000
+"""OpenSplat's default number of steps, and after how many it doubles the photographs' size, from a quarter on."""
 _ESCAPES = str.maketrans({"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
 
 
@@ -204,18 +206,38 @@ def cost_table(results: Results) -> Table:
 
 def nerfacto_limits(results: Results) -> list[str]:
     """How Nerfacto was run, as a sentence, where it has results: on CPUs it is far from its defaults."""
-    found = [result for (_, method), result in results.by.items() if method == "nerfacto"]
-    steps = [count for result in found if (count := result.trained("steps"))]
-    devices = {result.process.get("settings", {}).get("device") for result in found}
+    steps, devices = _steps_and_devices(results, "nerfacto")
     if not steps or devices != {"cpu"}:
         return []
-    least, most = min(steps) / NERFACTO_STEPS, max(steps) / NERFACTO_STEPS
     return [
         f"Nerfacto ran on CPUs, with {NERFACTO_CPU_RAYS:,} rays a batch instead of its default of {NERFACTO_RAYS:,}; "
-        f"within the budget it made {min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default "
-        f"of {NERFACTO_STEPS:,}. Its figures are those of a method at the start of its training, and they are "
-        "no evidence about Nerfacto trained to its end on a GPU."
+        f"within the budget it made {_share_of_default(steps, NERFACTO_STEPS)}. Its figures are those of a method at "
+        "the start of its training, and they are no evidence about Nerfacto trained to its end on a GPU."
     ]
+
+
+def opensplat_limits(results: Results) -> list[str]:
+    """How OpenSplat was run, as a sentence, where it has results."""
+    steps, _ = _steps_and_devices(results, "opensplat")
+    if not steps:
+        return []
+    return [
+        f"Within the budget OpenSplat made {_share_of_default(steps, OPENSPLAT_STEPS)}; by default, it makes the first "
+        f"{OPENSPLAT_SCHEDULE:,} with photographs of a quarter of their size, and as many more with half of it. It "
+        "reads no masks. Its views are rendered by Tidefield, whose speed is not that of OpenSplat."
+    ]
+
+
+def _steps_and_devices(results: Results, method: str) -> tuple[list[int | float], set[str | None]]:
+    """Of all results of a method."""
+    found = [result for (_, name), result in results.by.items() if name == method]
+    steps = [count for result in found if (count := result.trained("steps"))]
+    return steps, {result.process.get("settings", {}).get("device") for result in found}
+
+
+def _share_of_default(steps: list[int | float], default: int) -> str:
+    least, most = min(steps) / default, max(steps) / default
+    return f"{min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default of {default:,}"
 
 
 def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
@@ -267,6 +289,7 @@ def write_tables(
         f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
         f"{machine['torch']}; {made['date']}.",
         *nerfacto_limits(results),
+        *opensplat_limits(results),
         *remarks,
         *lpips_weights(results),
         *missing_metrics(results),

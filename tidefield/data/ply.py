@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -20,18 +21,23 @@ def read_ply(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, 
     Raises:
         SceneError: the file is damaged, or has no element `vertex` with x, y, z.
     """
-    from plyfile import PlyData, PlyParseError
-
     with opened(path, "a complete PLY file of points; export it again", _MEGABYTES):
-        try:
-            vertex = PlyData.read(path)["vertex"].data
-        except PlyParseError as error:
-            raise ValueError(str(error)) from error
+        vertex = read_vertices(path)
         xyz = np.stack([vertex[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         coloured = all(c in vertex.dtype.names and vertex.dtype[c] == np.uint8 for c in _COLOURS)
         rgb = np.stack([vertex[c] for c in _COLOURS], axis=-1) if coloured else None
     finite = in_range(xyz).all(axis=1)
     return (xyz[finite], None if rgb is None else rgb[finite]) if finite.any() else None
+
+
+def read_vertices(path: Path) -> Any:
+    """Read the element `vertex` as a structured array, inside `opened`, which bounds the size and names the file."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        return PlyData.read(path)["vertex"].data
+    except PlyParseError as error:
+        raise ValueError(str(error)) from error
 
 
 def write_ply(path: Path, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], overwrite: bool) -> None:

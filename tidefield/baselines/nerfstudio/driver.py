@@ -16,9 +16,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 
+from tidefield.baselines.export import at_common_exposure, exposure_factor, point_colours
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget, Range, from_json
 from tidefield.data.images import write_mask
@@ -241,10 +242,9 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras, files = scene.cameras, [f"images/{index:05d}.png" for index in range(len(scene.names))]
-    factor = cameras.gain.amin(0).clamp(max=1.0) if scene.background_rgb is None else torch.ones(3)
+    factor = exposure_factor(scene, range(len(files)))
     for index, file in enumerate(files):
-        colour = scene.photographs[index].float() / cameras.gain[index] * factor
-        Image.fromarray(colour.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+        Image.fromarray(at_common_exposure(scene, index, factor)).save(folder / file)
     masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
     for index, mask in enumerate(masks):
         write_mask(folder / mask, scene.photographs.used(index).numpy())
@@ -258,7 +258,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         cameras.T_world_camera[:, :3].double().numpy(),
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
-        _point_colours(scene),
+        point_colours(scene),
         masks=masks,
         overwrite=True,
     )
@@ -269,18 +269,3 @@ def camera_to_json(camera: Cameras) -> dict[str, Any]:
     """Describe one camera for the worker."""
     names = ("T_world_camera", "focal_px", "principal_px", "size_px")
     return {name: getattr(camera, name)[0].tolist() for name in names}
-
-
-def _point_colours(scene: Scene) -> UInt8[np.ndarray, "P 3"]:
-    """Sample each sparse point's colour in the first training photograph that shows it; grey where none does."""
-    points = scene.points
-    if points is None:
-        return np.zeros((0, 3), dtype=np.uint8)
-    rgb = np.full((len(points.xyz_world), 3), 128, dtype=np.uint8)
-    for index in reversed(scene.train):
-        mine = points.camera_index == index
-        photograph = scene.photographs[index]
-        u, v = points.uv_px[mine].floor().long().unbind(-1)
-        inside = (u >= 0) & (v >= 0) & (u < photograph.shape[1]) & (v < photograph.shape[0])
-        rgb[points.point_index[mine][inside].numpy()] = photograph[v[inside], u[inside]].numpy()
-    return rgb

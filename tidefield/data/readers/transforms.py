@@ -227,6 +227,7 @@ def write_transforms_file(
     *,
     masks: Sequence[str] = (),
     header: dict[str, Any] | None = None,
+    per_frame: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Write `transforms.json` and, if there are points, `sparse_pc.ply`.
@@ -244,13 +245,14 @@ def write_transforms_file(
         masks: of each photograph, relative to the folder; empty if no photograph has one. nerfstudio reads masks of all
             photographs or of none.
         header: further entries at the top.
+        per_frame: write the calibration for each photograph even where all share it.
         overwrite: replace existing files.
 
     Raises:
         RunError: a file exists already, or cannot be written.
     """
     calibrations = [_calibration(lens) for lens in lenses]
-    is_shared = len(set(lenses)) == 1
+    is_shared = len(set(lenses)) == 1 and not per_frame
     train, test = ([files[i] for i in part] for part in split)
     model = _FISHEYE if all(isinstance(lens, FisheyeLens) for lens in lenses) else "OPENCV"
     top: dict[str, Any] = {"camera_model": model, **(calibrations[0] if is_shared else {}), **(header or {})}
