@@ -1,4 +1,4 @@
-"""`python -m benchmarks speed | frames | memory | surveys | kills | fuzz | table | robustness | card`, or else speed.
+"""`python -m benchmarks NAME`, as `python -m benchmarks --help` lists them; without a name, speed.
 
 torch and the rest are imported inside the commands.
 """
@@ -213,6 +213,35 @@ def fuzz(
         raise RunError(f"there are findings: expected none; their files and tracebacks are in {kept}")
 
 
+def scales(
+    sources: tyro.conf.Positional[tuple[Path, ...]],
+    runs: Path = MEASURED,
+    widths: tuple[int, ...] = (100, 200, 400, 800, 1600),
+    width: int = 400,
+    device: str = "auto",
+    out: Path = Path("docs/scales.md"),
+) -> None:
+    """Quality and time at several widths: read at points, by cones, and with several rays (hours); write the page.
+
+    Args:
+        sources: Runs, or scenes for the trained weights.
+        runs: Store the figures in this folder's scales.json, after each; a repeated command continues.
+        widths: Of the pictures in pixels.
+        width: That scenes are opened at; a run has its own.
+        device: auto, cpu, cuda, cuda:N or mps.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.scales import measure_scales, write_page
+    from tidefield.compare.run import run_measured, tidefield
+
+    def run(words: list[str]) -> None:
+        run_measured(tidefield(*words), {})
+
+    measure_scales(sources, runs, widths, width, device, run, partial(print, flush=True))
+    write_page(runs, out)
+    print(out)
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -265,7 +294,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, table, robustness, card, surveys, kills, fuzz)
+    functions = (speed, frames, memory, scales, table, robustness, card, surveys, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

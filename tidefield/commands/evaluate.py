@@ -47,6 +47,8 @@ class Evaluate:
     width: int | None = None
     """Width of the photographs in pixels to compare at. With --method and --zero-shot the scene is opened at it; a run
     renders from its own, and finer or coarser ones where they are better."""
+    opened_width: int | None = None
+    """With --zero-shot: width that the scene is opened at, as a run is trained at one, if another than --width."""
     device: Device = "auto"
     download_lpips: bool = False
     """Download the weights that LPIPS needs (AlexNet 233 MB, VGG 528 MB) if they are missing."""
@@ -83,11 +85,14 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
             return evaluate_method(render, truth, out or source, configuration=record, **settings)
     if out is None:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
-    scene = load(source, options.width, options.allow_missing, console)
+    if options.opened_width is not None and not zero_shot:
+        raise RunError("--opened-width belongs to --zero-shot: others have one width; leave it out")
+    scene = load(source, options.opened_width or options.width, options.allow_missing, console)
     if method is not None:
         side = sampling.rays_per_side or 1
         record = {"method": method, **({"rays_per_side": side} if side > 1 else {})}
         render = with_rays(untrained(method, scene), side)
         return evaluate_method(render, scene, out, configuration=record, **settings)
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
-    return evaluate_method(render, scene, out, configuration=record, **settings)
+    truth = scene if options.opened_width is None or options.width is None else at_width(scene, options.width)
+    return evaluate_method(render, truth, out, configuration=record, **settings)
