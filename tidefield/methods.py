@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tidefield.config import PRESETS, AnyConfig, Config, NerfConfig, NerfstudioConfig
+from tidefield.config import PRESETS, AnyConfig, Config, NerfConfig, NerfstudioConfig, vary
 
 if TYPE_CHECKING:
     import torch
@@ -33,16 +33,19 @@ class Method:
         kind: a preset of ours trained on the scene, one with trained weights as they are, classical NeRF, a method of
             nerfstudio, or a baseline that needs no training.
         preset: of ours; None for the others.
+        variant: of the preset; None for the preset itself.
     """
 
     kind: Kind
     preset: str | None = None
+    variant: str | None = None
 
 
 METHODS = {
     "tidefield": Method("preset", "swift"),
     "zero-shot": Method("zero-shot", "swift"),
     "paper": Method("preset", "paper"),
+    "paper-seen": Method("preset", "paper", "neighbours-seen"),
     "paper-zero-shot": Method("zero-shot", "paper"),
     "nerf": Method("nerf"),
     "nerfacto": Method("nerfstudio"),
@@ -68,7 +71,8 @@ def configuration(name: str, preset: str = "swift") -> AnyConfig:
 
         return NerfstudioConfig(name, VERSION)  # type: ignore[arg-type]
     assert method.kind == "preset", f"{name} is not trained"
-    return PRESETS[preset if name == "tidefield" else name]
+    config = PRESETS[preset if name == "tidefield" else str(method.preset)]
+    return config if method.variant is None else vary(config, method.variant)
 
 
 def untrained(name: str, scene: Scene) -> Render:

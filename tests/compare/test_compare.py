@@ -32,12 +32,12 @@ from tidefield.compare.tables import (
     quality_tables,
     write_comparison,
 )
-from tidefield.config import Budget
+from tidefield.config import PAPER, Budget
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import write_json
-from tidefield.methods import METHODS
+from tidefield.methods import METHODS, configuration
 
 
 @pytest.fixture
@@ -72,6 +72,12 @@ def test_zero_shot_uses_the_weights_of_its_preset() -> None:
         asked = commands(Path("data"), Path("run"), method, SETTINGS)
         assert list(asked) == ["evaluate"]
         assert asked["evaluate"][3:6] == ["--zero-shot", "--preset", preset]
+
+
+def test_the_papers_network_can_choose_neighbours_by_what_they_see() -> None:
+    plain, seen = (commands(Path("S"), Path("F"), name, SETTINGS)["train"] for name in ("paper", "paper-seen"))
+    assert seen == [*plain[:5], "--variant", "neighbours-seen", *plain[5:]]
+    assert configuration("paper-seen") == replace(PAPER, train=replace(PAPER.train, neighbours="seen"))
 
 
 def test_an_interrupted_training_is_repeated_and_a_finished_one_is_not(disk: Path, tmp_path: Path):
