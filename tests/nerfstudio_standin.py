@@ -99,7 +99,7 @@ class Trainer:
         for step in range(self.config.max_num_iterations):
             for callback in self.callbacks:
                 callback(step)
-        self.save_checkpoint(step)
+        self.save_checkpoint(self.config.max_num_iterations - 1)
 
     def eval(self) -> None:
         self.is_evaluating = True
