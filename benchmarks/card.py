@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.table import SCENES, marked, notes
+from benchmarks.table import SCENES, marks_of, notes
 from tidefield.compare.results import Results, read_figures
-from tidefield.compare.tables import Table, lpips_weights, shown
+from tidefield.compare.tables import Table, lpips_weights, marked, shown
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import write_text
@@ -77,6 +77,7 @@ def card(weights: Path, results: Results) -> str:
     points = recorded["validation"]
     kinds = list(points[0]["psnr"]) if points else []
     curve = [(f"{point['step']:,}", *(f"{point['psnr'][kind]:.2f}" for kind in kinds)) for point in points]
+    marks = marks_of(results, recorded["real"])
     parts = [
         f"# Weights of the preset {preset}",
         f"`{weights.name}`, {weights.stat().st_size / 1e6:.2f} MB, half precision, "
@@ -103,8 +104,8 @@ def card(weights: Path, results: Results) -> str:
         Table("", ["step", *kinds], curve).markdown(),
         "## What they achieve",
         "Zero-shot, means over the held-out photographs; `docs/results.md` says how the others were trained.",
-        *notes(results),
-        *(table.markdown() for table in _quality(results)),
+        *notes(results, marks),
+        *(marked(table, marks).markdown() for table in _quality(results)),
         *lpips_weights(results),
         "## Licence",
         "Apache-2.0, as Tidefield itself.",
@@ -119,6 +120,6 @@ def _quality(results: Results) -> list[Table]:
     for name, metric in METRICS.items():
         rows = [[scene, *(results.metric(scene, method, name) for method in results.methods)] for scene in scenes]
         if any(value is not None for row in rows for value in row[1:]):
-            cells = [[marked(str(row[0])), *(shown(value, metric.style) for value in row[1:])] for row in rows]
+            cells = [[str(row[0]), *(shown(value, metric.style) for value in row[1:])] for row in rows]
             tables.append(Table(metric.title, ["scene", *results.methods], cells))
     return tables

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,21 @@ from tidefield.compare.tables import (
     NOTHING,
     REGIONS,
     TABLE_3,
+    Mark,
     Table,
     cost_table,
+    learned_from,
+    legend,
     lpips_weights,
+    marked,
     missing_metrics,
     nerfacto_limits,
     opensplat_limits,
     paper_table,
     quality_tables,
+    scene_marks,
     shown,
+    trainings,
 )
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
@@ -35,38 +41,16 @@ from tidefield.methods import names
 SPEED_FILE = "speed.json"
 SHOWN_REGIONS = ("", "_seen_cc")
 """Of `REGIONS`, those on the page; docs/measured has all."""
-LEARNED_FROM = ("turin_lot", "brighton_beach")
-"""Scenes whose training photographs the shipped weights learned from."""
-CHOSE_RECIPE = ("caliterra", "swindale", "fern")
-"""Scenes on which the recipe of the weights was chosen."""
 SCENES = (*TABLE_3, "caliterra", "swindale", "turin_lot", "brighton_beach", "fern", "lego")
 """In the order of the tables."""
-MARKS = (
-    (
-        TABLE_3,
-        "¹",
-        "a category of the synthetic generator; the shipped weights learned from other scenes of the same generator.",
-    ),
-    (
-        CHOSE_RECIPE,
-        "²",
-        "nothing was learned from this scene, but results on it chose the recipe of the weights: it is validation, not "
-        "test.",
-    ),
-    (
-        LEARNED_FROM,
-        "³",
-        "the shipped weights learned from this scene's training photographs: its zero-shot figures are not those of an "
-        "unseen scene, and training on it adds to what was learned before.",
-    ),
-    (
-        ("lego",),
-        "⁴",
-        "its photographs have an alpha channel, which Tidefield uses (visual hull, known background) and Nerfacto is "
-        "not given: any lead of Tidefield over Nerfacto here rests on that.",
-    ),
+WITHOUT_ALPHA = Mark(
+    "⁴",
+    ("lego",),
+    "the shipped weights and their recipe do not know it. Its photographs have an alpha channel, which Tidefield uses "
+    "(visual hull, known background) and which Nerfacto was not given when this was measured: any lead of Tidefield "
+    "over Nerfacto here rests on that.",
 )
-"""Scenes, their mark in the tables, and what it means."""
+"""Of figures without a protocol, which are older than alpha in what nerfstudio gets."""
 NO_LPIPS = (
     "There is no LPIPS column: earlier figures were made with backbone files other than the published ones; the column "
     "comes back when the measurements are repeated after `tidefield evaluate --download-lpips`, which fetches the "
@@ -106,7 +90,8 @@ def write_page(
 def page(compared: Results, ablated: Results, others: Sequence[Results], stored: Stored) -> str:
     """The whole page: results first, circumstances and commands last."""
     records = _records(compared, ablated, others, stored)
-    lengths = _marked_rows(length_tables(by_length(compared, others)))
+    marks = scene_marks(learned_from())
+    lengths = [marked(table, marks) for table in length_tables(by_length(compared, others))]
     parts = [
         "# Results",
         "## Quality",
@@ -139,6 +124,7 @@ def _quality(compared: Results) -> list[str]:
         return []
     methods = tuple(method for method in compared.methods if any(m == method for _, m in compared.by))
     results = Results(compared.scenes, methods, compared.by)
+    marks = marks_of(results, learned_from())
     tables = quality_tables(results, {suffix: REGIONS[suffix] for suffix in SHOWN_REGIONS})
     papers = paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic")
     measured = any(
@@ -147,36 +133,26 @@ def _quality(compared: Results) -> list[str]:
     return [
         "Means over the held-out photographs. Every method had the same photographs, split, resolution, machine and "
         "minutes of training; bold is the best.",
-        *notes(results),
-        *(table.markdown() for table in _marked_rows(tables)),
+        *notes(results, marks),
+        *(marked(table, marks).markdown() for table in tables),
         *([papers.markdown()] if papers else []),
         *(lpips_weights(results) if measured else [NO_LPIPS]),
         *missing_metrics(results),
     ]
 
 
-def notes(results: Results) -> list[str]:
+def marks_of(results: Results, learned: Collection[str]) -> tuple[Mark, ...]:
+    """The marks of scenes next to weights that learned from some of them."""
+    nerfacto = [result for (scene, method), result in results.by.items() if method == "nerfacto" and scene == "lego"]
+    older = any("protocol" not in result.evaluation for result in nerfacto)
+    return (*scene_marks(learned), *([WITHOUT_ALPHA] if older else []))
+
+
+def notes(results: Results, marks: Sequence[Mark]) -> list[str]:
     """What a reader must know of some methods and scenes, as sentences."""
-    marks = [
-        f"- {mark} {', '.join(found)}: {meaning}"
-        for scenes, mark, meaning in MARKS
-        if (found := [scene for scene in results.scenes if scene in scenes])
-    ]
-    paper = [result for (_, method), result in results.by.items() if method == "paper"]
-    from_random = paper and all(result.evaluation["configuration"].get("weights") is None for result in paper)
-    random_start = "The column `paper` was trained from random weights, not from the shipped ones."
+    trained = "\n".join(f"- {line}" for line in trainings(results))
     limits = [*nerfacto_limits(results), *opensplat_limits(results)]
-    return [*limits, *([random_start] if from_random else []), *(["\n".join(marks)] if marks else [])]
-
-
-def marked(scene: str) -> str:
-    """A scene's name with its mark."""
-    return " ".join([scene, *(mark for scenes, mark, _ in MARKS if scene in scenes)])
-
-
-def _marked_rows(tables: Sequence[Table]) -> list[Table]:
-    """Tables whose scenes carry their marks."""
-    return [replace(table, rows=[[marked(row[0]), *row[1:]] for row in table.rows]) for table in tables]
+    return [*limits, *([trained] if trained else []), *legend(results.scenes, marks)]
 
 
 ByLength = Mapping[str, Mapping[str, Result]]

@@ -290,6 +290,11 @@ def _without(config: Config, part: Part) -> Config:
     return _network(config, without=(*config.network.without, part))
 
 
+def _neighbours(config: Config, strategy: Literal["seen", "direction"]) -> Config:
+    """Another choice of the neighbouring views, of the same network."""
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, neighbours=strategy))
+
+
 def _samples(config: Config, share: float) -> Config:
     """Another number of samples along the ray, as a share of the preset's, in all passes."""
     passes = (dataclasses.replace(one, samples=max(2, round(share * one.samples))) for one in config.network.passes)
@@ -303,6 +308,8 @@ VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     "no-target-colour": partial(_without, part="target colour"),
     **{f"degree-{degree}": partial(_network, harmonics_degree=degree) for degree in (0, 1, 2, 3, 4)},
     **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
+    "neighbours-seen": partial(_neighbours, strategy="seen"),
+    "neighbours-direction": partial(_neighbours, strategy="direction"),
     "samples-half": partial(_samples, share=0.5),
     "samples-double": partial(_samples, share=2.0),
 }

@@ -21,6 +21,7 @@ from tidefield.config import (
     NerfstudioConfig,
     OpensplatConfig,
     Sampling,
+    vary,
 )
 
 if TYPE_CHECKING:
@@ -42,16 +43,19 @@ class Method:
         kind: a preset of ours trained on the scene, one with trained weights as they are, classical NeRF, a method of
             nerfstudio, OpenSplat, or a baseline that needs no training.
         preset: of ours; None for the others.
+        variant: of the preset; None for the preset itself.
     """
 
     kind: Kind
     preset: str | None = None
+    variant: str | None = None
 
 
 METHODS = {
     "tidefield": Method("preset", "swift"),
     "zero-shot": Method("zero-shot", "swift"),
     "paper": Method("preset", "paper"),
+    "paper-seen": Method("preset", "paper", "neighbours-seen"),
     "paper-zero-shot": Method("zero-shot", "paper"),
     "nerf": Method("nerf"),
     "nerfacto": Method("nerfstudio"),
@@ -86,7 +90,8 @@ def configuration(name: str, preset: str = "swift", program: Path | None = None)
 
         return OpensplatConfig(opensplat.version(opensplat.find(program)))
     assert method.kind == "preset", f"{name} is not trained"
-    return PRESETS[preset if name == "tidefield" else name]
+    config = PRESETS[preset if name == "tidefield" else str(method.preset)]
+    return config if method.variant is None else vary(config, method.variant)
 
 
 def untrained(name: str, scene: Scene) -> Render:

@@ -9,19 +9,25 @@ from pickle import UnpicklingError
 from subprocess import CompletedProcess
 from types import SimpleNamespace
 
+import nerfstudio_standin
 import numpy as np
 import pytest
 import textured_wall as wall
 import torch
+from PIL import Image
 from rich.console import Console
 from torch.torch_version import TorchVersion
 
 from tidefield.baselines.nerfstudio import driver, environment, worker
 from tidefield.config import Budget
+from tidefield.data.hull import Hull
+from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import make_curve
+from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.model.rendering import Rendering
 
 CPU = torch.device("cpu")
 FAKE = """
@@ -73,7 +79,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_exported_scene_is_the_same_scene(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    factor = driver.export(scene, tmp_path / "data")
+    factor = driver.export(scene, tmp_path / "data").factor
     again = load_scene(tmp_path / "data")
     assert (again.train, again.test) == (scene.train, scene.test)
     shift = again.origin_world.float()
@@ -109,6 +115,99 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
             torch.testing.assert_close(view.colour, grey.expand(36, 48, 3))
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert driver.progress_of(run).step == 3
+
+
+@pytest.fixture
+def standin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """nerfstudio's own worker, in a process where nerfstudio is its stand-in."""
+    script = tmp_path / "worker.py"
+    folder = Path(nerfstudio_standin.__file__).parent
+    script.write_text(
+        f"import runpy, sys\nsys.path.insert(0, {str(folder)!r})\n"
+        f"sys.argv.insert(1, {worker.__file__!r})\n"
+        f"runpy.run_path({nerfstudio_standin.__file__!r}, run_name='__main__')\n"
+    )
+    monkeypatch.setattr(driver, "WORKER", script)
+    monkeypatch.setattr(driver, "python", lambda: Path(sys.executable))
+
+
+def looks_like(rendering: Rendering, truth: torch.Tensor, camera: Cameras) -> None:
+    """Whether the middle of a view, which all others show, is that of the photograph, at its exposure and depth."""
+    inner = np.s_[8:-8, 16:-16]
+    difference = (rendering.colour - truth.float() / 255)[inner]
+    assert difference.mean((0, 1)).abs().max() < 0.01, "the colours are not those of this exposure"
+    assert difference.square().mean() < 0.003, "it is not this view"
+    torch.testing.assert_close(rendering.depth, wall.true_depth(camera), atol=0.01, rtol=0)
+
+
+def test_what_nerfstudio_has_learned_comes_back_as_the_view_of_the_camera(tmp_path: Path, standin: None):
+    cameras = wall.with_gains(wall.cameras(5, 96, 72))
+    cameras = replace(cameras, focal_px=torch.tensor([[96.0, 80.0]] * 5), principal_px=torch.tensor([[45.0, 38.0]] * 5))
+    scene = wall.scene(cameras, test=(2,))
+    assert driver.export(scene, tmp_path / "data").factor.max() < 0.95, "a scene whose factor matters"
+    driver.train("nerfacto", scene, tmp_path, Budget(steps=2), 0, CPU, None, lambda step, seconds: None)
+    with driver.renderer(tmp_path) as render:
+        view = render(scene.cameras[2])
+    looks_like(view, scene.photographs[2], scene.cameras[2])
+    assert view.opacity.min() == 1
+
+
+def with_alpha(scene: Scene) -> Scene:
+    """The same wall, more and more transparent to the right, before white."""
+    colours, alphas = [], []
+    for index, colour in enumerate(scene.photographs.colours):
+        camera = scene.cameras[index]
+        x = camera.position_world[0, 0] + wall.DEPTH * camera.directions_world(pixel_grid(96, 72)[None])[0, :, 0]
+        alpha = (0.5 - 0.5 * x).clamp(0, 1).reshape(72, 96)
+        colours.append((alpha[..., None] * colour + (1 - alpha[..., None]) * 255).round().to(torch.uint8))
+        alphas.append((255 * alpha).round().to(torch.uint8))
+    hull = Hull(torch.tensor([-4.0, -3.0, 4.0]), torch.full((3,), 0.5), torch.ones(16, 16, 16, dtype=torch.bool))
+    photographs = Photographs(tuple(colours), tuple(alphas))
+    return replace(scene, photographs=photographs, background_rgb=(1.0, 1.0, 1.0), hull=hull)
+
+
+@pytest.fixture
+def transparent() -> Scene:
+    return with_alpha(wall.scene(wall.with_gains(wall.cameras(5, 96, 72)), test=(2,)))
+
+
+def test_photographs_with_alpha_are_exported_with_it_and_composited_give_the_same(transparent: Scene, tmp_path: Path):
+    factor = driver.export(transparent, tmp_path).factor
+    for index in range(5):
+        with Image.open(tmp_path / "images" / f"{index:05d}.png") as picture:
+            assert picture.mode == "RGBA"
+            pixels = torch.from_numpy(np.array(picture)).float() / 255
+        colour, alpha = pixels.split([3, 1], dim=-1)
+        gain = transparent.cameras.gain[index]
+        shown = colour / factor * gain * alpha + (1 - alpha)
+        difference = (shown - transparent.photographs[index].float() / 255).abs()
+        assert difference.max() < 2.5 / 255
+        opaque = wall.photograph(transparent.cameras[index])[alpha[..., 0] > 0.2].float() / 255
+        assert ((colour / factor * gain)[alpha[..., 0] > 0.2] - opaque).abs().max() < 8 / 255, "it was multiplied"
+        assert not colour[alpha[..., 0] == 0].any()
+
+
+def test_the_background_of_a_scene_with_alpha_comes_back_without_gain(
+    transparent: Scene, tmp_path: Path, standin: None
+):
+    driver.train("nerfacto", transparent, tmp_path, Budget(steps=2), 0, CPU, None, lambda step, seconds: None)
+    with driver.renderer(tmp_path) as render:
+        view = render(transparent.cameras[2])
+    looks_like(view, transparent.photographs[2], transparent.cameras[2])
+    alpha = transparent.photographs.alpha(2)
+    assert alpha is not None
+    assert (view.opacity - alpha / 255)[8:-8, 16:-16].abs().max() < 0.03
+    assert view.colour[alpha == 0].min() == 1
+
+
+def test_rays_and_box_hold_the_object_of_a_scene_with_alpha(transparent: Scene):
+    limits = driver.object_limits(transparent)
+    assert limits is not None
+    near, far = limits["near_far"]
+    assert near == 3.0
+    assert far == pytest.approx(10 * (1 + 0.5**2 + 0.375**2) ** 0.5), "the ray through a corner is longer than deep"
+    assert limits["half_side"] == 12.0
+    assert driver.object_limits(replace(transparent, hull=None)) is None
 
 
 def test_an_error_of_nerfstudio_is_reported(scene: Scene, tmp_path: Path, fake: None):
@@ -301,6 +400,23 @@ def test_the_configuration_differs_from_the_defaults_only_where_it_must(device: 
     assert config.machine.device_type == device.split(":")[0]
     expected = ("torch", 2048, 1024) if device == "cpu" else ("tcnn", 32768, 4096)
     assert (model.implementation, model.eval_num_rays_per_chunk, data.train_num_rays_per_batch) == expected
+
+
+def test_scenes_of_an_object_get_nerfstudios_settings_for_blender_scenes():
+    config = nerfstudio_standin.defaults()
+    job = {"method": "nerfacto", "data": "d", "out": "o", "steps": None, "seed": 3, "device": "cpu"}
+    job |= {"background": None, "object": None}
+    worker.configure(config, job, tiny_cuda_nn=False)
+    model, before = config.pipeline.model, nerfstudio_standin.defaults().pipeline.model
+    own = ("near_plane", "far_plane", "background_color", "proposal_initial_sampler", "distortion_loss_mult")
+    own = (*own, "disable_scene_contraction")
+    assert [getattr(model, name) for name in own] == [getattr(before, name) for name in own]
+    assert worker.parser_options(job) == {"data": Path("d"), "downscale_factor": 1}
+    job |= {"background": [1, 1, 1], "object": {"near_far": [2.0, 6.0], "half_side": 1.5}}
+    worker.configure(config, job, tiny_cuda_nn=False)
+    assert [getattr(model, name) for name in own] == [2.0, 6.0, "white", "uniform", 0.0, True]
+    kept = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False, "scene_scale": 1.5}
+    assert worker.parser_options(job) == {"data": Path("d"), "downscale_factor": 1} | kept
 
 
 @pytest.mark.slow

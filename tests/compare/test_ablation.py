@@ -28,6 +28,9 @@ def test_a_variant_is_a_network_that_a_run_can_store(name: str, preset):
     if name == "no-neighbours":
         assert isinstance(varied, NerfConfig), "without neighbouring views what is left is classical NeRF"
         return
+    if name.startswith("neighbours"):
+        assert varied == replace(preset, train=replace(preset.train, neighbours=name.removeprefix("neighbours-")))
+        return
     assert varied.train == preset.train
     small = replace(varied.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), instance_norm=False))
     assert sum(p.numel() for p in make_network(small).parameters()) > 0

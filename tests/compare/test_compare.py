@@ -11,7 +11,7 @@ import numpy as np
 import opensplat_program
 import pytest
 import textured_wall as wall
-from comparisons import SETTINGS, Children, quiet
+from comparisons import SETTINGS, Children, evaluation, quiet
 from PIL import Image
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
@@ -21,25 +21,27 @@ from tidefield.commands.ablate import Ablate, ablate
 from tidefield.commands.compare import Compare, make_settings
 from tidefield.commands.compare import compare as compare_command
 from tidefield.compare.figures import most_different, side_by_side
-from tidefield.compare.results import figures_of, read_figures, read_results
+from tidefield.compare.results import Result, Results, figures_of, read_figures, read_results
 from tidefield.compare.run import MIPNERF360, Settings, Usage, commands, compare, mipnerf360, named, tidal_flats
 from tidefield.compare.tables import (
     TABLE_2,
     TABLE_3,
     Table,
     cost_table,
+    learned_from,
     nerfacto_limits,
     opensplat_limits,
     paper_table,
     quality_tables,
+    trainings,
     write_comparison,
 )
-from tidefield.config import Budget
+from tidefield.config import PAPER, Budget
 from tidefield.data.load import load_scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import write_json
-from tidefield.methods import METHODS
+from tidefield.methods import METHODS, configuration
 
 
 @pytest.fixture
@@ -74,6 +76,12 @@ def test_zero_shot_uses_the_weights_of_its_preset() -> None:
         asked = commands(Path("data"), Path("run"), method, SETTINGS)
         assert list(asked) == ["evaluate"]
         assert asked["evaluate"][3:6] == ["--zero-shot", "--preset", preset]
+
+
+def test_the_papers_network_can_choose_neighbours_by_what_they_see() -> None:
+    plain, seen = (commands(Path("S"), Path("F"), name, SETTINGS)["train"] for name in ("paper", "paper-seen"))
+    assert seen == [*plain[:5], "--variant", "neighbours-seen", *plain[5:]]
+    assert configuration("paper-seen") == replace(PAPER, train=replace(PAPER.train, neighbours="seen"))
 
 
 def test_an_interrupted_training_is_repeated_and_a_finished_one_is_not(disk: Path, tmp_path: Path):
@@ -128,6 +136,45 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     assert cost_table(again) == cost_table(results)
     with Image.open(out / "figures" / "flats.png") as figure:
         assert figure.width == 3 * 320 + 2 * 4
+
+
+def test_tables_say_what_trained_weights_know_of_a_scene(disk: Path, tmp_path: Path):
+    learned = learned_from()
+    assert learned == ("brighton_beach", "turin_lot"), "what the file of the shipped weights says"
+    out, names = tmp_path / "out", ("vegetation", "swindale", learned[1], "mine")
+    scenes, run = dict.fromkeys(names, disk), Children(load_scene(disk, width=48))
+    compare(scenes, ("tidefield", "nearest"), SETTINGS, out, run, quiet)
+    results = read_results(out, names, ("tidefield", "nearest"))
+    write_comparison(results, scenes, SETTINGS, out)
+    page = (out / "tables.md").read_text()
+    for line in (
+        "- ¹ vegetation: a category of the synthetic generator; ",
+        "- ² swindale: nothing was learned from this scene, but results on it chose the recipe",
+        "- ³ turin_lot: the shipped weights learned from this scene's training photographs: ",
+        "- without a mark (mine): the shipped weights and their recipe do not know it.",
+        *("| vegetation ¹ | ", "| swindale ² | ", "| turin_lot ³ | ", "| mine | "),
+        "The column `tidefield` began with random weights and was trained for 7 steps.",
+    ):
+        assert any(found.startswith(line) for found in page.splitlines()), line
+    assert "\nturin_lot,20.00," in (out / "tables.csv").read_text(), "for programs, names stay as they are"
+    untrained = replace(results, methods=("nearest",))
+    write_comparison(untrained, scenes, SETTINGS, out)
+    assert "³" not in (out / "tables.md").read_text(), "nothing was learned by what is compared"
+
+
+def test_columns_of_presets_say_what_they_began_with(disk: Path):
+    def column(*weights: str | None, steps: tuple[int, ...] = (404, 496)) -> str:
+        found = {}
+        for name, sha256, count in zip("ab", weights, steps, strict=True):
+            one = evaluation(load_scene(disk, width=48), 20.0)
+            one["configuration"] = {"weights": sha256, "trained": {"steps": count, "seconds": 600.0}}
+            found[name, "paper"] = Result(one)
+        (sentence,) = trainings(Results(("a", "b"), ("paper",), found))
+        return sentence
+
+    assert column(None, None) == "The column `paper` began with random weights and was trained for 404 to 496 steps."
+    assert column("f00d", "f00d", steps=(7, 7)).endswith("began with trained weights and was trained for 7 steps.")
+    assert "random or trained weights" in column(None, "f00d")
 
 
 def test_the_best_is_bold_and_means_need_every_scene(disk: Path, tmp_path: Path):

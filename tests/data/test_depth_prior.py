@@ -93,6 +93,17 @@ def test_without_points_the_interval_is_the_cameras_near_and_far():
     torch.testing.assert_close(read[2], torch.full((1, 2), 0.125))
 
 
+def test_with_too_few_points_for_an_interval_it_is_the_cameras_near_and_far():
+    own = wall.cameras(3)
+    points = wall.points(own[[0]])
+    inside = (points.uv_px > 0).all(-1) & (points.uv_px < own.size_px[0]).all(-1)
+    few = points.subset(inside & (inside.cumsum(0) < INTERVAL_POINTS))
+    expected, near, far = surface_prior(own[0], few, own)
+    torch.testing.assert_close(expected, torch.full_like(expected, 1 / wall.DEPTH))
+    torch.testing.assert_close(near, torch.full_like(near, 1 / 3))
+    torch.testing.assert_close(far, torch.full_like(far, 1 / 10))
+
+
 def test_a_new_camera_without_observations_has_a_prior():
     own = wall.cameras(5)
     points = wall.points(own[[0, 1, 3, 4]], tilt=TILT)

@@ -249,6 +249,20 @@ def test_a_view_is_rendered_at_the_gain_of_its_camera():
     )
 
 
+def test_what_lies_behind_empty_space_is_rendered_at_the_gain_of_the_camera():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 100  # nothing is seen there
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose), points=None)
+    config = replace(PAPER, network=SMALL_PAPER)
+    own = Renderer(network(SMALL_PAPER).eval(), at, config, CPU)
+    gain = torch.tensor([[0.5, 0.75, 1.0]])
+    view, darker = own(at.cameras[TARGET]), own(replace(at.cameras[TARGET], gain=gain))
+    assert not view.opacity.any()
+    assert view.colour.min() > 0.2
+    torch.testing.assert_close(darker.colour, view.colour * gain[0], atol=1e-5, rtol=0)
+
+
 def test_the_papers_density_is_per_mean_interval_of_the_ray():
     """An untrained head of a constant density: softplus(b) in every mean interval, whatever the lengths."""
     own, at = network(SMALL_PAPER), scene()

@@ -102,6 +102,9 @@ def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkey
     assert isinstance(started.config, Config)
     assert started.config.train.warm_up == 200
     assert far < 1e-4, "two steps of a two-hundred-step rise"
+    same, _ = moved("same", variant="neighbours-direction")
+    assert same.weights == started.weights, "other neighbours, but the same network"
+    assert moved("fewer", variant="views-2")[0].weights is None
     fresh, far = moved("fresh", from_scratch=True)
     assert (fresh.weights, fresh.config) == (None, SMALL)
     assert far > 1e-2

@@ -37,9 +37,10 @@ class Compare:
     """Scenes; with --protocol tidalflats in addition to its own, with --protocol mipnerf360 the folder of the data
     set."""
     methods: tuple[AnyMethod, ...] = ("tidefield", "nerfacto", "plane-sweep", "sparse-depth", "nearest")
-    """Which, in the order of the tables. tidefield and paper are our presets, zero-shot and paper-zero-shot the same
-    without training on the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; opensplat is the
-    program that you have installed; the others need no training."""
+    """Which, in the order of the tables. tidefield and paper are our presets, paper-seen is paper with neighbours
+    chosen by what they see instead of by direction, zero-shot and paper-zero-shot are the presets without training on
+    the scene; nerf is classical NeRF; nerfacto and splatfacto are nerfstudio's; opensplat is the program that you have
+    installed; the others need no training."""
     budget: OmitArgPrefixes[Budget] = Budget()
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""

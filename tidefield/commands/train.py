@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, OpensplatProgram, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary, warm_start
+from tidefield.config import PRESETS, Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary, warm_start
 from tidefield.errors import RunError, SceneError
 from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
@@ -180,7 +180,7 @@ def _resumed_weights(options: Train, run: Run) -> Path | None:
 
 
 def _new_run(options: Train) -> tuple[Run, Path | None]:
-    """A new run, and the weights it starts from: the named ones, else the installed ones of the unchanged preset."""
+    """A new run, and the weights it starts from: the named ones, else the installed ones of its network."""
     from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
@@ -195,8 +195,8 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
             "--weights is given for a training that starts without (--from-scratch, another method, or a variant that "
             "is one): expected one or the other; leave one out"
         )
-    if options.variant is None and weights is None and not from_random:
-        weights = shipped_weights(options.preset)
+    if weights is None and not options.from_scratch and isinstance(config, Config):
+        weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
     digest = None
     if weights is not None:
         assert isinstance(config, Config), "only our networks start from weights"

@@ -189,7 +189,8 @@ def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict
         variant = [] if method == OTHER_SEED else ["--variant", method]
         source = ["--preset", settings.preset, *variant, *start]
     elif kind == "preset":
-        source = ["--preset", str(preset), *start]
+        variant = METHODS[method].variant
+        source = ["--preset", str(preset), *(["--variant", variant] if variant else []), *start]
     elif kind == "zero-shot":
         source = ["--zero-shot", "--preset", str(preset)]
     else:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
+from tidefield.config import PRESETS
 from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json, write_text
 from tidefield.machine import describe
+from tidefield.methods import METHODS
 
 NOTHING, MEAN = "-", "mean"
 REGIONS = {
@@ -43,6 +45,9 @@ TABLE_3 = {
     "deep_water": {"nerfacto": (20.49, 0.429, 0.384), "tidefield": (20.34, 0.443, 0.383)},
 }
 """The paper's Table 3: the same on its own tidal flats, which are not public; our categories only share the names."""
+CHOSE_RECIPE = ("caliterra", "swindale", "fern")
+"""Scenes whose held-out photographs chose the recipe of the shipped weights (docs/experiments.md). Their files do not
+know: a recipe is chosen before it is used."""
 NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
 """Nerfacto's default number of steps and of rays a batch in nerfstudio 1.1.5, and the rays a batch that it gets on CPUs
 (`baselines/nerfstudio/worker.py`)."""
@@ -240,6 +245,80 @@ def _share_of_default(steps: list[int | float], default: int) -> str:
     return f"{min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default of {default:,}"
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A mark of some scenes in the tables, and what it means."""
+
+    sign: str
+    scenes: Collection[str]
+    meaning: str
+
+
+def learned_from() -> tuple[str, ...]:
+    """Names of the scenes that the installed weights learned from, as their files say."""
+    from tidefield.train.checkpoint import read_weights_file, shipped_weights
+
+    files = [file for preset in PRESETS if (file := shipped_weights(preset)) is not None]
+    return tuple(sorted({name for file in files for name in read_weights_file(file)[0].get("real", ())}))
+
+
+def scene_marks(learned: Collection[str]) -> tuple[Mark, ...]:
+    """What scenes are to trained weights that learned from some of them: seen, like what was seen, or validation."""
+    return (
+        Mark(
+            "¹",
+            TABLE_3,
+            "a category of the synthetic generator; the shipped weights learned from other scenes of the same "
+            "generator.",
+        ),
+        Mark(
+            "²",
+            CHOSE_RECIPE,
+            "nothing was learned from this scene, but results on it chose the recipe of the weights: it is validation, "
+            "not test.",
+        ),
+        Mark(
+            "³",
+            learned,
+            "the shipped weights learned from this scene's training photographs: its zero-shot figures are not those "
+            "of an unseen scene, and training on it adds to what was learned before.",
+        ),
+    )
+
+
+def marked(table: Table, marks: Sequence[Mark]) -> Table:
+    """A table whose scenes carry their marks."""
+    signs = [" ".join([row[0], *(mark.sign for mark in marks if row[0] in mark.scenes)]) for row in table.rows]
+    return replace(table, rows=[[sign, *row[1:]] for sign, row in zip(signs, table.rows, strict=True)])
+
+
+def legend(scenes: Sequence[str], marks: Sequence[Mark]) -> list[str]:
+    """The meaning of the marks that some scenes carry, as a list; nothing where none has one."""
+    found = [(mark, [scene for scene in scenes if scene in mark.scenes]) for mark in marks]
+    lines = [f"- {mark.sign} {', '.join(names)}: {mark.meaning}" for mark, names in found if names]
+    others = [scene for scene in scenes if not any(scene in mark.scenes for mark in marks)]
+    if lines and others:
+        lines.append(f"- without a mark ({', '.join(others)}): the shipped weights and their recipe do not know it.")
+    return ["\n".join(lines)] if lines else []
+
+
+def trainings(results: Results) -> list[str]:
+    """How the columns of our presets were trained, as sentences."""
+    sentences = []
+    for method in results.methods:
+        kind = METHODS[method].kind if method in METHODS else None
+        own = [result for (_, name), result in results.by.items() if name == method]
+        if kind == "zero-shot" and own:
+            sentences.append(f"The column `{method}` has trained weights as they are, without a step on the scene.")
+        elif kind == "preset" and own:
+            starts = {"trained" if result.evaluation["configuration"].get("weights") else "random" for result in own}
+            start = " or ".join(sorted(starts))
+            steps = [count for result in own if (count := result.trained("steps")) is not None]
+            made = " to ".join(f"{count:,}" for count in sorted({min(steps), max(steps)})) if steps else "unknown"
+            sentences.append(f"The column `{method}` began with {start} weights and was trained for {made} steps.")
+    return sentences
+
+
 def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
     """Write tables, figures, curves and comparison.json into the comparison's folder, over older ones.
 
@@ -255,7 +334,13 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
         paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
     )
     tables = [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
-    files = write_tables("tables", "Comparison", tables, [], results, settings, out)
+    of_weights = any(
+        METHODS[name].kind == "zero-shot" or (METHODS[name].kind == "preset" and not settings.from_scratch)
+        for name in results.methods
+    )
+    marks = scene_marks(learned_from()) if of_weights else ()
+    remarks = [*trainings(results), *legend(results.scenes, marks)]
+    files = write_tables("tables", "Comparison", tables, remarks, results, settings, out, marks)
     files.append(write_figures("comparison", results, settings, out))
     for name, path in scenes.items():
         figure = side_by_side(results, name, load_scene(path, width=settings.width))
@@ -275,9 +360,17 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
 
 
 def write_tables(
-    stem: str, title: str, tables: list[Table], remarks: list[str], results: Results, settings: Settings, out: Path
+    stem: str,
+    title: str,
+    tables: list[Table],
+    remarks: list[str],
+    results: Results,
+    settings: Settings,
+    out: Path,
+    marks: Sequence[Mark] = (),
 ) -> list[Path]:
-    """Write tables with their circumstances as STEM.md, STEM.tex and STEM.csv; returns the files."""
+    """Write tables with their circumstances as STEM.md, and without these and marks as STEM.tex and STEM.csv; returns
+    the files."""
     made: dict[str, Any] = describe()
     machine = made["machine"]
     budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
@@ -293,7 +386,7 @@ def write_tables(
         *remarks,
         *lpips_weights(results),
         *missing_metrics(results),
-        *(table.markdown() for table in tables),
+        *(marked(table, marks).markdown() for table in tables),
     ]
     texts = {
         ".md": "\n\n".join(page) + "\n",

@@ -11,6 +11,7 @@ import os
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from tidefield.baselines.export import at_common_exposure, exposure_factor, point_colours
+from tidefield.baselines.export import point_colours
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget, Range, from_json
 from tidefield.data.images import write_mask
@@ -42,7 +43,21 @@ END_SECONDS = 30
 """A worker may take so long to end."""
 _TRAINED = tuple[Annotated[int, Range(0, (1 << 63) - 1)], Annotated[float, Range(0, 1e12)]]
 _FACTOR = tuple[(Annotated[float, Range(1e-9, 1)],) * 3]
+_BACKGROUND = tuple[(Annotated[float, Range(0, 1)],) * 3]
 """Types of what job.json holds."""
+
+
+@dataclass(frozen=True)
+class Colours:
+    """What the colours of an exported scene are, for the way back.
+
+    Attributes:
+        factor: renderings divided by it are at the common exposure.
+        background_rgb: what they are composited on; None where photographs have no alpha.
+    """
+
+    factor: Float[torch.Tensor, "3"]
+    background_rgb: tuple[float, ...] | None
 
 
 def delete_training(folder: Path) -> None:
@@ -85,7 +100,7 @@ def train(
         RunError: nerfstudio is not installed, the method does not run on the device, or nerfstudio fails.
     """
     require(method, device)
-    factor = export(scene, folder / DATA)
+    colours = export(scene, folder / DATA)
     seconds = None if budget.minutes is None else 60 * budget.minutes
     job = {
         "method": method,
@@ -97,7 +112,9 @@ def train(
         "device": str(device),
         "curve_seconds": [share * seconds for share in SHARES] if curve and seconds else [],
         "curve_cameras": [camera_to_json(camera) for camera in curve.cameras] if curve else [],
-        "factor": factor.tolist(),
+        "factor": colours.factor.tolist(),
+        "background": colours.background_rgb,
+        "object": object_limits(scene),
     }
     write_json(folder / JOB_FILE, job)
     last: dict[str, Any] = {}
@@ -106,7 +123,7 @@ def train(
             if "curve" in last and curve is not None:
                 files = [folder / name for name in last["curve"]]
                 views = zip(files, curve.cameras, strict=True)
-                curve.add(last["seconds"], [read_rendering(file, camera, factor) for file, camera in views])
+                curve.add(last["seconds"], [read_rendering(file, camera, colours) for file, camera in views])
                 curve.write(folder)
             progress(last["step"], last["seconds"])
     if not last.get("done"):
@@ -141,24 +158,27 @@ def renderer(folder: Path) -> Iterator[Render]:
     Raises:
         RunError: nerfstudio is not installed, or fails.
     """
-    factor = torch.tensor(_read_job(folder)[1])
+    colours = _read_job(folder)[1]
     with _worker("render", folder) as worker:
         worker.answer()  # once it has loaded
 
         def render(camera: Cameras) -> Rendering:
             file = folder / "rendering.npz"
             worker.ask({**camera_to_json(camera), "file": str(file.resolve())})
-            return read_rendering(file, camera, factor)
+            return read_rendering(file, camera, colours)
 
         yield render
 
 
-def read_rendering(file: Path, camera: Cameras, factor: torch.Tensor) -> Rendering:
-    """What the worker wrote, at the camera's own gain."""
+def read_rendering(file: Path, camera: Cameras, colours: Colours) -> Rendering:
+    """What the worker wrote, at the camera's own gain; the background has none."""
     with np.load(file, allow_pickle=False) as values:
         colour, depth, opacity = (torch.from_numpy(values[name]) for name in ("colour", "depth", "opacity"))
     file.unlink()
-    return Rendering((colour / factor * camera.gain[0]).clamp(0, 1), depth, opacity.clamp(0, 1))
+    opacity = opacity.clamp(0, 1)
+    behind = (1 - opacity[..., None]) * torch.tensor(colours.background_rgb or (0.0, 0.0, 0.0))
+    colour = (colour - behind) / colours.factor * camera.gain[0] + behind
+    return Rendering(colour.clamp(0, 1), depth, opacity)
 
 
 class _Process:
@@ -220,31 +240,34 @@ def _failed(folder: Path) -> RunError:
     )
 
 
-def _read_job(folder: Path) -> tuple[tuple[int, float], tuple[float, ...]]:
-    """Steps and seconds of a training that is complete, and the factor of its scene."""
+def _read_job(folder: Path) -> tuple[tuple[int, float], Colours]:
+    """Steps and seconds of a training that is complete, and the colours of its scene."""
     path = folder / JOB_FILE
     job = read_json(path) or {}
     if not isinstance(job, dict):
         raise RunError(f"{path} is damaged: expected what training wrote; train it with --overwrite")
     if "trained" not in job:
         raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
-    factor = from_json(_FACTOR, job.get("factor"), f"{path}: factor")
-    return from_json(_TRAINED, job["trained"], f"{path}: trained"), factor
+    factor = torch.tensor(from_json(_FACTOR, job.get("factor"), f"{path}: factor"))
+    # Of version 0.1, which exported no alpha, there is none.
+    background = job.get("background") and from_json(_BACKGROUND, job["background"], f"{path}: background")
+    return from_json(_TRAINED, job["trained"], f"{path}: trained"), Colours(factor, background)
 
 
-def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
+def export(scene: Scene, folder: Path) -> Colours:
     """Write photographs and masks (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
-    Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping.
-
-    Returns:
-        The factor: renderings divided by it are at the common exposure.
+    Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping. Those of
+    a scene with alpha have it, and colours that are not multiplied by it, as nerfstudio reads them.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras, files = scene.cameras, [f"images/{index:05d}.png" for index in range(len(scene.names))]
-    factor = exposure_factor(scene, range(len(files)))
+    colours = Colours(cameras.gain.amin(0).clamp(max=1.0), scene.background_rgb)
     for index, file in enumerate(files):
-        Image.fromarray(at_common_exposure(scene, index, factor)).save(folder / file)
+        colour, alpha = _straight(scene, index)
+        colour = colour / cameras.gain[index] * colours.factor
+        pixels = torch.cat([colour, *([] if scene.background_rgb is None else [255 * alpha])], dim=-1)
+        Image.fromarray(pixels.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
     masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
     for index, mask in enumerate(masks):
         write_mask(folder / mask, scene.photographs.used(index).numpy())
@@ -262,7 +285,34 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         masks=masks,
         overwrite=True,
     )
-    return factor
+    return colours
+
+
+def _straight(scene: Scene, index: int) -> tuple[Float[torch.Tensor, "H W 3"], Float[torch.Tensor, "H W 1"]]:
+    """Colours of a photograph, 0 to 255, before they were composited, and alpha, 0 to 1; black where that is 0."""
+    colour, alpha = scene.photographs[index].float(), scene.photographs.alpha(index)
+    if alpha is None or scene.background_rgb is None:
+        return colour, torch.ones_like(colour[..., :1])
+    opacity = alpha[..., None].float() / 255
+    own = colour - (1 - opacity) * 255 * torch.tensor(scene.background_rgb)
+    return torch.where(opacity > 0, own / opacity.clamp(min=1 / 255), 0.0), opacity
+
+
+def object_limits(scene: Scene) -> dict[str, Any] | None:
+    """Where the object of a scene with alpha is: the ends of rays, and half the side of a box around the origin.
+
+    None where no visual hull tells of it. The ends are distances along the rays, which are longer than depths.
+    """
+    if scene.hull is None:
+        return None
+    cameras, hull = scene.cameras, scene.hull
+    corners = cameras.size_px[:, None] * torch.tensor([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+    longest = cameras.directions_world(corners).norm(dim=-1).amax(1)
+    box = torch.stack([hull.corner_world, hull.corner_world + hull.voxel_world * torch.tensor(hull.filled.shape)])
+    return {
+        "near_far": [float(cameras.near_far[:, 0].min()), float((cameras.near_far[:, 1] * longest).max())],
+        "half_side": float(box.abs().max()),
+    }
 
 
 def camera_to_json(camera: Cameras) -> dict[str, Any]:

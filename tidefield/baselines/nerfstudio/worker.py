@@ -70,7 +70,7 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
 
     config = method_configs[job["method"]]
     configure(config, job, has_tiny_cuda_nn())
-    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=Path(job["data"]), downscale_factor=1)
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(**parser_options(job))
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
         # nerfstudio's checkpoints hold NumPy numbers; nothing else is unpickled (see `load_only_weights`).
@@ -90,7 +90,8 @@ def configure(config: Any, job: dict[str, Any], tiny_cuda_nn: bool) -> None:
     """Change a method's default configuration to what the job asks for.
 
     The camera optimiser and the appearance embedding are off: held-out photographs have neither. On CPUs a batch has
-    1,024 rays instead of nerfstudio's 4,096, so figures from CPUs are not those of the defaults.
+    1,024 rays instead of nerfstudio's 4,096, so figures from CPUs are not those of the defaults. Scenes with alpha get
+    what nerfstudio's own benchmark sets for Blender scenes (scripts/benchmarking/launch_train_blender.sh).
     """
     config.data = Path(job["data"])
     config.output_dir, config.experiment_name, config.timestamp = Path(job["out"]), "nerfstudio", "run"
@@ -108,6 +109,15 @@ def configure(config: Any, job: dict[str, Any], tiny_cuda_nn: bool) -> None:
         model.camera_optimizer.mode = "off"
     if hasattr(model, "use_appearance_embedding"):
         model.use_appearance_embedding = False
+    if job.get("background"):
+        # Photographs with alpha and renderings are composited on it. Ours is white, the one background that is read.
+        model.background_color = "white"
+    if job.get("object") and hasattr(model, "near_plane"):
+        # Defaults are for photographs of a whole environment: rays from 0.05 to 1,000 that pass most of their samples
+        # close by, a contraction of what is far away, and a loss against fog before it. An object has no such thing.
+        model.near_plane, model.far_plane = job["object"]["near_far"]
+        model.proposal_initial_sampler = "uniform"
+        model.disable_scene_contraction, model.distortion_loss_mult = True, 0.0
     if hasattr(model, "implementation") and not tiny_cuda_nn:
         model.implementation = "torch"
     if job["device"] == "cpu" and hasattr(model, "eval_num_rays_per_chunk"):
@@ -115,6 +125,19 @@ def configure(config: Any, job: dict[str, Any], tiny_cuda_nn: bool) -> None:
         model.eval_num_rays_per_chunk = 2048
         # In minutes, a CPU makes too few steps of its 4,096 rays for it to learn anything; more and smaller ones help.
         config.pipeline.datamanager.train_num_rays_per_batch = 1024
+
+
+def parser_options(job: dict[str, Any]) -> dict[str, Any]:
+    """Options of nerfstudio's data parser: its defaults, but for scenes of an object.
+
+    These keep their frame, as with its parser of Blender scenes: without the contraction nothing outside of the scene's
+    box is seen, and the poses do not tell where the object is.
+    """
+    options = {"data": Path(job["data"]), "downscale_factor": 1}
+    if job.get("object"):
+        options |= {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+        options["scene_scale"] = job["object"]["half_side"]
+    return options
 
 
 def has_tiny_cuda_nn() -> bool:
