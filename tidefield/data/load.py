@@ -91,6 +91,7 @@ def load_scene(
     *,
     width: int | None = None,
     allow_missing: bool = False,
+    hold_out: bool = True,
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Scene:
@@ -101,6 +102,7 @@ def load_scene(
         width: of every photograph in pixels, with its aspect kept; photographs are never enlarged. None keeps their
             own widths.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
+        hold_out: otherwise all photographs are training photographs.
         progress: called with (ready, all) while photographs are decoded; not called when they are cached.
         cache: folder for decoded photographs; the user's if not given.
 
@@ -120,6 +122,8 @@ def load_scene(
     train, test = every_eighth(len(posed.names))
     if posed.split is not None:
         train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+    if not hold_out:
+        train, test = tuple(range(len(posed.names))), ()
     if posed.points is None or not len(posed.points.uv_px):
         posed = replace(posed, points=find_points(posed, train, root, progress, cache) or posed.points)
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)

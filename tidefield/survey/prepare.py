@@ -245,7 +245,7 @@ def write_scene(
     correction = None
     if colour != "off":
         with ProgressBar(console, "Measuring exposures") as bar:
-            loaded = load_scene(scene, width=COLOUR_WIDTH, progress=bar)
+            loaded = load_scene(scene, width=COLOUR_WIDTH, hold_out=False, progress=bar)
         correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
         if correction.helps:
             with ProgressBar(console, "Correcting exposures") as bar:
