@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
+from tidefield.data.holdout import read_holdout
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, read_header
 from tidefield.data.near_far import estimate_near_far
@@ -152,7 +153,7 @@ def load_scene(
         gain=torch.ones(len(pinholes), 3),
     )
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))
+    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths), posed.divided_by)
     return Scene(
         root=root,
         names=posed.names,
@@ -195,15 +196,19 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
     points = posed.points
     if points is not None:
         points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
+    names = tuple(posed.names[i] for i in order)
+    holdout = read_holdout(root, names, allow_missing)
     return replace(
         posed,
-        names=tuple(posed.names[i] for i in order),
+        names=names,
         paths=tuple(posed.paths[i] for i in order),
         lenses=tuple(posed.lenses[i] for i in order),
         T_world_camera=T_world_camera[order],
         near_far=None if posed.near_far is None else posed.near_far[order],
         points=points,
         masks=tuple(posed.masks[i] for i in order) if posed.masks else (),
+        split=holdout.split(names) if holdout else posed.split,
+        divided_by=holdout.gains(names) if holdout else None,
     )
 
 
