@@ -70,8 +70,8 @@ def read_holdout(folder: Path, names: Sequence[str], allow_missing: bool) -> Hol
             raise ValueError("a gain is not positive")
     unknown = held_out - set(names)
     if (unknown and not allow_missing) or not 0 < len(held_out - unknown) < len(names):
+        found = list_names(sorted(unknown or held_out)) or "nothing"
         raise SceneError(
-            f"{path} holds out {list_names(sorted(held_out))}: expected some of the scene's {len(names)} photographs; "
-            "prepare the scene again"
+            f"{path} holds out {found}: expected some of the scene's {len(names)} photographs; prepare the scene again"
         )
     return Holdout(held_out, divided_by)
