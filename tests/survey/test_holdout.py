@@ -14,6 +14,7 @@ from PIL import Image
 from rich.console import Console
 
 from tidefield.data.load import load_scene
+from tidefield.survey.import_project import import_project
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
@@ -127,6 +128,13 @@ def test_held_out_photographs_stay_as_taken_and_their_gains_are_of_the_same_scal
     loaded = load_scene(scene)
     assert [loaded.names[i] for i in loaded.test] == [flight.names[0], flight.names[8]]
     assert loaded.cameras.gain[list(loaded.train)].log().abs().max() < 0.02
+
+
+def test_an_imported_scene_holds_the_same_photographs_out(made: tuple[Path, Prepared], tmp_path: Path):
+    import_project(made[0], tmp_path / "scene")
+    before, after = load_scene(made[0]), load_scene(tmp_path / "scene")
+    assert after.test == before.test
+    assert (after.cameras.gain - before.cameras.gain).abs().max() < 1e-6
 
 
 def test_the_split_is_written_for_nerfstudio_and_the_report_counts_it(made: tuple[Path, Prepared], flight: Flight):
