@@ -20,7 +20,7 @@ from tidefield.errors import RunError
 
 PROTOCOL = "strict"
 """Nothing of a held-out photograph but its camera reaches a method: neither its pixels nor its observations of sparse
-points, which are placed by the training photographs alone (docs/method.md, section 12). Records without it are older:
+points, which are placed by the training photographs alone (docs/method.md, section 11). Records without it are older:
 there the points and the range of depths were also of held-out photographs."""
 
 

@@ -163,6 +163,21 @@ def test_the_exif_exposure_of_a_held_out_photograph_is_used():
     assert without[list(TEST)].max() > 0.1
 
 
+def test_held_out_photographs_as_taken_have_gains_that_suit_the_others_at_a_common_exposure():
+    log_exposure = torch.zeros(COUNT, dtype=torch.float64)
+    log_exposure[::2] = 0.6
+    metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
+    taken = torch.exp(0.5 * log_exposure)[:, None].float() * torch.tensor([1.0, 0.9, 1.1])
+    divided_by = (0.8 * taken).double().numpy()  # the others are 1.25 times the ground now
+    divided_by[list(TEST)] = 1.0
+    photographs, cameras, points = survey(taken / torch.from_numpy(divided_by).float())
+    found = estimate_gains(photographs, cameras, points, TRAIN, metadata, divided_by)
+    assert found[list(TRAIN)].log().abs().max() < 0.01
+    assert (found / (0.8 * taken)).log()[list(TEST)].abs().max() < 0.02
+    unaware = estimate_gains(photographs, cameras, points, TRAIN, metadata)
+    assert (unaware / (0.8 * taken)).log()[list(TEST)].abs().max() > 0.1
+
+
 def test_exposures_that_the_photographs_contradict_are_ignored():
     log_exposure = torch.linspace(-1, 1, COUNT, dtype=torch.float64).flip(0)[torch.arange(COUNT) * 5 % COUNT]
     photographs, cameras, points = survey(torch.ones(COUNT, 3))

@@ -32,7 +32,8 @@ def shaded(gains: np.ndarray, falloff: np.ndarray) -> Scene:
         light = wall.photograph(cameras[k]).numpy() * 0.55
         pictures.append(torch.from_numpy(np.clip(np.rint(light * shade), 0, 255).astype(np.uint8)))
     scene = wall.scene(cameras)
-    return replace(scene, photographs=Photographs(tuple(pictures)), points=wall.points(cameras, 1500))
+    points = wall.points(cameras, 1500)
+    return replace(scene, photographs=Photographs(tuple(pictures)), points=points, train=tuple(range(12)), test=())
 
 
 def test_gains_and_falloff_are_found():
@@ -86,6 +87,20 @@ def test_each_lens_has_its_own_falloff():
     r = 0.5
     without, with_falloff = (correction.falloff[k] @ [r**2, r**4, r**6] for k in (0, 1))
     assert with_falloff - without == pytest.approx(FALLOFF @ [r**2, r**4, r**6], abs=0.04)
+
+
+def test_held_out_photographs_have_gain_one_and_change_nothing():
+    scene = replace(shaded(GAINS, FALLOFF), train=tuple(range(2, 12)), test=(0, 1))
+    correction = estimate_correction(scene, [0] * 12)
+    for k in scene.test:
+        scene.photographs.colours[k].neg_()  # modulo 256
+    again = estimate_correction(scene, [0] * 12)
+    np.testing.assert_array_equal(again.gain, correction.gain)
+    np.testing.assert_array_equal(again.falloff, correction.falloff)
+    np.testing.assert_array_equal(correction.gain[:2], 1)
+    np.testing.assert_array_equal(correction.falloff[:2], correction.falloff[2:4])
+    relative = np.log(correction.gain / GAINS)[2:]
+    np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.02)
 
 
 def test_without_points_nothing_is_done():

@@ -44,6 +44,9 @@ class Prepare:
     """Lens of the camera. What a fisheye sees beyond 120 degrees is left out when the scene is read."""
     keep_all: bool = False
     """Use photographs of low quality, too."""
+    holdout: bool = False
+    """Keep every eighth photograph out of poses, points and colours, and place it afterwards: for figures that owe
+    nothing to what is held out. Make maps and other products without it."""
     colour: Literal["auto", "on", "off"] = "auto"
     """Correct exposures and the lens' falloff: where it helps, always, or never."""
     features: int = 6000
@@ -85,6 +88,7 @@ def prepare(options: Prepare, console: Console) -> None:
         console,
         lens=options.lens,
         keep_all=options.keep_all,
+        holdout=options.holdout,
         colour=options.colour,
         downscale=options.downscale,
         redo=options.redo,

@@ -17,7 +17,7 @@ Alphabet: V photographs, O observations of sparse points, N pairs of photographs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -60,6 +60,7 @@ def estimate_gains(
     points: SparsePoints | None,
     train: Sequence[int],
     metadata: Exposures | None = None,
+    divided_by: Float64[np.ndarray, "V 3"] | None = None,
 ) -> Float[Tensor, "V 3"]:
     """Estimate the gain of every photograph and channel, with geometric mean 1 over the training photographs.
 
@@ -70,14 +71,19 @@ def estimate_gains(
             these.
         train: indices of the training photographs; all others are held out.
         metadata: exposures and times (`exif.read_exposures`), if any.
+        divided_by: gains that the photographs' files were divided by, ones if not given. EXIF is of photographs as
+            taken, so the gains are estimated of these, and divided by the same at the end.
     """
     count, learned = len(cameras), np.asarray(train, dtype=np.int64)
     exposure, clock = _exposure_and_clock(metadata, count)
+    applied = np.zeros((count, 3)) if divided_by is None else np.log(divided_by)
     seen = observe(photographs, points, train) if points is not None else None
     if seen is not None and len(seen.value):
+        seen = replace(seen, value=seen.value + applied[seen.photograph])
         gains = _solve(seen, exposure, clock, cameras.position_world.double().cpu().numpy(), learned)
     else:
         gains = DISPLAY_SLOPE * exposure[:, None] * np.ones(3)
+    gains = gains - applied
     return torch.as_tensor(np.exp(gains - gains[learned].mean(0)), dtype=torch.float32)
 
 

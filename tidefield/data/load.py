@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
+from tidefield.data.holdout import read_holdout
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, read_header
 from tidefield.data.near_far import estimate_near_far
@@ -91,6 +92,7 @@ def load_scene(
     *,
     width: int | None = None,
     allow_missing: bool = False,
+    hold_out: bool = True,
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Scene:
@@ -101,6 +103,7 @@ def load_scene(
         width: of every photograph in pixels, with its aspect kept; photographs are never enlarged. None keeps their
             own widths.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
+        hold_out: otherwise all photographs are training photographs.
         progress: called with (ready, all) while photographs are decoded; not called when they are cached.
         cache: folder for decoded photographs; the user's if not given.
 
@@ -120,6 +123,8 @@ def load_scene(
     train, test = every_eighth(len(posed.names))
     if posed.split is not None:
         train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+    if not hold_out:
+        train, test = tuple(range(len(posed.names))), ()
     if posed.points is None or not len(posed.points.uv_px):
         posed = replace(posed, points=find_points(posed, train, root, progress, cache) or posed.points)
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
@@ -148,7 +153,7 @@ def load_scene(
         gain=torch.ones(len(pinholes), 3),
     )
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths))
+    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths), posed.divided_by)
     return Scene(
         root=root,
         names=posed.names,
@@ -217,15 +222,19 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
     points = posed.points
     if points is not None:
         points = replace(points, photograph_index=np.argsort(order)[points.photograph_index])
+    names = tuple(posed.names[i] for i in order)
+    holdout = read_holdout(root, names, allow_missing)
     return replace(
         posed,
-        names=tuple(posed.names[i] for i in order),
+        names=names,
         paths=tuple(posed.paths[i] for i in order),
         lenses=tuple(posed.lenses[i] for i in order),
         T_world_camera=T_world_camera[order],
         near_far=None if posed.near_far is None else posed.near_far[order],
         points=points,
         masks=tuple(posed.masks[i] for i in order) if posed.masks else (),
+        split=holdout.split(names) if holdout else posed.split,
+        divided_by=holdout.gains(names) if holdout else None,
     )
 
 

@@ -50,7 +50,9 @@ class ExposureCorrection:
 
 
 def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = False) -> ExposureCorrection:
-    """Estimate the gains and the falloff of all photographs of a scene.
+    """Estimate the gains and the falloff of the training photographs of a scene.
+
+    The gains of its held-out photographs are ones. The falloff is the lens's, so they share it.
 
     Args:
         scene: with sparse points; a small width suffices.
@@ -58,7 +60,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
         always: apply gains even if they do not help.
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
-    seen = observe(scene.photographs, scene.points, range(count)) if scene.points is not None else None
+    seen = observe(scene.photographs, scene.points, scene.train) if scene.points is not None else None
     if scene.points is None or seen is None or not len(seen.value):
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
@@ -83,7 +85,8 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
     if not sees:
         gains, falloff = robust_gains(seen, np.zeros(count))[0], np.zeros_like(falloff)
-    gain = np.exp(gains - gains.mean(0)) if helps else np.exp(nothing)
+    gain = np.exp(gains - gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
+    gain[list(scene.test)] = 1.0
     return ExposureCorrection(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -59,12 +59,13 @@ def write_images(
         photograph = photographs[index]
         target = folder / photograph.name
         is_heif = photograph.path.suffix.casefold() in HEIFS  # written as JPEG, which others read
-        if correction is None and photograph.orientation == 1 and not is_heif:
+        same = correction is None or ((correction.gain[index] == 1).all() and not correction.falloff[index].any())
+        if same and photograph.orientation == 1 and not is_heif:
             with completed_file(target, overwrite=True) as partial:
                 shutil.copyfile(photograph.path, partial)
             return
         pixels = upright(photograph)
-        if correction is not None:
+        if correction is not None and not same:
             tangent = tangents.get(cameras[index].camera_id, np.zeros((1, 1), dtype=np.float32))
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
         write_image(pixels, target, photograph.path)
@@ -159,17 +160,19 @@ def write_transforms(
     folder: Path,
     model: pycolmap.Reconstruction,
     *,
+    held_out: Collection[str] = (),
     masks: bool = False,
     z_is_up: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Write `transforms.json` and `sparse_pc.ply` of a model whose photographs are in `folder/images`.
 
-    Every eighth photograph is held out, as `load_scene` does. Coordinates are the model's; coordinates too large for
+    Coordinates are the model's; coordinates too large for
     float32 are reduced by whole numbers, which `applied_transform` states.
 
     Args:
         model: cameras with Brown's distortion; photographs without a pose are left out.
+        held_out: names of photographs; without any, every eighth one is held out, as `load_scene` does.
         masks: whether `folder/masks` has a mask of every photograph.
         z_is_up: whether the world's z axis points up: nerfstudio then does not rotate the world.
 
@@ -187,13 +190,17 @@ def write_transforms(
         key: lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params.tolist())
         for key, camera in model.cameras.items()
     }
+    split: tuple[Sequence[int], Sequence[int]] = every_eighth(len(images))
+    if held_out:
+        test = [i for i, image in enumerate(images) if image.name in held_out]
+        split = sorted({*range(len(images))} - {*test}), test
     points = [point for _, point in sorted(model.points3D.items()) if np.isfinite(point.xyz).all()]
     write_transforms_file(
         folder,
         [f"images/{image.name}" for image in images],
         [lenses[image.camera_id] for image in images],
         T_world_camera,
-        every_eighth(len(images)),
+        split,
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3) - origin,
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         masks=[f"masks/{image.name}.png" for image in images if masks],

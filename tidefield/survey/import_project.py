@@ -18,6 +18,7 @@ import pycolmap
 from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
+from tidefield.data.holdout import read_holdout
 from tidefield.data.images import Progress, decode, read_mask, rectify_mask, write_mask
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.files import naming, quiet_pillow
@@ -91,7 +92,8 @@ def import_project(
             left_out=(),
             notes=("The origin is the imported project's; its accuracy is unknown.",),
         )
-    if posed.split is not None:
+    holdout = read_holdout(source, posed.names, allow_missing)
+    if posed.split is not None and holdout is None:
         _log.warning(f"{source} has its own split: the imported scene holds out every eighth photograph instead")
     if posed.near_far is not None:
         _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
@@ -123,7 +125,10 @@ def import_project(
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
-        write_transforms(folder, model, masks=bool(posed.masks), z_is_up=located is not None)
+        held_out = holdout.split(posed.names)[1] if holdout else ()
+        write_transforms(folder, model, held_out=held_out, masks=bool(posed.masks), z_is_up=located is not None)
+        if holdout:
+            replace(holdout, names=frozenset(held_out)).write(folder)
         if located is not None:
             located.write(folder)
     return model, located

@@ -14,7 +14,10 @@ import pycolmap
 from rich.console import Console
 
 from tidefield.data.georeference import Georeference, read_georeference
+from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
+from tidefield.data.holdout import Holdout
 from tidefield.data.load import load_scene
+from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError, SurveyError
 from tidefield.files import writing_to
 from tidefield.progress import ProgressBar
@@ -22,12 +25,13 @@ from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import reduced_folders, write_images, write_masks, write_reduced_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.photographs import control_remark
-from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs
+from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs, without
 from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database
 from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
+from tidefield.survey.sfm.placing import MIN_INLIERS, place
 from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
 
@@ -73,6 +77,7 @@ def prepare(
     *,
     lens: LensKind = "pinhole",
     keep_all: bool = False,
+    holdout: bool = False,
     colour: Literal["auto", "on", "off"] = "auto",
     downscale: Sequence[int] = (),
     redo: str | None = None,
@@ -82,6 +87,8 @@ def prepare(
     Args:
         lens: of the camera.
         keep_all: use photographs of low quality too.
+        holdout: keep every eighth photograph out of everything, and place it afterwards. Which ones are chosen, their
+            quality and their colours do not depend on their pixels.
         colour: correct exposures and lens falloff: where it helps, always, or never.
         downscale: factors of reduced photographs to write beside the others.
         redo: a stage to repeat, with all that follow.
@@ -98,14 +105,21 @@ def prepare(
     if redo not in (None, *STAGES):
         raise RunError(f"there is no stage {redo!r}: expected one of {', '.join(STAGES)}; name one of these")
     stages = Stages(work, _fingerprint(survey), redo)
+    everyone = [photograph.name for photograph in survey.photographs]
+    held_out = frozenset(everyone[i] for i in every_eighth(len(everyone))[1] if holdout)
 
     def judge_quality(_: bool) -> Facts:
         with ProgressBar(console, "Judging photographs") as bar:
-            return {"verdicts": [_to_json(verdict) for verdict in assess_quality(survey, bar)]}
+            verdicts = list(assess_quality(without(survey, held_out), bar))
+        if held_out:  # of these, only whether they can be decoded
+            verdicts += [v for v in assess_quality(without(survey, {*everyone} - held_out)) if v.measures is None]
+        return {"verdicts": [_to_json(verdict) for verdict in verdicts]}
 
-    verdicts = stages.run("quality", {}, [], judge_quality, _verdicts_from_json)
+    # No option is part of the key of scenes that do not have it, so that earlier ones are kept.
+    verdicts = stages.run("quality", {"holdout": True} if holdout else {}, [], judge_quality, _verdicts_from_json)
     good = select_photographs(survey, verdicts, keep_all)
     names = [photograph.name for photograph in good.photographs]
+    mapped = without(good, held_out)
 
     def extract_features(resume: bool) -> Facts:
         if not resume or not is_database(database):
@@ -125,7 +139,7 @@ def prepare(
         "pairs",
         {},
         [],
-        lambda _: choose_pairs(good.photographs, database, console),
+        lambda _: choose_pairs(good.photographs, held_out, database, console),
         lambda facts: _pairs_from_json(facts, names),
     )
 
@@ -147,20 +161,20 @@ def prepare(
         return models, _lens_from_json(facts["lens"])
 
     models, choice = stages.run(
-        "poses", {}, model_files(model), lambda _: estimate_poses(survey, database, model, console), read_poses
+        "poses", {}, model_files(model), lambda _: estimate_poses(mapped, database, model, console), read_poses
     )
 
-    def read_located(_: Facts) -> Georeference:
-        located = read_georeference(scene)
-        if located is None or registered_names(read_model(sparse)) != models[0]:
+    def read_located(facts: Facts) -> tuple[Georeference, list[str]]:
+        located, placed = read_georeference(scene), sorted([*models[0], *facts.get("placed", ())])
+        if located is None or registered_names(read_model(sparse)) != placed:
             raise ValueError("the model has other photographs")
-        return located
+        return located, placed
 
-    located = stages.run(
+    located, models[0] = stages.run(
         "georeference",
         {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
         [*model_files(sparse), scene / "georeference.json"],
-        lambda _: georeference_model(good, model, sparse, console),
+        lambda _: georeference_model(mapped, model, sparse, console, database, held_out & {*names}),
         read_located,
     )
     registered = set(models[0])
@@ -172,8 +186,9 @@ def prepare(
             *(images / photograph.name for photograph in placed),
             *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
             *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
+            *([scene / HOLDOUT_FILE] if holdout else []),
         ],
-        lambda _: write_scene(placed, scene, colour, console),
+        lambda _: write_scene(placed, scene, colour, console, held_out & registered),
         lambda facts: _correction_from_json(facts["evening"], len(placed)),
     )
 
@@ -189,13 +204,22 @@ def prepare(
     return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
 
 
-def choose_pairs(photographs: Sequence[Photograph], database: Path, console: Console) -> Facts:
-    """Choose the pairs of photographs to match, by name."""
+def choose_pairs(
+    photographs: Sequence[Photograph], held_out: Collection[str], database: Path, console: Console
+) -> Facts:
+    """Choose the pairs of photographs to match, by name.
+
+    Pairs with a held-out photograph do not compete with the others, and there are none of two.
+    """
+    candidates = candidate_pairs(photographs)
+    of_held_out = [sum(photographs[k].name in held_out for k in pair) for pair in candidates]
+    parts = [[pair for pair, n in zip(candidates, of_held_out, strict=True) if n == part] for part in (0, 1)]
     with pycolmap.Database.open(database) as db:
         ids = {decode_name(image.name): image.image_id for image in db.read_all_images()}
         largest = [np.array(db.read_descriptors(ids[p.name]).data[:PREVIEW]) for p in photographs]
     with ProgressBar(console, "Choosing pairs") as bar:
-        pairs = select_pairs(candidate_pairs(photographs), preview_descriptors(largest), bar)
+        previews = preview_descriptors(largest)
+        pairs = [pair for part in parts for pair in select_pairs(part, previews, bar)]
     return {"pairs": [[photographs[i].name, photographs[j].name] for i, j in pairs]}
 
 
@@ -203,15 +227,18 @@ def estimate_poses(survey: Survey, database: Path, folder: Path, console: Consol
     """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder."""
     known = all(photograph.lens is not None for photograph in survey.photographs)
     with ProgressBar(console, "Estimating poses") as bar:
-        models = reconstruct(database, folder.with_name("models"), bar, known)
+        names = [photograph.name for photograph in survey.photographs]
+        models = reconstruct(database, folder.with_name("models"), names, bar, known)
     with ProgressBar(console, "Choosing a lens") as bar:
         choice = choose_lens(models[0], survey.photographs, known, bar)
     write_model(models[0], folder)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 
-def georeference_model(good: Survey, model: Path, sparse: Path, console: Console) -> Facts:
-    """Georeference the largest model; write it, and `georeference.json`, to the scene."""
+def georeference_model(
+    good: Survey, model: Path, sparse: Path, console: Console, database: Path, held_out: Collection[str]
+) -> Facts:
+    """Georeference the largest model and place held-out photographs; write it, and `georeference.json`."""
     reconstruction = read_model(model)
     with ProgressBar(console, "Georeferencing") as bar:
         try:
@@ -224,15 +251,41 @@ def georeference_model(good: Survey, model: Path, sparse: Path, console: Console
             reconstruction = read_model(model)
             located = georeference(reconstruction, replace(good, control=None), bar)
             located = replace(located, notes=(*located.notes, remark))
+    placed: list[str] = []
+    if held_out:
+        with ProgressBar(console, "Placing held-out photographs") as bar:
+            failed = place(reconstruction, database, held_out, bar)
+        for name, inliers in failed.items():
+            log.warning(
+                f"{name} is held out and cannot be placed: {inliers} of its matches with the other photographs' points "
+                f"fit a pose, {MIN_INLIERS} are needed; it is left out"
+            )
+        placed = sorted(set(held_out) - set(failed))
+        if not placed:
+            raise SurveyError(
+                f"none of the {len(held_out)} held-out photographs can be placed: expected some that overlap with the "
+                "others; leave --holdout out, or add photographs"
+            )
+        remark = f"{len(placed)} photographs are held out: they were placed afterwards, by the points of the others."
+        located = replace(located, notes=(*located.notes, remark))
     write_model(reconstruction, sparse)
     located.write(sparse.parents[1])
-    return {}
+    return {"placed": placed}
 
 
 def write_scene(
-    photographs: Sequence[Photograph], scene: Path, colour: Literal["auto", "on", "off"], console: Console
+    photographs: Sequence[Photograph],
+    scene: Path,
+    colour: Literal["auto", "on", "off"],
+    console: Console,
+    held_out: frozenset[str],
 ) -> Facts:
-    """Write the model's photographs, at a common exposure if that helps, colour its points, write transforms.json."""
+    """Write the model's photographs, at a common exposure if that helps, colour its points, write transforms.json.
+
+    Held-out photographs keep their own exposures; `holdout.json` says what the others were divided by.
+    """
+    if held_out:
+        Holdout(held_out, {}).write(scene)
     images, sparse = scene / "images", scene / "sparse" / "0"
     model = read_model(sparse)
     camera_of = {image.name: model.camera(image.camera_id) for image in map(model.image, model.reg_image_ids())}
@@ -245,14 +298,17 @@ def write_scene(
     correction = None
     if colour != "off":
         with ProgressBar(console, "Measuring exposures") as bar:
-            loaded = load_scene(scene, width=COLOUR_WIDTH, progress=bar)
+            loaded = load_scene(scene, width=COLOUR_WIDTH, hold_out=bool(held_out), progress=bar)
         correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
         if correction.helps:
             with ProgressBar(console, "Correcting exposures") as bar:
                 write_images(photographs, images, correction, cameras, bar)
+            if held_out:
+                gains = {p.name: gain for p, gain in zip(photographs, correction.gain, strict=True)}
+                Holdout(held_out, gains).write(scene)
     model.extract_colors_for_all_images(images)
     write_model(model, sparse)
-    write_transforms(scene, model, masks=masks, z_is_up=True, overwrite=True)
+    write_transforms(scene, model, held_out=held_out, masks=masks, z_is_up=True, overwrite=True)
     return {"evening": _to_json(correction)}
 
 

@@ -69,6 +69,7 @@ class PosedPhotographs:
         points: sparse points, where the format has them; without observations, where it has only a cloud.
         near_far: z-depths, where the format states them.
         split: names of the training and the held-out photographs, where the format has a split.
+        divided_by: the gains that the photographs' files were divided by, where `prepare --holdout` did so.
         background_rgb: the background of photographs with alpha, where the format states it.
         reference: the geographic origin, where the format states it.
         masks: of each photograph (`PhotographFile.mask`), or None; empty if no photograph has one.
@@ -81,6 +82,7 @@ class PosedPhotographs:
     points: Observations | None = None
     near_far: Float64[np.ndarray, "V 2"] | None = None
     split: tuple[frozenset[str], frozenset[str]] | None = None
+    divided_by: Float64[np.ndarray, "V 3"] | None = None
     background_rgb: tuple[float, float, float] | None = None
     reference: Reference | None = None
     masks: tuple[Path | None, ...] = ()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -124,7 +124,7 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
     """Remove the photographs that are to be left out, their marks, and control points without marks.
 
     Args:
-        decisions: on all photographs of the survey.
+        decisions: on photographs of the survey; others are kept.
         keep_all: keep all photographs that can be decoded.
 
     Raises:
@@ -132,15 +132,21 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
     """
     out = [d for d in decisions if d.measures is None or (d.left_out is not None and not keep_all)]
     names = {decision.name for decision in out}
-    photographs = tuple(photograph for photograph in survey.photographs if photograph.name not in names)
-    if len(photographs) < FEWEST:
+    selected = without(survey, names)
+    if len(selected.photographs) < FEWEST:
         kinds = Counter((decision.left_out or "").partition(":")[0] for decision in out)
         counted = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         hint = "" if keep_all else ", or keep them all the same with --keep-all"
         raise SurveyError(
-            f"{len(photographs)} of the {len(decisions)} photographs in {survey.folder} can be used ({counted}; such "
-            f"as {out[0].name}, {out[0].left_out}): expected at least {FEWEST}; take them again{hint}"
+            f"{len(selected.photographs)} of the {len(survey.photographs)} photographs in {survey.folder} can be used "
+            f"({counted}; such as {out[0].name}, {out[0].left_out}): expected at least {FEWEST}; take them again{hint}"
         )
+    return selected
+
+
+def without(survey: Survey, names: Collection[str]) -> Survey:
+    """Remove photographs from a survey, their marks, and control points without marks."""
+    photographs = tuple(photograph for photograph in survey.photographs if photograph.name not in names)
     control = survey.control
     if control is not None:
         marks = tuple(mark for mark in control.marks if mark.photograph not in names)

@@ -15,7 +15,7 @@ proportional to the focal length, so the one is chosen whose flight height agree
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from tidefield.errors import SurveyError
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
-from tidefield.survey.sfm.features import decode_name
+from tidefield.survey.sfm.features import decode_name, encode_name
 from tidefield.survey.sfm.matching import interruptible
 from tidefield.survey.survey import Photograph, Progress
 
@@ -107,10 +107,13 @@ class LensChoice:
     heights: Heights | None = None
 
 
-def reconstruct(database: Path, folder: Path, progress: Progress, known: bool) -> list[pycolmap.Reconstruction]:
-    """Run incremental mapping on the matches of a database.
+def reconstruct(
+    database: Path, folder: Path, names: Collection[str], progress: Progress, known: bool
+) -> list[pycolmap.Reconstruction]:
+    """Run incremental mapping on the matches of photographs of a database.
 
     Args:
+        names: of the photographs; others in the database take no part.
         folder: where pycolmap may write; created if it does not exist.
         known: whether all focal lengths have a prior, and are held to it.
 
@@ -120,9 +123,9 @@ def reconstruct(database: Path, folder: Path, progress: Progress, known: bool) -
     Raises:
         SurveyError: no three photographs fit together.
     """
-    with pycolmap.Database.open(database) as db:
-        count = db.num_images()
+    encoded, count = sorted(map(encode_name, names)), len(names)
     options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = encoded
     options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
     registered = 0
@@ -146,19 +149,21 @@ def reconstruct(database: Path, folder: Path, progress: Progress, known: bool) -
     if not large:
         fit = models[0].num_reg_images() if models else 0
         raise SurveyError(
-            f"{fit or 'none'} of the {count} photographs fit together ({_why_so_few(database)}): expected at least "
-            f"{MIN_PHOTOGRAPHS} that overlap by half or more and show ground with some texture; fly with more overlap, "
-            "or add the photographs in between"
+            f"{fit or 'none'} of the {count} photographs fit together ({_why_so_few(database, encoded)}): expected "
+            f"at least {MIN_PHOTOGRAPHS} that overlap by half or more and show ground with some texture; fly with more "
+            "overlap, or add the photographs in between"
         )
     return large
 
 
-def _why_so_few(database: Path) -> str:
-    """Say what the photographs of a database lack to fit together."""
+def _why_so_few(database: Path, encoded: Collection[str]) -> str:
+    """Say what photographs of a database lack to fit together."""
     with pycolmap.Database.open(database) as db:
-        images = {image.image_id: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
-        pairs = zip(*db.read_two_view_geometry_num_inliers(), strict=True)
-        matched = {number for pair, inliers in pairs if inliers for number in pycolmap.pair_id_to_image_pair(pair)}
+        numbers = [image.image_id for image in db.read_all_images() if image.name in encoded]
+        images = {number: db.num_keypoints_for_image(number) for number in numbers}
+        verified = zip(*db.read_two_view_geometry_num_inliers(), strict=True)
+        pairs = [set(pycolmap.pair_id_to_image_pair(pair)) for pair, inliers in verified if inliers]
+        matched = {number for pair in pairs if pair <= set(images) for number in pair}
     plain = [number for number, features in images.items() if features < FEW_FEATURES]
     single = [number for number in images if number not in matched and number not in plain]
     reasons = [
