@@ -162,6 +162,13 @@ def test_a_message_names_no_temporary_file(tmp_path: Path, monkeypatch: pytest.M
         require_writable(Path("map.tif"))
 
 
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_json_with_numbers_that_are_not_finite_is_damaged(number: str, tmp_path: Path):
+    (tmp_path / "a.json").write_text(f"[1.5, {number}]")
+    with pytest.raises(RunError, match="no finite number"):
+        read_json(tmp_path / "a.json")
+
+
 def test_json_nested_too_deeply_is_damaged(tmp_path: Path):
     (tmp_path / "a.json").write_text("[" * 100_000)
     with pytest.raises(RunError, match="is not valid JSON"):

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import logging
+import math
 import os
 import secrets
 import shutil
@@ -269,6 +270,14 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
+def _finite(text: str) -> float:
+    """A number of JSON; this program writes none that is not finite."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
+
+
 def read_json(path: Path) -> Any:
     """The content of a JSON file that this program wrote, or None where there is none.
 
@@ -286,7 +295,7 @@ def read_json(path: Path) -> Any:
             )
         content = path.read_bytes() if status.st_size else b""  # the system's own files have no size, some no end
     try:
-        return json.loads(content)
+        return json.loads(content, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise RunError(
             f"{path} is not valid JSON ({error}): expected what this program wrote; restore it, or delete it and repeat"

@@ -430,6 +430,8 @@ def test_mistakes_are_reported_before_anything_is_trained(disk: Path, monkeypatc
         ("curve.json", "[[1]]"),
         ("curve.json", "7"),
         ("curve.json", f"[[1, 1{400 * '0'}]]"),
+        ("curve.json", "[[1, NaN]]"),
+        ("run.json", "[]"),
         ("evaluation.json", lambda whole: whole.replace("1234.0", "NaN")),
         ("evaluation.json", lambda whole: whole.replace("1234.0", f"1{400 * '0'}")),
         ("evaluation.json", lambda whole: json.dumps({**json.loads(whole), "per_photograph": {}})),
@@ -440,10 +442,10 @@ def test_a_damaged_result_is_named(name: str, damaged, disk: Path, tmp_path: Pat
     compare({"flats": disk}, ("tidefield",), SETTINGS, out, run, quiet)
     file = out / "runs" / "flats" / "tidefield" / name
     file.write_text(damaged if isinstance(damaged, str) else damaged(file.read_text()))
-    with pytest.raises(RunError, match=f"{name} is damaged"):
+    with pytest.raises(RunError, match=f"{name} is (damaged|not valid JSON)"):
         read_results(out, ["flats"], ["tidefield"])
     if name != "curve.json":
-        with pytest.raises(RunError, match=f"{name} is damaged"):
+        with pytest.raises(RunError, match=f"{name} is (damaged|not valid JSON)"):
             compare({"flats": disk}, ("tidefield", "nearest"), SETTINGS, out, run, quiet)
         assert len(run.words) == 2, "before anything is trained"
 

@@ -97,6 +97,14 @@ def test_files_that_are_no_reconstruction_are_refused(tmp_path: Path, content: s
         load_scene(tmp_path)
 
 
+def test_a_smaller_reconstruction_without_shots_is_left_out(tmp_path: Path) -> None:
+    whole = reconstruction()
+    write_opensfm(tmp_path, whole)
+    file = tmp_path / "reconstruction.json"
+    file.write_text(file.read_text().rstrip().removesuffix("]") + ", {}]")
+    assert set(read_posed(tmp_path, False).names) == set(whole["shots"])
+
+
 def test_truncated_reconstructions_are_refused(tmp_path: Path) -> None:
     content = write_opensfm(tmp_path, reconstruction()).read_bytes()
     for keep in np.linspace(0, len(content) - 1, 40).astype(int):

@@ -262,6 +262,8 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
         RunError: it is damaged, or of another run than the one that is there.
     """
     evaluation, run = _read(folder / EVALUATION_FILE, _is_evaluation), read_json(folder / RUN_FILE)
+    if run is not None and not isinstance(run, dict):
+        raise RunError(f"{folder / RUN_FILE} is damaged: expected what this program wrote; delete it and repeat")
     if evaluation is not None and run is not None and evaluation["configuration"].get("run") != run.get("id"):
         raise RunError(
             f"{folder / EVALUATION_FILE} is of another run than {RUN_FILE}: expected two files of one run; delete it "

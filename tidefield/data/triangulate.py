@@ -166,6 +166,7 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     masks = [posed.masks[i] if posed.masks else None for i in used]
     features: list[Features] = []
     with ExitStack() as stack:
+        stack.enter_context(_quiet_pycolmap())
         run = map
         if sum(lens.width * lens.height for lens in lenses) > WORTH_PROCESSES_PX:
             run = stack.enter_context(worker_processes(min(cores(), len(used)), _quiet)).map
@@ -345,7 +346,7 @@ def _quiet() -> None:
 
 @contextmanager
 def _quiet_pycolmap() -> Iterator[None]:
-    """It warns that it finds no photographs to take colours from, which we take from the features."""
+    """Its log would mix with the progress bar, and it warns of photographs that it finds no colours in."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel

@@ -114,7 +114,7 @@ def _largest(file: Path) -> Object:
     if not reconstructions or not all(isinstance(one, dict) for one in reconstructions):
         raise SceneError(f"{file} holds no list of reconstructions: expected the format of OpenSfM; run it again")
     largest, *others = sorted(reconstructions, key=lambda r: len(_objects(r, "shots", file)), reverse=True)
-    left = [name for other in others for name in other["shots"]]
+    left = [name for other in others for name in _objects(other, "shots", file)]
     if left:
         _log.warning(
             f"{file} has {len(reconstructions)} reconstructions that are not connected: the largest, of "

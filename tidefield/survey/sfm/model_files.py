@@ -47,11 +47,15 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         if len(content) < 8 or int.from_bytes(content[:8], "little") != len(records) or (records[ones] != 1).any():
             raise SceneError(f"{folder / name} is damaged: expected a whole file of a COLMAP model; prepare it again")
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
+        observed = {p.point3D_id for image in model.images.values() for p in image.get_observation_points2D()}
+        if not observed <= set(model.points3D):
+            raise ValueError("a photograph observes points that are not there")
     except (ValueError, RuntimeError, LookupError) as error:
         raise SceneError(
             f"{folder} is damaged ({error}): expected a whole COLMAP model; prepare the scene again"
         ) from error
+    return model
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
