@@ -1,5 +1,9 @@
 """How all tests run: shapes checked (jaxtyping, enforced by beartype), on one thread, the slow ones on request."""
 
+import logging
+import os
+from collections.abc import Iterator
+
 import pytest
 import torch
 from jaxtyping import install_import_hook
@@ -7,6 +11,18 @@ from jaxtyping import install_import_hook
 install_import_hook("tidefield", "beartype.beartype")
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def messages_as_before() -> Iterator[None]:
+    """Commands set up logging and threads for their whole process, which here is that of all tests."""
+    ours, root, environment = logging.getLogger("tidefield"), logging.getLogger(), dict(os.environ)
+    level, handlers = ours.level, root.handlers[:]
+    yield
+    ours.setLevel(level)
+    root.handlers[:] = handlers
+    os.environ.clear()
+    os.environ.update(environment)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +18,6 @@ from tidefield import cli, synthetic
 from tidefield import progress as meter
 from tidefield.commands import demo
 from tidefield.synthetic import make_survey, write_survey
-
-
-@pytest.fixture(autouse=True, scope="module")
-def messages_as_before() -> Iterator[None]:
-    """Commands set up logging and threads for their whole process, which here is that of all tests."""
-    ours, root, environment = logging.getLogger("tidefield"), logging.getLogger(), dict(os.environ)
-    level, handlers = ours.level, root.handlers[:]
-    yield
-    ours.setLevel(level)
-    root.handlers[:] = handlers
-    os.environ.clear()
-    os.environ.update(environment)
 
 
 def call(*arguments: object) -> None:

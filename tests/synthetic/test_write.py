@@ -56,8 +56,9 @@ def test_load_scene_returns_the_same_photographs_and_poses(folder: Path, survey:
     back = scene.cameras.position_world + scene.origin_world
     assert torch.allclose(back.float(), survey.cameras.position_world, atol=1e-4)
     assert torch.allclose(scene.cameras.T_world_camera[..., :3], survey.cameras.T_world_camera[..., :3], atol=1e-5)
-    assert scene.points is not None
-    assert len(scene.points.xyz_world) == len(survey.points.xyz_world)
+    whole = load_scene(folder, hold_out=False).points
+    assert whole is not None
+    assert len(whole.xyz_world) == len(survey.points.xyz_world)
     depth = survey.depth.flatten(1)
     assert (scene.cameras.near_far[:, 0] < depth.quantile(0.01, dim=1)).all()
     assert (scene.cameras.near_far[:, 1] > depth.quantile(0.99, dim=1)).all()
