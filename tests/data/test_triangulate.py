@@ -100,6 +100,14 @@ def test_points_whose_rays_are_nearly_parallel_are_dropped(tmp_path: Path):
     assert not len(triangulate.triangulate_again(posed.points, posed.T_world_camera, posed.lenses, range(9)).uv_px)
 
 
+def test_without_an_observation_that_counts_there_are_no_points(tmp_path: Path):
+    disk.write_colmap(tmp_path, disk.survey())
+    posed = read_posed(tmp_path, False)
+    assert posed.points is not None
+    found = triangulate.triangulate_again(posed.points, posed.T_world_camera, posed.lenses, ())
+    assert found.xyz_world.shape == (0, 3)
+
+
 def test_nothing_of_a_held_out_photograph_reaches_a_rendering(tmp_path: Path):
     truth = disk.survey()
     held_out = {sorted(truth.names)[i] for i in every_eighth(9)[1]}

@@ -136,6 +136,10 @@ def test_an_equivalent_focal_length_is_by_the_diagonal_of_the_whole_sensor(tmp_p
     assert focal(tmp_path / "e", (1280, 720), small) == pytest.approx(focal(tmp_path / "f", (1280, 960), small))
 
 
+def test_a_focal_length_of_nearly_nothing_has_no_crop_factor(tmp_path):
+    focal(tmp_path, (120, 80), {Base.FocalLength: 1e-320, Base.FocalLengthIn35mmFilm: 65535})
+
+
 def test_a_focal_plane_resolution_is_for_the_picture_that_the_camera_wrote(tmp_path):
     tags = {
         Base.FocalLength: 4.3,

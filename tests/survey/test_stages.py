@@ -1,6 +1,7 @@
 """Stages run once, run again with all that follow when something changes, and continue after an interruption."""
 
 import json
+import math
 import time
 from pathlib import Path
 
@@ -94,7 +95,11 @@ def test_a_damaged_record_is_an_error(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "record", [3, {"seconds": "x"}, {"seconds": 1e999}, {"facts": []}, {"done": 1}, {"files": [1]}, {"files": None}]
+    "record",
+    [
+        *(3, {"seconds": "x"}, {"seconds": 1e999}, {"facts": []}, {"facts": {"a": [math.nan]}}, {"done": 1}),
+        *({"files": [1]}, {"files": None}),
+    ],
 )
 def test_a_stage_whose_record_has_another_form_is_done_again_with_one_warning(
     record: object, pipeline: Pipeline, caplog: pytest.LogCaptureFixture

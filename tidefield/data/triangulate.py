@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -303,9 +304,9 @@ def triangulate_again(
 
     def total(values: Float64[np.ndarray, "O *D"]) -> Float64[np.ndarray, "P *D"]:
         """Sums over the observations of each point."""
-        flat = values.reshape(len(values), -1)
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
         sums = [np.bincount(point, weights=column, minlength=len(kept)) for column in flat.T]
-        return np.stack(sums, axis=1).reshape(len(kept), *values.shape[1:])
+        return np.stack(sums, axis=1).reshape(len(kept), *values.shape[1:]).astype(np.float64)
 
     ray = np.einsum("oij,oj->oi", R, np.column_stack([xy, np.ones(len(xy))]))
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)

@@ -181,7 +181,17 @@ def _is_record(record: object) -> bool:
         and isinstance(record.get("facts", {}), dict)
         and isinstance(files := record.get("files", []), list)
         and all(isinstance(file, str) for file in files)
+        and _is_finite(record)
     )
+
+
+def _is_finite(value: object) -> bool:
+    """Whether all numbers in a record are finite; this program writes no others."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError:
+        return False
+    return True
 
 
 def _digest(value: object) -> str:

@@ -159,7 +159,7 @@ def _film_equivalent_px(metadata: PhotographMetadata, width: int, height: int) -
     equivalent_mm = metadata.exif.number(ExifTags.Base.FocalLengthIn35mmFilm)
     crop = equivalent_mm / metadata.exif.number(ExifTags.Base.FocalLength)
     columns, rows = width, height
-    if crop > 0:
+    if 0 < crop < math.inf:
         columns, rows = _uncropped_px(width, height, next(shape for limit, shape in _SHAPES if crop < limit))
     return equivalent_mm / _FILM_DIAGONAL_MM * math.hypot(columns, rows)
 
