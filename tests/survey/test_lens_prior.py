@@ -136,6 +136,13 @@ def test_an_equivalent_focal_length_is_by_the_diagonal_of_the_whole_sensor(tmp_p
     assert focal(tmp_path / "e", (1280, 720), small) == pytest.approx(focal(tmp_path / "f", (1280, 960), small))
 
 
+def test_the_sensor_of_a_camera_without_an_equivalent_is_looked_up(tmp_path):
+    pytest.importorskip("lensfunpy", reason="lensfunpy is not installed (the extra [lensfun])")
+    tags = {Base.Make: "Canon", Base.Model: "Canon EOS 5D Mark II", Base.FocalLength: 24.0}
+    assert focal(tmp_path / "a", (1200, 800), tags) == pytest.approx(24 / 36 * 1200, rel=1e-3)
+    assert math.isnan(focal(tmp_path / "b", (1200, 800), {**tags, Base.Make: "Nobody", Base.Model: "X"}))
+
+
 def test_a_focal_length_of_nearly_nothing_has_no_crop_factor(tmp_path):
     focal(tmp_path, (120, 80), {Base.FocalLength: 1e-320, Base.FocalLengthIn35mmFilm: 65535})
 

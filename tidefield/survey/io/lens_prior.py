@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags
@@ -42,7 +44,8 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
     """Derive the best lens prior that a file's metadata allow, or None.
 
     In order of preference: the maker's calibration (DJI's dewarp data, Pix4D's namespace), DJI's design focal length,
-    EXIF's focal length over a sensor of known width, its 35 mm equivalent, its focal plane resolution.
+    EXIF's focal length over a sensor of known width, its 35 mm equivalent, its focal plane resolution, and the crop
+    factor that lensfun's database has of the camera (the extra `lensfun`).
 
     Args:
         width, height: size of the image as stored, in pixels.
@@ -61,6 +64,8 @@ def lens_prior(metadata: PhotographMetadata, width: int, height: int, orientatio
                 * max(width, height)
             ),
         }
+        if not any(px > 0 for px in nominal.values()):
+            nominal["EXIF focal length and lensfun's crop factor"] = _lensfun_px(metadata, width, height)
         prior = next((LensPrior(px, None, None, source, False) for source, px in nominal.items() if px > 0), None)
     smallest, largest = (side * max(width, height) for side in _FOCAL_IN_WIDTHS)
     if prior is None or not smallest < prior.focal_px < largest:
@@ -157,7 +162,29 @@ def _sensor_table_px(metadata: PhotographMetadata, width: int, height: int) -> f
 def _film_equivalent_px(metadata: PhotographMetadata, width: int, height: int) -> float:
     """EXIF's 35 mm equivalent, which is for the whole sensor, also where the image is a crop of it; NaN if absent."""
     equivalent_mm = metadata.exif.number(ExifTags.Base.FocalLengthIn35mmFilm)
-    crop = equivalent_mm / metadata.exif.number(ExifTags.Base.FocalLength)
+    return _equivalent_px(equivalent_mm, equivalent_mm / metadata.exif.number(ExifTags.Base.FocalLength), width, height)
+
+
+def _lensfun_px(metadata: PhotographMetadata, width: int, height: int) -> float:
+    """EXIF's focal length times the crop factor of the camera's sensor; NaN if one of them is unknown."""
+    crop = _crop_factor(metadata.text(ExifTags.Base.Make, "Make"), metadata.text(ExifTags.Base.Model, "Model"))
+    return _equivalent_px(metadata.exif.number(ExifTags.Base.FocalLength) * crop, crop, width, height)
+
+
+@lru_cache
+def _crop_factor(make: str, model: str) -> float:
+    """The crop factor of a camera in lensfun's database; NaN if it is not there, or lensfunpy is not installed."""
+    try:
+        import lensfunpy
+    except ImportError:
+        return math.nan
+    database: Any = lensfunpy.Database()  # type: ignore[attr-defined]
+    found = database.find_cameras(make, model) if make and model else []
+    return found[0].crop_factor if found else math.nan
+
+
+def _equivalent_px(equivalent_mm: float, crop: float, width: int, height: int) -> float:
+    """The focal length of which the equivalent for 35 mm film is known, for the diagonal of the whole sensor."""
     columns, rows = width, height
     if 0 < crop < math.inf:
         columns, rows = _uncropped_px(width, height, next(shape for limit, shape in _SHAPES if crop < limit))
