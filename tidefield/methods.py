@@ -141,27 +141,22 @@ def trained(
     Raises:
         RunError: the run has not been trained, or is damaged.
     """
-    from tidefield.model.renderer import Renderer
     from tidefield.model.rendering import with_rays
     from tidefield.train.checkpoint import load_network
-    from tidefield.train.loop import SceneTrainer
 
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver
 
         with driver.renderer(folder) as render:
-            yield with_rays(render, sampling.rays_per_side or 1), driver.progress_of(folder)
+            yield with_rays(render, sampling), driver.progress_of(folder)
         return
     if isinstance(run.config, OpensplatConfig):
         from tidefield.baselines import opensplat
 
-        render = with_rays(opensplat.renderer(folder, device), sampling.rays_per_side or 1)
+        render = with_rays(opensplat.renderer(folder, device), sampling)
         yield render, opensplat.progress_of(folder)
         return
     trainer = make_trainer(run.config, scene, run.seed, device)
     progress = load_network(folder, trainer.network)
     trainer.network.eval()
-    if isinstance(trainer, SceneTrainer):
-        yield Renderer(trainer.network, scene, trainer.config, device, sampling), progress
-    else:
-        yield with_rays(trainer.renderer(), sampling.rays_per_side or 1), progress
+    yield trainer.renderer(sampling), progress

@@ -86,7 +86,7 @@ def test_several_rays_give_the_mean_of_their_colours_and_of_their_inverse_depths
         values = torch.arange(1.0, camera.width * camera.height + 1).reshape(camera.height, camera.width)
         return Rendering(values[..., None].expand(-1, -1, 3) / 100, 1 / values, values / 100)
 
-    view = with_rays(render, 2)(wall.cameras(1, 4, 2))
+    view = with_rays(render, Sampling(rays_per_side=2))(wall.cameras(1, 4, 2))
     assert view.colour.shape == (2, 4, 3)
     first = torch.tensor([1.0, 2.0, 9.0, 10.0]).mean()
     torch.testing.assert_close(view.colour[0, 0], first.expand(3) / 100)

@@ -1,6 +1,7 @@
 """Sparse points from posed photographs: found where there are none, and placed by training photographs alone."""
 
 import logging
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,16 @@ def test_kept_points_that_are_damaged_are_found_again(hills: Path, tmp_path: Pat
     assert first is not None
     assert again is not None
     assert torch.equal(again.xyz_world, first.xyz_world)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such permissions")
+def test_points_of_a_cache_that_others_can_write_to_are_not_used(
+    hills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    load_scene(hills, cache=tmp_path)
+    tmp_path.chmod(0o777)
+    monkeypatch.setattr(triangulate, "triangulate", lambda *_: None)
+    assert load_scene(hills, cache=tmp_path).points is None
 
 
 def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, caplog: pytest.LogCaptureFixture):

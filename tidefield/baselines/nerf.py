@@ -17,12 +17,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tidefield.config import NerfConfig
+from tidefield.config import USUAL_SAMPLING, NerfConfig, Sampling
 from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.compositing import composite, weights
-from tidefield.model.rendering import Render, Rendering
+from tidefield.model.rendering import Render, Rendering, with_rays
 from tidefield.model.sampling import sample
 from tidefield.train.loop import Trainer
 
@@ -191,8 +191,8 @@ class NerfTrainer(Trainer):
             errors.append(F.mse_loss(colour, truth))
         return errors[0] + errors[1], errors[1].detach()
 
-    def renderer(self) -> Render:
-        return make_render(self.nerf, self.scene, self.device)
+    def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
+        return with_rays(make_render(self.nerf, self.scene, self.device), sampling)
 
 
 def draw_pixels(

@@ -29,20 +29,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from PIL import Image
 
 from tidefield.baselines.export import at_common_exposure, exposure_factor, point_colours
+from tidefield.baselines.job_file import JOB_FILE, failure, read_job
 from tidefield.baselines.splats import Splats, read_splats, render_splats
-from tidefield.config import Budget, Range, from_json
+from tidefield.config import Budget
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.curves import SHARES, QualityCurve
-from tidefield.files import delete_files, read_json, write_json
+from tidefield.files import delete_files, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
@@ -58,16 +59,11 @@ SAVE_EVERY_CPU, SAVE_EVERY_GPU = 10, 100
 """Steps between saves where the budget is one of minutes: what was trained after the last is lost."""
 BACKGROUND_RGB = (0.6130, 0.0101, 0.3984)
 """Behind all Gaussians: those are trained to look right before it."""
-FOLDER, JOB_FILE, LOG_FILE, SPLATS_FILE = "opensplat", "job.json", "log", "splat.ply"
+FOLDER, LOG_FILE, SPLATS_FILE = "opensplat", "log", "splat.ply"
 VERSION_SECONDS, END_SECONDS = 60, 30
-"""The program may take so long to tell its version, and to end when it is told to."""
+"""Time limits: for printing its version, and for ending after SIGTERM."""
 LEAST_POINTS = 4
 """OpenSplat's first Gaussians are as large as the distances to their three nearest neighbours."""
-_JOB = {
-    "factor": tuple[(Annotated[float, Range(1e-9, 1)],) * 3],
-    "trained": tuple[Annotated[int, Range(0, (1 << 63) - 1)], Annotated[float, Range(0, 1e12)]],
-}
-"""Types of what job.json holds."""
 
 
 def find(given: Path | None) -> Path:
@@ -192,7 +188,7 @@ def train(
             process.wait()
     if not is_over:
         if process.returncode or not (out / SPLATS_FILE).is_file():
-            raise _failed(out)
+            raise failure("OpenSplat", out / LOG_FILE, "train")
         saves.append(_Save(steps, elapsed, out / SPLATS_FILE))
     elif not saves:
         raise RunError(
@@ -272,32 +268,14 @@ def _lines(process: subprocess.Popen[str], out: Path) -> Iterator[str]:
             yield line
 
 
-def _failed(out: Path) -> RunError:
-    tail = (out / LOG_FILE).read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-    return RunError(
-        f"OpenSplat ended before it was done ({tail[0][:200] if tail else 'no message'}): expected it to train; read "
-        f"{out / LOG_FILE}"
-    )
-
-
 def progress_of(folder: Path) -> TrainingProgress:
     """How far a run has trained.
 
     Raises:
         RunError: not to its end.
     """
-    step, seconds = _read_job(folder)["trained"]
+    step, seconds = read_job(folder / FOLDER / JOB_FILE, "splats")["trained"]
     return TrainingProgress(step, seconds)
-
-
-def _read_job(folder: Path) -> dict[str, Any]:
-    path = folder / FOLDER / JOB_FILE
-    job = read_json(path) or {}
-    if not isinstance(job, dict):
-        raise RunError(f"{path} is damaged: expected what training wrote; train it with --overwrite")
-    if "trained" not in job:
-        raise RunError(f"{folder} has not been trained to its end: expected splats; train it with --overwrite")
-    return {name: from_json(kind, job.get(name), f"{path}: {name}") for name, kind in _JOB.items()}
 
 
 def renderer(folder: Path, device: torch.device) -> Render:
@@ -307,7 +285,7 @@ def renderer(folder: Path, device: torch.device) -> Render:
         RunError: it has not been trained to its end.
         SceneError: its splats are damaged.
     """
-    factor = torch.tensor(_read_job(folder)["factor"])
+    factor = torch.tensor(read_job(folder / FOLDER / JOB_FILE, "splats")["factor"])
     splats = read_splats(folder / FOLDER / SPLATS_FILE)
     return lambda camera: _render(splats, camera, factor, device)
 

@@ -1,4 +1,4 @@
-"""`tidefield cache`: show or empty the cache of decoded photographs."""
+"""`tidefield cache`: show or empty the cache of decoded photographs and triangulated points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cache:
-    """Show the cache of decoded photographs, or empty it.
+    """Show the cache of decoded photographs and triangulated points, or empty it.
 
     A scene that is opened for the first time at a width is decoded into one file of the cache. When a new file does not
     fit, those that were not used for the longest time are deleted. The environment variable TIDEFIELD_CACHE_GB sets the

@@ -1,13 +1,15 @@
 """The user's cache of decoded photographs and triangulated points: its folder, its size, and what is deleted from it.
 
-Each file of it holds the photographs of one scene at one width (`data.images`) or its points (`data.triangulate`), and
-is touched when it is used.
-Before another is written, the files that were not used for the longest time are deleted until it fits.
+Each file of it holds the photographs of one scene at one width (`data.images`) or its points (`data.triangulate`), is
+named by a hash of everything that its content depends on, and is touched when it is used. Before another is written,
+the files that were not used for the longest time are deleted until it fits.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import os
 import stat
 import time
@@ -60,12 +62,28 @@ def cache_folder() -> Path | None:
     return folder if folder.is_absolute() else None  # platformdirs before 4.5 returns "~/.cache"
 
 
-def refuse_shared(folder: Path) -> None:
-    """Raise a PermissionError for a cache folder in which others can put pixels: only a file's size is checked."""
+def open_folder(folder: Path) -> None:
+    """Make a cache folder if it is not there; raise a PermissionError for one in which others can put files.
+
+    What is read from it is hardly checked.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     status = folder.stat()
     # Windows has no such bits; there the folder belongs to the user's profile.
     if os.name == "posix" and (status.st_uid != os.geteuid() or status.st_mode & stat.S_IWOTH):
         raise PermissionError(errno.EPERM, "others own it or can write to it")
+
+
+def identity(path: Path) -> tuple[str, int, int]:
+    """Where a file is, its size and when it was changed: what must be the same for what was made of it to be used."""
+    status = path.stat()
+    return str(path.resolve()), status.st_size, status.st_mtime_ns
+
+
+def key(parts: object) -> str:
+    """Name a file of the cache by what its content depends on, as JSON."""
+    text = json.dumps(parts, sort_keys=True)
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
 def limit_bytes() -> float:

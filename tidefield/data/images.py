@@ -7,8 +7,6 @@ a scene that is opened again at the same width is not decoded again.
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import logging
 import os
 from collections import deque
@@ -25,7 +23,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from tidefield.data.cache import SUFFIX, cache_folder, make_room, refuse_shared
+from tidefield.data.cache import SUFFIX, cache_folder, identity, key, make_room, open_folder
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_file
@@ -110,6 +108,11 @@ class PhotographFile:
     has_alpha: bool
     mask: Path | None = None
 
+    def at_width(self, width: int | None) -> PhotographFile:
+        """The same file, to be read at a width with its aspect kept; never enlarged, at its own where None is given."""
+        own = min(width or self.lens.width, self.lens.width)
+        return replace(self, width=own, height=max(1, round(self.lens.height * own / self.lens.width)))
+
     @property
     def bytes(self) -> int:
         return self.width * self.height * (3 + self.has_alpha + (self.mask is not None))
@@ -170,8 +173,7 @@ def open_photographs(
     store = folder / f"{_key(files, background_rgb)}{SUFFIX}"
     expected = sum(file.bytes for file in files)
     try:
-        store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        refuse_shared(store.parent)
+        open_folder(store.parent)
         if store.is_file() and store.stat().st_size == expected:
             os.utime(store)
         else:
@@ -204,15 +206,13 @@ def open_photographs(
 def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
     parts = []
     for file in files:
-        status = file.path.stat()
-        about = {**asdict(file), "path": str(file.path.resolve())}
+        path, *version = identity(file.path)
+        about = {**asdict(file), "path": path}
         del about["mask"]
-        parts.append([about, status.st_size, status.st_mtime_ns])
+        parts.append([about, *version])
         if file.mask is not None:
-            status = file.mask.stat()
-            parts.append([str(file.mask.resolve()), status.st_size, status.st_mtime_ns])
-    text = json.dumps([_PIXELS_VERSION, background_rgb, parts], sort_keys=True)
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+            parts.append(identity(file.mask))
+    return key([_PIXELS_VERSION, background_rgb, parts])
 
 
 def read_at_size(
@@ -297,8 +297,8 @@ def rectify_mask(
     return rectify(255 * mask[..., None].astype(np.uint8), lens, width, height)[..., 0] == 255
 
 
-def read_mask(path: Path, size: tuple[int, int], photograph: Path) -> Bool[np.ndarray, "H W"]:
-    """Read a mask: False where it is black, that is where the photograph is not to be used.
+def read_mask(path: Path | None, size: tuple[int, int], photograph: Path) -> Bool[np.ndarray, "H W"]:
+    """Read a mask: False where it is black, that is where the photograph is not to be used; without one, all is used.
 
     Args:
         size: width and height of the photograph.
@@ -307,6 +307,8 @@ def read_mask(path: Path, size: tuple[int, int], photograph: Path) -> Bool[np.nd
     Raises:
         SceneError: the mask cannot be read, or has another size than the photograph.
     """
+    if path is None:
+        return np.ones(size[::-1], dtype=bool)
     with _open_mask(path, size, photograph) as picture:
         return np.asarray(picture.convert("L")) > 0
 

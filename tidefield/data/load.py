@@ -117,9 +117,7 @@ def load_scene(
     masks = posed.masks or (None,) * len(posed.names)
     for path, lens, mask in zip(posed.paths, posed.lenses, masks, strict=True):
         own, has_alpha = own_lens(path, lens)
-        new_width = min(width or own.width, own.width)
-        new_height = max(1, round(own.height * new_width / own.width))
-        files.append(PhotographFile(path, own, new_width, new_height, has_alpha, mask))
+        files.append(PhotographFile(path, own, own.width, own.height, has_alpha, mask).at_width(width))
     train, test = every_eighth(len(posed.names))
     if posed.split is not None:
         train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
@@ -176,10 +174,7 @@ def at_width(scene: Scene, width: int, progress: Progress | None = None, cache: 
         width, progress, cache: see `load_scene`.
     """
     require_width(width)
-    files = []
-    for file in scene.photographs.files:
-        own = min(width, file.lens.width)
-        files.append(replace(file, width=own, height=max(1, round(file.lens.height * own / file.lens.width))))
+    files = [file.at_width(width) for file in scene.photographs.files]
     size = torch.tensor([(file.width, file.height) for file in files])
     ratio, points = size / scene.cameras.size_px, scene.points
     if points is not None:

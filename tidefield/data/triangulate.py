@@ -5,8 +5,6 @@ Photographs are matched with neighbours by position, near ones for many matches 
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
 import os
@@ -23,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from tidefield.data.cache import POINTS_SUFFIX, cache_folder, make_room, refuse_shared
+from tidefield.data.cache import POINTS_SUFFIX, cache_folder, identity, key, make_room, open_folder
 from tidefield.data.images import Progress, read_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
@@ -161,13 +159,17 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     Returns:
         The points, observed by the photographs used; None where there are fewer than `FEWEST`.
     """
-    import pycolmap
+    with _quiet_pycolmap():
+        features = _find_features(posed, used, progress)
+        return _triangulate(posed, used, features)
 
+
+def _find_features(posed: PosedPhotographs, used: Sequence[int], progress: Progress | None) -> list[Features]:
+    """The features of the photographs used."""
     paths, lenses = [posed.paths[i] for i in used], [posed.lenses[i] for i in used]
     masks = [posed.masks[i] if posed.masks else None for i in used]
     features: list[Features] = []
     with ExitStack() as stack:
-        stack.enter_context(_quiet_pycolmap())
         run = map
         if sum(lens.width * lens.height for lens in lenses) > WORTH_PROCESSES_PX:
             run = stack.enter_context(worker_processes(min(cores(), len(used)), _quiet)).map
@@ -175,6 +177,14 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
             features.append(found)
             if progress:
                 progress(len(features), len(used))
+    return features
+
+
+def _triangulate(posed: PosedPhotographs, used: Sequence[int], features: list[Features]) -> Observations | None:
+    """Match the features of the photographs used, and triangulate what matches."""
+    import pycolmap
+
+    lenses = [posed.lenses[i] for i in used]
     poses = posed.T_world_camera[list(used)]
     T_camera_world = [_inverse(pose) for pose in poses]
 
@@ -192,12 +202,8 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
         model = _model(lenses, T_camera_world, features)
         _write_database(Path(folder) / "database.db", model, dict(zip(pairs, matches, strict=True)))
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads, options.extract_colors = (
-            1,
-            False,
-        )  # with one thread the same photographs give the same points
-        with _quiet_pycolmap():
-            model = pycolmap.triangulate_points(model, Path(folder) / "database.db", folder, folder, options=options)
+        options.num_threads = 1  # then the same photographs give the same points
+        model = pycolmap.triangulate_points(model, Path(folder) / "database.db", folder, folder, options=options)
     points = [model.points3D[key] for key in sorted(model.points3D)]
     if len(points) < FEWEST:
         return None
@@ -227,8 +233,7 @@ def find_points(
         root: of the scene, for messages.
         cache: a folder; the user's if not given.
     """
-    folder = cache or cache_folder()
-    store = folder and folder / f"{_key(posed, used)}{POINTS_SUFFIX}"
+    store = _store(posed, used, cache or cache_folder())
     if store and store.is_file():
         with suppress(ValueError, KeyError, EOFError, BadZipFile):  # damaged: they are found again
             return _read(store)
@@ -250,12 +255,22 @@ def find_points(
     return points
 
 
+def _store(posed: PosedPhotographs, used: Sequence[int], folder: Path | None) -> Path | None:
+    """Where points are kept; None without a folder that can be used, which `open_photographs` tells of."""
+    try:
+        if folder is not None:
+            open_folder(folder)
+            return folder / f"{_key(posed, used)}{POINTS_SUFFIX}"
+    except OSError as error:
+        _log.debug("the cache folder %s cannot be used (%s)", folder, error.strerror)
+    return None
+
+
 def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
     """What the points depend on, as a file's name."""
-    paths = [*posed.paths, *(mask for mask in posed.masks if mask is not None)]
-    files = [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
-    parts = [_VERSION, files, [asdict(lens) for lens in posed.lenses], posed.T_world_camera.tolist(), list(used)]
-    return hashlib.sha256(json.dumps(parts).encode("utf-8", "surrogateescape")).hexdigest()[:32]
+    files = [identity(path) for path in (*posed.paths, *posed.masks) if path is not None]
+    lenses = [asdict(lens) for lens in posed.lenses]
+    return key([_VERSION, files, lenses, posed.T_world_camera.tolist(), list(used)])
 
 
 def _read(store: Path) -> Observations | None:
@@ -269,8 +284,6 @@ def _keep(points: Observations | None, store: Path) -> None:
     """Write points, or that there are none, unless the cache cannot be used: then they are found again next time."""
     arrays = {} if points is None else {field.name: getattr(points, field.name) for field in fields(points)}
     try:
-        store.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        refuse_shared(store.parent)
         make_room(store.parent, sum(array.nbytes for array in arrays.values()))
         with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
@@ -290,12 +303,11 @@ def triangulate_again(
         points: with observations; where they are at first does not matter.
         used: the photographs whose observations count, such as those that are not held out.
     """
-    mine = np.isin(points.photograph_index, np.asarray(used))
-    point, photograph, uv = points.point_index[mine], points.photograph_index[mine], points.uv_px[mine]
-    xy, focal = np.full(uv.shape, np.nan), np.ones(len(uv))
+    point, photograph, uv = points.point_index, points.photograph_index, points.uv_px
+    xy, focal = np.full(uv.shape, np.nan), np.ones(len(uv))  # of other photographs, none is good below
+    rows = points.by_photograph(len(lenses))
     for i in used:
-        rows = photograph == i
-        xy[rows], focal[rows] = lenses[i].unproject(uv[rows]), (lenses[i].fx + lenses[i].fy) / 2
+        xy[rows[i]], focal[rows[i]] = lenses[i].unproject(uv[rows[i]]), (lenses[i].fx + lenses[i].fy) / 2
     good = np.isfinite(xy).all(axis=1)
     good &= (np.bincount(point[good], minlength=len(points.xyz_world)) >= 2)[point]
     point, photograph, uv, xy, focal = point[good], photograph[good], uv[good], xy[good], focal[good]

@@ -21,7 +21,7 @@ from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.cache import CacheFull, FeatureCache
 from tidefield.model.network import Network
-from tidefield.model.rendering import Rendering, fill_unseen, with_rays
+from tidefield.model.rendering import Rendering, fill_unseen, render_with_rays
 from tidefield.model.sampling import Tiles
 from tidefield.model.views import Views
 from tidefield.parallel import in_parallel
@@ -72,7 +72,7 @@ class Renderer:
     def __call__(self, camera: Cameras) -> Rendering:
         """Render the view of one camera, at its own gain, from its sources (`Scene.sources`)."""
         side = self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
-        return with_rays(self._render, side)(camera)
+        return render_with_rays(self._render, camera, side)
 
     @torch.inference_mode()
     def _render(self, camera: Cameras) -> Rendering:

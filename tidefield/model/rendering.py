@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
+from tidefield.config import Sampling
 from tidefield.geometry.cameras import Cameras
 
 
@@ -58,13 +59,16 @@ Render = Callable[[Cameras], Rendering]
 """A method: takes one camera (a `Cameras` of length 1) and returns its view in full size."""
 
 
-def with_rays(render: Render, side: int) -> Render:
+def with_rays(render: Render, sampling: Sampling) -> Render:
+    """Render with several rays per pixel if they are asked for (one otherwise)."""
+    return lambda camera: render_with_rays(render, camera, sampling.rays_per_side or 1)
+
+
+def render_with_rays(render: Render, camera: Cameras, side: int) -> Rendering:
     """Render with side x side rays per pixel: the mean colour and opacity, and the depth of the mean inverse depth."""
-
-    def render_larger(camera: Cameras) -> Rendering:
-        view = render(camera.resized(side * camera.width, side * camera.height))
-        colour = F.avg_pool2d(view.colour.permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
-        inverse_depth, opacity = F.avg_pool2d(torch.stack([1 / view.depth, view.opacity])[None], side)[0]
-        return Rendering(colour=colour, depth=1 / inverse_depth, opacity=opacity)
-
-    return render if side == 1 else render_larger
+    if side == 1:
+        return render(camera)
+    view = render(camera.resized(side * camera.width, side * camera.height))
+    colour = F.avg_pool2d(view.colour.permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
+    inverse_depth, opacity = F.avg_pool2d(torch.stack([1 / view.depth, view.opacity])[None], side)[0]
+    return Rendering(colour=colour, depth=1 / inverse_depth, opacity=opacity)

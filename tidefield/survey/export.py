@@ -133,10 +133,7 @@ def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
     """
     for photograph in photographs:
         size = photograph.width, photograph.height
-        used = np.ones(size[::-1], dtype=bool)
-        if photograph.mask is not None:
-            used = read_mask(photograph.mask, size, photograph.path)
-        write_mask(folder / f"{photograph.name}.png", used)
+        write_mask(folder / f"{photograph.name}.png", read_mask(photograph.mask, size, photograph.path))
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:

@@ -226,8 +226,7 @@ def _write_masks(posed: PosedPhotographs, lenses: Sequence[LensModel], folder: P
         lenses: of the photographs' files.
     """
     for name, path, lens, own, mask in zip(posed.names, posed.paths, posed.lenses, lenses, posed.masks, strict=True):
-        size = own.width, own.height
-        used = np.ones(size[::-1], dtype=bool) if mask is None else read_mask(mask, size, path)
+        used = read_mask(mask, (own.width, own.height), path)
         if lens != own:
             used = rectify_mask(used, own, own.width, own.height)
         write_mask(folder / f"{name}.png", used)

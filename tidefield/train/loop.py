@@ -18,7 +18,7 @@ from rich.console import Console
 from tensorboardX import SummaryWriter
 from torch import nn
 
-from tidefield.config import Budget, Config
+from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
@@ -90,7 +90,7 @@ class Trainer(ABC):
         """Draw a batch; returns its loss, and the mean squared error of its colours."""
 
     @abstractmethod
-    def renderer(self) -> Render:
+    def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
         """The trained method so far; the network is in evaluation mode."""
 
     def views(self, cameras: Sequence[Cameras]) -> list[Rendering]:
@@ -178,8 +178,8 @@ class SceneTrainer(Trainer):
             self.scene, self.priors, self.cameras, self.config.network.views, self.generator, self.precision
         )
 
-    def renderer(self) -> Render:
-        return Renderer(self.network, self.scene, self.config, self.device)
+    def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
+        return Renderer(self.network, self.scene, self.config, self.device, sampling)
 
 
 def train(

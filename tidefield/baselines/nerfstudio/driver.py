@@ -21,6 +21,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from tidefield.baselines.export import point_colours
+from tidefield.baselines.job_file import JOB_FILE, failure, read_job
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget, Range, from_json
 from tidefield.data.images import write_mask
@@ -28,7 +29,7 @@ from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, QualityCurve
-from tidefield.files import delete_files, read_json, write_json
+from tidefield.files import delete_files, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
@@ -36,15 +37,13 @@ from tidefield.processes import end_with_parent
 from tidefield.train.checkpoint import TrainingProgress
 
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
-JOB_FILE, LOG_FILE, DATA, CURVE = "job.json", "nerfstudio.log", "data", "curve"
+LOG_FILE, DATA, CURVE = "nerfstudio.log", "data", "curve"
 KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
 """What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
-"""A worker may take so long to end."""
-_TRAINED = tuple[Annotated[int, Range(0, (1 << 63) - 1)], Annotated[float, Range(0, 1e12)]]
-_FACTOR = tuple[(Annotated[float, Range(1e-9, 1)],) * 3]
+"""Time limit for a worker that renders to end."""
 _BACKGROUND = tuple[(Annotated[float, Range(0, 1)],) * 3]
-"""Types of what job.json holds."""
+"""Type of the colour behind objects in job.json."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def train(
                 curve.write(folder)
             progress(last["step"], last["seconds"])
     if not last.get("done"):
-        raise _failed(folder)
+        raise failure("nerfstudio", folder / LOG_FILE, "train and render")
     write_json(folder / JOB_FILE, {**job, "checkpoint": last["checkpoint"], "trained": [last["step"], last["seconds"]]})
     return progress_of(folder)
 
@@ -195,7 +194,7 @@ class _Process:
     def answer(self) -> dict[str, Any]:
         found = next(self.lines(), None)
         if found is None:
-            raise _failed(self.folder)
+            raise failure("nerfstudio", self.folder / LOG_FILE, "train and render")
         return found
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
@@ -232,26 +231,13 @@ def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process
                 process.wait()
 
 
-def _failed(folder: Path) -> RunError:
-    tail = (folder / LOG_FILE).read_text(encoding="utf-8").strip().splitlines()[-1:]
-    return RunError(
-        f"nerfstudio ended before it was done ({tail[0] if tail else 'no message'}): expected it to train and "
-        f"render; read {folder / LOG_FILE}"
-    )
-
-
 def _read_job(folder: Path) -> tuple[tuple[int, float], Colours]:
     """Steps and seconds of a training that is complete, and the colours of its scene."""
     path = folder / JOB_FILE
-    job = read_json(path) or {}
-    if not isinstance(job, dict):
-        raise RunError(f"{path} is damaged: expected what training wrote; train it with --overwrite")
-    if "trained" not in job:
-        raise RunError(f"{folder} has not been trained to its end: expected a checkpoint; train it with --overwrite")
-    factor = torch.tensor(from_json(_FACTOR, job.get("factor"), f"{path}: factor"))
+    job = read_job(path, "a checkpoint")
     # Of version 0.1, which exported no alpha, there is none.
     background = job.get("background") and from_json(_BACKGROUND, job["background"], f"{path}: background")
-    return from_json(_TRAINED, job["trained"], f"{path}: trained"), Colours(factor, background)
+    return job["trained"], Colours(torch.tensor(job["factor"]), background)
 
 
 def export(scene: Scene, folder: Path) -> Colours:
