@@ -1,12 +1,12 @@
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tidefield.geometry.cameras import Cameras, angle_between, intersect_axes, pixel_grid
+from tidefield.geometry.cameras import Cameras, angle_between, concatenate, intersect_axes, pixel_grid
 
 
 def turned(angles: tuple[float, float, float]) -> Tensor:
@@ -34,6 +34,16 @@ def cameras() -> Cameras:
     )
 
 
+def bent() -> Cameras:
+    """The same cameras, with lenses that move pixels by up to 3 of them."""
+    own = cameras()
+    residual = 0.02 * torch.randn(3, 6, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    return replace(own, residual=residual)
+
+
+with_and_without_residual = pytest.mark.parametrize("own", [cameras(), bent()], ids=["pinhole", "residual"])
+
+
 def world_points(count: int = 6) -> Tensor:
     return 5 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -57,15 +67,44 @@ def test_the_projection_matrix_is_what_project_uses():
     torch.testing.assert_close((homogeneous[:, :2] / homogeneous[:, 2:]).transpose(1, 2), uv)
 
 
-def test_unprojecting_to_a_depth_and_projecting_is_the_identity():
-    own = cameras()
+@with_and_without_residual
+def test_unprojecting_to_a_depth_and_projecting_is_the_identity(own: Cameras):
     generator = torch.Generator().manual_seed(1)
     uv = 40 * torch.rand(3, 8, 2, generator=generator, dtype=torch.float64)
     depth = 1 + 5 * torch.rand(3, 8, generator=generator, dtype=torch.float64)
     points = own.position_world[:, None] + own.directions_world(uv) * depth[..., None]
     pixels, z = own.project(points)
-    torch.testing.assert_close(pixels, uv)
+    torch.testing.assert_close(pixels, uv, atol=1e-5, rtol=0)
     torch.testing.assert_close(z, depth)
+
+
+def test_a_lens_residual_moves_pixels_by_its_polynomial():
+    own = bent()
+    points = own.position_world[0] + own.directions_world(own.size_px[:, None] * 0.8)[0] * 3
+    u, v = replace(own, residual=None).project(points)[0][0, 0].tolist()
+    x, y = ((a - float(b)) / float(f) for a, b, f in zip((u, v), own.principal_px[0], own.focal_px[0], strict=True))
+    assert own.residual is not None
+    moved = torch.tensor([1, x, y, x * x, x * y, y * y], dtype=torch.float64) @ own.residual[0] * own.focal_px[0]
+    torch.testing.assert_close(own.project(points)[0][0, 0], torch.tensor([u, v], dtype=torch.float64) + moved)
+    assert 0.1 < moved.norm() < 3
+
+
+def test_a_lens_residual_folds_nothing_into_the_picture():
+    own = bent()
+    far = 10.0 ** torch.arange(0, 7)
+    for side in ([1.0, 0.3], [-0.2, 1.0], [-1.0, -1.0]):
+        xyz = torch.cat([far[:, None] * torch.tensor(side), torch.ones(7, 1)], 1).double()
+        points = own.position_world[:, None] + xyz @ own.T_world_camera[:, :, :3].transpose(1, 2)
+        distance = (own.project(points)[0] - own.principal_px[:, None]).norm(dim=-1)
+        assert (distance.diff() > 0).all()
+
+
+def test_cameras_with_and_without_a_residual_are_joined():
+    own, plain = bent(), cameras()
+    both = concatenate([plain, own])
+    torch.testing.assert_close(both.project(world_points())[0][:3], plain.project(world_points())[0])
+    torch.testing.assert_close(both.project(world_points())[0][3:], own.project(world_points())[0])
+    assert concatenate([plain, plain]).residual is None
 
 
 def test_the_principal_point_looks_forward_with_x_right_and_y_down():
@@ -93,8 +132,9 @@ def test_points_behind_and_in_the_cameras_plane_have_z_of_zero_or_less():
     assert uv.isfinite().all()
 
 
-def test_a_resized_camera_projects_to_scaled_pixels():
-    own, points = cameras(), world_points()
+@with_and_without_residual
+def test_a_resized_camera_projects_to_scaled_pixels(own: Cameras):
+    points = world_points()
     uv, z = own.project(points)
     small = own.resized(16, 24)
     assert (small.size_px == torch.tensor([16, 24])).all()
@@ -103,15 +143,16 @@ def test_a_resized_camera_projects_to_scaled_pixels():
     torch.testing.assert_close(same, z)
 
 
-def test_a_cropped_camera_keeps_its_pixels():
-    own, points = cameras(), world_points()
+@with_and_without_residual
+def test_a_cropped_camera_keeps_its_pixels(own: Cameras):
+    points = world_points()
     cut = own.cropped(20, 70)
     assert (cut.size_px == torch.tensor([20, 70])).all()
     torch.testing.assert_close(cut.project(points), own.project(points))
 
 
 def test_indexing_keeps_the_order_of_the_indices():
-    own = cameras()
+    own = bent()
     assert len(own) == 3
     assert len(own[1]) == 1
     assert (own[1].width, own[1].height) == (80, 60)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from tidefield.data.calibrate import calibrate_lenses
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains
 from tidefield.data.holdout import read_holdout
@@ -150,6 +151,8 @@ def load_scene(
         near_far=_float32(near_far),
         gain=torch.ones(len(pinholes), 3),
     )
+    if sparse is not None:
+        cameras, sparse = calibrate_lenses(cameras, sparse, posed.lenses, train)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths), posed.divided_by)
     return Scene(

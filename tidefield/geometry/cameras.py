@@ -2,12 +2,12 @@
 
 Conventions (OpenCV): +x right, +y down, +z forward; pixel centres at +0.5, so an image of width W spans
 u in [0, W]. `T_world_camera` maps camera coordinates into the world. Lens distortion has been removed before
-a `Cameras` exists (see `geometry.lenses`).
+a `Cameras` exists (see `geometry.lenses`), but for the small `residual` that a scene's calibration may have left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import PurePath
 
@@ -21,11 +21,16 @@ from tidefield.errors import SceneError
 _PARALLEL = 0.02
 """Smallest eigenvalue of the mean projection across the axes (the mean squared sine of their angle to one direction)
 below which they count as parallel: they lie within 8 degrees of it, and where they meet is ill-determined."""
+RESIDUAL_REACH = 2.0
+"""Tangent of the angle to the axis, across and along, beyond which a lens residual stays as it is there: a polynomial
+would fold the picture of what lies far outside of it back into it. Pinholes reach 1.7 (`lenses.WIDEST_DEG`)."""
+_INVERSE_STEPS = 5
+"""Of the fixed point that inverts a residual: each divides the error by a hundred and more."""
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """V pinhole cameras.
+    """V pinhole cameras, with a small residual of the lens where one was found.
 
     Attributes:
         T_world_camera: camera-to-world rotation and position, world units.
@@ -38,6 +43,8 @@ class Cameras:
         names: of the photographs, to index by; empty where the cameras have none. The view of a scene's own photograph
             is rendered without that photograph, as if it were held out; with `dataclasses.replace(camera, names=())` it
             serves as any other.
+        residual: of the lens, in the plane z = 1: a point that a pinhole shows at (x, y) is shown at (x, y) plus the
+            sum of the six rows times 1, x, y, x^2, x y, y^2 (docs/method.md, section 14). None without.
     """
 
     T_world_camera: Float[Tensor, "V 3 4"]
@@ -47,6 +54,7 @@ class Cameras:
     near_far: Float[Tensor, "V 2"]
     gain: Float[Tensor, "V 3"]
     names: tuple[str, ...] = ()
+    residual: Float[Tensor, "V 6 2"] | None = None
 
     def __len__(self) -> int:
         return self.T_world_camera.shape[0]
@@ -69,10 +77,14 @@ class Cameras:
             names = self.names[index]
         elif self.names and isinstance(index, list):
             names = tuple(self.names[i] for i in index)
-        return Cameras(**{name: getattr(self, name)[index] for name in _TENSORS}, names=names)
+        return self._each(lambda tensor: tensor[index], names)
 
     def to(self, device: torch.device | str) -> Cameras:
-        return Cameras(**{name: getattr(self, name).to(device) for name in _TENSORS}, names=self.names)
+        return self._each(lambda tensor: tensor.to(device), self.names)
+
+    def _each(self, change: Callable[[Tensor], Tensor], names: tuple[str, ...]) -> Cameras:
+        residual = None if self.residual is None else change(self.residual)
+        return Cameras(**{name: change(getattr(self, name)) for name in _TENSORS}, names=names, residual=residual)
 
     @property
     def width(self) -> int:
@@ -95,7 +107,10 @@ class Cameras:
 
     @property
     def projection(self) -> Float[Tensor, "V 3 4"]:
-        """Projection matrices P_i = K_i [R_i | t_i] of the paper to homogeneous pixels and z-depth."""
+        """Projection matrices P_i = K_i [R_i | t_i] of the paper to homogeneous pixels and z-depth.
+
+        They are without the residual, which `displaced` adds.
+        """
         rotation = self.T_world_camera[:, :, :3].transpose(1, 2)
         view = torch.cat([rotation, -rotation @ self.position_world[:, :, None]], dim=2)
         depth = view[:, 2:]
@@ -114,11 +129,27 @@ class Cameras:
         z = homogeneous[..., 2]
         # Keeps the division finite for points in the camera's plane; they are invalid by z <= 0 or out of the image.
         uv = homogeneous[..., :2] / torch.where(z.abs() < 1e-9, 1e-9, z)[..., None]
-        return uv, z
+        return self.displaced(uv), z
+
+    def displaced(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 2"]:
+        """Move pixels of the pinholes to where the lenses' residual shows them."""
+        if self.residual is None:
+            return uv_px
+        focal = self.focal_px[:, None]
+        return uv_px + focal * self._residual_at((uv_px - self.principal_px[:, None]) / focal, self.residual)
+
+    @staticmethod
+    def _residual_at(xy: Float[Tensor, "V P 2"], residual: Float[Tensor, "V 6 2"]) -> Float[Tensor, "V P 2"]:
+        x, y = xy.clamp(-RESIDUAL_REACH, RESIDUAL_REACH).split(1, -1)
+        one, of_x, of_y, of_xx, of_xy, of_yy = (row[:, None] for row in residual.unbind(1))
+        return one + x * (of_x + x * of_xx + y * of_xy) + y * (of_y + y * of_yy)
 
     def directions_world(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
         """Compute ray directions through pixels, scaled to a z-depth of 1."""
-        xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
+        shown = xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
+        if self.residual is not None:
+            for _ in range(_INVERSE_STEPS):
+                xy = shown - self._residual_at(xy, self.residual)
         xyz = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return xyz @ self.T_world_camera[:, :, :3].transpose(1, 2)
 
@@ -139,10 +170,16 @@ class Cameras:
 def concatenate(cameras: Sequence[Cameras]) -> Cameras:
     """Join cameras into one set, without their names."""
     parts = {name: torch.cat([getattr(one, name) for one in cameras]) for name in _TENSORS}
-    return Cameras(**parts, names=())
+    residual = None
+    if any(one.residual is not None for one in cameras):
+        none = [one.focal_px.new_zeros(len(one), 6, 2) for one in cameras]
+        residual = torch.cat(
+            [zeros if one.residual is None else one.residual for one, zeros in zip(cameras, none, strict=True)]
+        )
+    return Cameras(**parts, names=(), residual=residual)
 
 
-_TENSORS = tuple(f.name for f in fields(Cameras) if f.name != "names")
+_TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", "residual"))
 
 
 def find_name(name: str, names: Sequence[str], where: str) -> int:

@@ -123,7 +123,8 @@ class Views:
         homogeneous = products.unflatten(1, (count, 3)).transpose(2, 3)
         z = homogeneous[..., 2:]
         front = z > 1e-6  # points on the camera's plane have no pixel
-        uv = homogeneous[..., :2] / torch.where(front, z, 1.0)
+        uv = self.cameras.displaced((homogeneous[..., :2] / torch.where(front, z, 1.0)).flatten(0, 1))
+        uv = uv.unflatten(0, (tiles, count))
         size = self.cameras.size_px.reshape(tiles, count, 1, 2)
         inside = front[..., 0] & (uv >= 0).all(-1) & (uv <= size).all(-1)
         values, on_map = gather(self.encoded.features[stride], self.which, uv)
