@@ -148,7 +148,8 @@ def test_a_still_comes_with_its_depth_in_world_units(tmp_path: Path):
 def test_a_still_tells_what_made_it_of_which_scene_and_from_where(tmp_path: Path):
     scene = wall.scene(wall.cameras(3))
     scene = replace(scene, root=tmp_path / "Königshafen", origin_world=torch.tensor([4e5, 6e6, 0.1]).double())
-    camera = scene.cameras["02"].resized(24, 18)
+    bent = replace(scene.cameras, residual=torch.full((3, 6, 2), 0.25))
+    camera = bent["02"].resized(24, 18)
     write_still(rendering(), tmp_path / "view.png", about=describe_view(scene, camera))
     for name in ("view.png", "view_depth.png"):
         with Image.open(tmp_path / name) as picture:
@@ -158,6 +159,7 @@ def test_a_still_tells_what_made_it_of_which_scene_and_from_where(tmp_path: Path
         own = json.loads(text["Camera"])
         assert [own[key] for key in ("scene", "photograph", "width", "height")] == ["Königshafen", "02.jpg", 24, 18]
         assert (own["focal_px"], own["principal_px"]) == ([24, 24], [12, 9])
+        assert own["residual"] == [[0.25, 0.25]] * 6
         expected = np.hstack([np.eye(3), [[4e5 + 0.3], [6e6], [0.1]]])
         np.testing.assert_allclose(own["T_world_camera"], expected, rtol=0, atol=1e-6)
         assert "OpenCV" in own["convention"]

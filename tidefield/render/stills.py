@@ -72,6 +72,7 @@ def describe_view(scene: Scene, camera: Cameras) -> dict[str, str]:
         "focal_px": camera.focal_px[0].tolist(),
         "principal_px": camera.principal_px[0].tolist(),
         "T_world_camera": pose.tolist(),
+        "residual": None if camera.residual is None else camera.residual[0].tolist(),
         "convention": CONVENTION,
     }
     return {"Title": title(scene, name), "Camera": json.dumps(own)}
