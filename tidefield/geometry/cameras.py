@@ -136,13 +136,15 @@ class Cameras:
         if self.residual is None:
             return uv_px
         focal = self.focal_px[:, None]
-        return uv_px + focal * self._residual_at((uv_px - self.principal_px[:, None]) / focal, self.residual)
+        xy = (uv_px - self.principal_px[:, None]) / focal
+        return torch.addcmul(uv_px, self._residual_at(xy, self.residual), focal)
 
     @staticmethod
     def _residual_at(xy: Float[Tensor, "V P 2"], residual: Float[Tensor, "V 6 2"]) -> Float[Tensor, "V P 2"]:
         x, y = xy.clamp(-RESIDUAL_REACH, RESIDUAL_REACH).split(1, -1)
         one, of_x, of_y, of_xx, of_xy, of_yy = (row[:, None] for row in residual.unbind(1))
-        return one + x * (of_x + x * of_xx + y * of_xy) + y * (of_y + y * of_yy)
+        along_x = torch.addcmul(torch.addcmul(of_x, x, of_xx), y, of_xy)
+        return torch.addcmul(torch.addcmul(one, x, along_x), y, torch.addcmul(of_y, y, of_yy))
 
     def directions_world(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
         """Compute ray directions through pixels, scaled to a z-depth of 1."""
