@@ -72,7 +72,7 @@ def write_page(runs: Path, out: Path) -> None:
         "# Scales",
         "Held-out views at several widths, by networks that were trained, or scenes that were opened, at one. "
         "*Points*: photographs are read at that one width. *Cones*: they are read where their pixels are about as "
-        "large as what a pixel of the picture shows (method, section 14). *As usual*: cones, and 2 x 2 rays where "
+        "large as what a pixel of the picture shows (method, section 15). *As usual*: cones, and 2 x 2 rays where "
         "pixels are much larger than those of the photographs. PSNR, SSIM and FLIP of doubly seen pixels; the second "
         "PSNR after the colour fit.",
     ]
