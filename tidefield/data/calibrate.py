@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from scipy import sparse
 
 from tidefield.data.scene import SparsePoints
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, project_with_slopes
 
 FEWEST_PHOTOGRAPHS, FEWEST_OBSERVATIONS = 8, 400
 """Training photographs by one lens, and their observations, for it to be calibrated."""
@@ -57,8 +57,14 @@ def calibrate_lenses(
         train: the training photographs.
     """
     train_index = torch.tensor(train)
-    for lens in dict.fromkeys(lenses):
-        mine = torch.tensor([own == lens for own in lenses])
+    by_lens: dict[Hashable, list[int]] = {}
+    for index, lens in enumerate(lenses):
+        by_lens.setdefault(lens, []).append(index)
+    for photographs in by_lens.values():
+        if len(photographs) < FEWEST_PHOTOGRAPHS:
+            continue
+        mine = torch.zeros(len(cameras), dtype=torch.bool)
+        mine[photographs] = True
         if mine[train_index].sum() < FEWEST_PHOTOGRAPHS:
             continue
         residual = _fit(cameras, points, mine, train_index)
@@ -111,12 +117,8 @@ def _errors(cameras: Cameras, points: SparsePoints, chosen: Bool[torch.Tensor, "
     photograph = points.camera_index[chosen].long()
     own, point = points.point_index[chosen].unique(return_inverse=True)
     views = cameras[photograph]
-    pose = views.T_world_camera.double().numpy()
-    rotation = pose[:, :, :3]
     xyz = points.xyz_world[own].double().numpy()[point.numpy()]
-    camera = np.einsum("oij,oi->oj", rotation, xyz - pose[:, :, 3])
-    xy = camera[:, :2] / camera[:, 2:]
-    slope = (rotation[:, :, :2] - rotation[:, :, 2:] * xy[:, None]) / camera[:, 2, None, None]
+    xy, slope = project_with_slopes(views.T_world_camera.double().numpy(), xyz)
     focal, principal = views.focal_px.double(), views.principal_px.double()
     pinhole_px = torch.from_numpy(xy) * focal + principal
     in_double = replace(views, focal_px=focal, principal_px=principal)

@@ -28,6 +28,7 @@ from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.sift import find_features
 from tidefield.errors import RunError
 from tidefield.files import completed_file
+from tidefield.geometry.cameras import project_with_slopes
 from tidefield.geometry.lenses import LensModel
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
@@ -330,10 +331,8 @@ def triangulate_again(
     normal[~wide] = np.eye(3)
     xyz = np.linalg.solve(normal, total(np.einsum("oij,oj->oi", across, centre))[..., None])[..., 0]
     for _ in range(_STEPS):
-        camera = np.einsum("oij,oi->oj", R, xyz[point] - centre)
-        z = np.where(np.abs(camera[:, 2]) > 1e-9, camera[:, 2], 1e-9)
-        projected = camera[:, :2] / z[:, None]
-        slope = (R[:, :, :2] - R[:, :, 2:] * projected[:, None]) / z[:, None, None] * focal[:, None, None]
+        projected, slope = project_with_slopes(T_world_camera[photograph], xyz[point])
+        slope = slope * focal[:, None, None]
         error = (projected - xy) * focal[:, None]
         normal = total(slope @ slope.transpose(0, 2, 1))
         normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)

@@ -181,6 +181,22 @@ def concatenate(cameras: Sequence[Cameras]) -> Cameras:
     return Cameras(**parts, names=(), residual=residual)
 
 
+def project_with_slopes(
+    T_world_camera: Float64[np.ndarray, "O 3 4"], xyz_world: Float64[np.ndarray, "O 3"]
+) -> tuple[Float64[np.ndarray, "O 2"], Float64[np.ndarray, "O 3 2"]]:
+    """Project each point by a pinhole of its own into the plane z = 1.
+
+    Returns:
+        Where it is shown, and the derivative of that with respect to the point.
+    """
+    R = T_world_camera[:, :, :3]
+    camera = np.einsum("oij,oi->oj", R, xyz_world - T_world_camera[:, :, 3])
+    # Keeps the division finite for points in the camera's plane.
+    z = np.where(np.abs(camera[:, 2]) > 1e-9, camera[:, 2], 1e-9)
+    xy = camera[:, :2] / z[:, None]
+    return xy, (R[:, :, :2] - R[:, :, 2:] * xy[:, None]) / z[:, None, None]
+
+
 _TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", "residual"))
 
 
