@@ -176,7 +176,7 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
         "--steps 1000 --seed 3",
         "- brighton_beach: the training photographs (BSD-2-Clause, (c) 2017 Piero Toffanin)",
         "| 1,000 | 25.50 | 20.25 |",
-        "| swindale ² | 24.50 | 21.25 | - | - | - |",
+        "| swindale ² | 24.50 | 21.25 | - | - | - | - |",
     ):
         assert line in text.splitlines(), line
     assert f"SHA-256 `{weights_sha256(file)}`" in text

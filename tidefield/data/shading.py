@@ -170,7 +170,7 @@ class _Model:
         Args:
             start: unknowns near the solution, from which the iterative solution starts.
         """
-        design, seen, own = self.design, self.seen, self.prior.shape[0]
+        design, seen, own = self.design, self.seen, OWN_TERMS * len(self.lens)
         share = weight / np.maximum(np.bincount(seen.point, weight), 1e-12)[seen.point]
         mean = sparse.csr_array((share, (seen.point, np.arange(len(share)))))
         diagonal = np.asarray((design.multiply(design)).T @ weight)
@@ -185,7 +185,7 @@ class _Model:
             return (remaining(design @ x) + prior @ x).ravel()
 
         right = remaining(self.value)
-        system = LinearOperator((right.size, right.size), matvec=normal, dtype=np.float64)
+        system = LinearOperator(shape=(right.size, right.size), matvec=normal, dtype=np.float64)  # type: ignore[call-arg]
         inverse = sparse.diags_array(np.repeat(1 / (diagonal + prior.diagonal()), 3))
         return cg(system, right.ravel(), None if start is None else start.ravel(), rtol=1e-3, M=inverse)[0].reshape(
             -1, 3
@@ -207,7 +207,7 @@ class _Model:
         return float(np.where(size < HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
 
     def polynomials(self, unknowns: Float64[np.ndarray, "N 3"]) -> Float[Tensor, "V K 3"]:
-        count, own = len(self.lens), self.prior.shape[0]
+        count, own = len(self.lens), OWN_TERMS * len(self.lens)
         coefficients = np.zeros((count, len(self.to_monomials), 3))
         coefficients[:, :OWN_TERMS] = unknowns[:own].reshape(count, -1, 3)
         coefficients[:, 1:] += unknowns[own:].reshape(-1, len(self.to_monomials) - 1, 3)[self.lens]

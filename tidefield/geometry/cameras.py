@@ -89,8 +89,8 @@ class Cameras:
         return self._each(lambda tensor: tensor.to(device), self.names)
 
     def _each(self, change: Callable[[Tensor], Tensor], names: tuple[str, ...]) -> Cameras:
-        of_some = {n: None if getattr(self, n) is None else change(getattr(self, n)) for n in _OF_SOME}
-        return Cameras(**{name: change(getattr(self, name)) for name in _TENSORS}, names=names, **of_some)
+        values = {n: change(value) for n in (*_TENSORS, *_OF_SOME) if (value := getattr(self, n)) is not None}
+        return replace(self, names=names, **values)
 
     @property
     def width(self) -> int:
@@ -201,7 +201,7 @@ class Cameras:
 def concatenate(cameras: Sequence[Cameras]) -> Cameras:
     """Join cameras into one set, without their names."""
     parts = {name: torch.cat([getattr(one, name) for one in cameras]) for name in _TENSORS}
-    of_some = {}
+    of_some: dict[str, Tensor] = {}
     for name in _OF_SOME:
         own = [getattr(one, name) for one in cameras]
         like = next((value for value in own if value is not None), None)
