@@ -197,7 +197,7 @@ def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
     text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()
     assert card.BY_DIRECTION in text
-    assert "| swindale ² | 20.50 | - | - | - | - |" in text.splitlines()
+    assert "| swindale ² | 20.50 | - | - | - | - | - |" in text.splitlines()
 
 
 def test_without_lpips_the_page_says_how_to_get_it(tmp_path: Path) -> None:
