@@ -63,6 +63,7 @@ METHODS = {
     "opensplat": Method("opensplat"),
     "plane-sweep": Method("untrained"),
     "sparse-depth": Method("untrained"),
+    "sparse-depth-as-given": Method("untrained"),
     "nearest": Method("untrained"),
 }
 
@@ -96,9 +97,14 @@ def configuration(name: str, preset: str = "swift", program: Path | None = None)
 
 def untrained(name: str, scene: Scene) -> Render:
     """A baseline that needs no training."""
-    from tidefield.baselines.untrained import nearest, plane_sweep, sparse_depth
+    from tidefield.baselines import untrained
 
-    return {"plane-sweep": plane_sweep, "sparse-depth": sparse_depth, "nearest": nearest}[name](scene)
+    return {
+        "plane-sweep": untrained.plane_sweep,
+        "sparse-depth": untrained.sparse_depth,
+        "sparse-depth-as-given": untrained.sparse_depth_as_given,
+        "nearest": untrained.nearest,
+    }[name](scene)
 
 
 def make_trainer(

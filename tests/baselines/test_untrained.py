@@ -1,12 +1,15 @@
 """The untrained baselines: nearest photograph, plane sweep and sparse-depth blending."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import textured_wall as wall
 import torch
+from scenes_on_disk import survey, write_colmap
 
 from tidefield.baselines import untrained
-from tidefield.baselines.untrained import nearest, plane_sweep, sparse_depth
+from tidefield.baselines.untrained import nearest, plane_sweep, sparse_depth, sparse_depth_as_given
+from tidefield.data.load import load_scene
 
 
 def test_nearest_shows_the_next_photograph_on_the_surface():
@@ -137,3 +140,16 @@ def test_masked_pixels_are_read_by_no_baseline():
         if method is not plane_sweep:
             assert not shown[:, :12].any()
             assert (view.colour - scene.photographs[2] / 255)[:, 30:36].abs().mean() < 0.02
+
+
+def test_blending_as_given_knows_neither_shading_nor_residual(tmp_path: Path):
+    write_colmap(tmp_path, survey())
+    plain = load_scene(tmp_path, calibrate=False)
+    count = len(plain.cameras)
+    shading, residual = torch.zeros(count, 15, 3), torch.zeros(count, 6, 2)
+    shading[:, 1], residual[:, 0] = 0.5, 0.1
+    calibrated = replace(plain, cameras=replace(plain.cameras, shading=shading, residual=residual))
+    test = plain.test[0]
+    as_given = sparse_depth_as_given(calibrated)(calibrated.cameras[test])
+    assert torch.equal(as_given.colour, sparse_depth(plain)(plain.cameras[test]).colour)
+    assert not torch.equal(as_given.colour, sparse_depth(calibrated)(calibrated.cameras[test]).colour)

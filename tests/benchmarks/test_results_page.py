@@ -176,7 +176,7 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
         "--steps 1000 --seed 3",
         "- brighton_beach: the training photographs (BSD-2-Clause, (c) 2017 Piero Toffanin)",
         "| 1,000 | 25.50 | 20.25 |",
-        "| swindale ² | 24.50 | 21.25 | - | - | - |",
+        "| swindale ² | 24.50 | 21.25 | - | - | - | - |",
     ):
         assert line in text.splitlines(), line
     assert f"SHA-256 `{weights_sha256(file)}`" in text
@@ -197,7 +197,7 @@ def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
     text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()
     assert card.BY_DIRECTION in text
-    assert "| swindale ² | 20.50 | - | - | - | - |" in text.splitlines()
+    assert "| swindale ² | 20.50 | - | - | - | - | - |" in text.splitlines()
 
 
 def test_without_lpips_the_page_says_how_to_get_it(tmp_path: Path) -> None:

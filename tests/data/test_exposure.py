@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tidefield.data import exposure
 from tidefield.data.exif import Exposures, read_exposures
-from tidefield.data.exposure import disagreement, estimate_gains
+from tidefield.data.exposure import disagreement, estimate_gains, observe
 from tidefield.data.images import Photographs
 from tidefield.data.scene import SparsePoints, every_eighth
 from tidefield.geometry.cameras import Cameras
@@ -62,6 +62,18 @@ def survey(gain: Tensor) -> tuple[Watched, Cameras, SparsePoints]:
     return Watched(tuple(pixels)), cameras, SparsePoints(xyz, torch.ones(900), point, camera, uv[inside])
 
 
+def gains(
+    photographs: Photographs,
+    cameras: Cameras,
+    points: SparsePoints | None,
+    train: tuple[int, ...],
+    metadata: Exposures | None = None,
+    divided_by: np.ndarray | None = None,
+) -> Tensor:
+    seen = None if points is None else observe(photographs, points, train)
+    return estimate_gains(seen, cameras, train, metadata, divided_by)
+
+
 def planted(spread: float = 0.25) -> Tensor:
     """Gains that wander along the flight, channels apart."""
     step = torch.arange(COUNT)[:, None] * 0.5 + torch.tensor([0.0, 0.4, 0.9])
@@ -75,7 +87,7 @@ def relative(gain: Tensor) -> Tensor:
 def test_planted_gains_are_recovered_within_one_percent():
     truth = planted()
     photographs, cameras, points = survey(truth)
-    found = estimate_gains(photographs, cameras, points, TRAIN)
+    found = gains(photographs, cameras, points, TRAIN)
     error = (found / relative(truth)).log().abs()
     assert error[list(TRAIN)].max() < 0.01
     assert found[list(TRAIN)].log().mean(0).abs().max() < 1e-5
@@ -84,7 +96,7 @@ def test_planted_gains_are_recovered_within_one_percent():
 def test_gains_remove_the_disagreement_of_photographs():
     photographs, cameras, points = survey(planted())
     before = disagreement(photographs, points, TRAIN, torch.ones(COUNT, 3))
-    after = disagreement(photographs, points, TRAIN, estimate_gains(photographs, cameras, points, TRAIN))
+    after = disagreement(photographs, points, TRAIN, gains(photographs, cameras, points, TRAIN))
     assert before[0] > 0.1
     assert after[0] < 0.01
     assert math.isnan(disagreement(photographs, points, TRAIN[:1], torch.ones(COUNT, 3))[0])
@@ -93,7 +105,7 @@ def test_gains_remove_the_disagreement_of_photographs():
 def test_a_held_out_photograph_is_predicted_by_its_neighbours():
     truth = planted()
     photographs, cameras, points = survey(truth)
-    found = estimate_gains(photographs, cameras, points, TRAIN)
+    found = gains(photographs, cameras, points, TRAIN)
     inner = [i for i in TEST if 0 < i < COUNT - 1]
     assert (found / relative(truth)).log()[inner].abs().max() < 0.05
     assert relative(truth).log()[inner].abs().max() > 0.1
@@ -101,11 +113,11 @@ def test_a_held_out_photograph_is_predicted_by_its_neighbours():
 
 def test_pixels_of_held_out_photographs_change_no_gain():
     photographs, cameras, points = survey(planted())
-    before = estimate_gains(photographs, cameras, points, TRAIN)
+    before = gains(photographs, cameras, points, TRAIN)
     for i in TEST:
         photographs.colours[i].neg_()  # modulo 256
     photographs.asked.clear()
-    assert torch.equal(estimate_gains(photographs, cameras, points, TRAIN), before)
+    assert torch.equal(gains(photographs, cameras, points, TRAIN), before)
     assert not set(photographs.asked) & set(TEST)
 
 
@@ -116,7 +128,7 @@ def test_outliers_like_moving_water_are_tolerated():
     for picture in photographs.colours:
         row, column = (int(torch.randint(n, (1,), generator=generator)) for n in (HEIGHT - 30, WIDTH - 30))
         picture[row : row + 30, column : column + 30] = torch.randint(40, 200, (3,), generator=generator).byte()
-    found = estimate_gains(photographs, cameras, points, TRAIN)
+    found = gains(photographs, cameras, points, TRAIN)
     assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.05
 
 
@@ -126,7 +138,7 @@ def test_black_and_saturated_pixels_are_ignored(value: int):
     photographs, cameras, points = survey(truth)
     for i in range(3, COUNT, 3):
         photographs.colours[i][:, : WIDTH // 2] = value
-    found = estimate_gains(photographs, cameras, points, TRAIN)
+    found = gains(photographs, cameras, points, TRAIN)
     assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
 
 
@@ -135,7 +147,7 @@ def test_windows_with_glints_are_ignored_although_their_mean_is_not_clipped():
     photographs, cameras, points = survey(truth)
     for i in range(3, COUNT, 3):
         photographs.colours[i][::2, : 3 * WIDTH // 4 : 2] = 255
-    found = estimate_gains(photographs, cameras, points, TRAIN)
+    found = gains(photographs, cameras, points, TRAIN)
     assert (found / relative(truth)).log()[list(TRAIN)].abs().max() < 0.01
 
 
@@ -147,7 +159,7 @@ def test_photographs_without_shared_points_follow_the_previous_and_next():
     cut = SparsePoints(
         points.xyz_world, points.error_px, points.point_index[keep], points.camera_index[keep], points.uv_px[keep]
     )
-    found = estimate_gains(photographs, cameras, cut, TRAIN)
+    found = gains(photographs, cameras, cut, TRAIN)
     assert (found / relative(truth)).log()[lonely].abs().max() < 0.08
 
 
@@ -157,8 +169,8 @@ def test_the_exif_exposure_of_a_held_out_photograph_is_used():
     truth = torch.exp(0.5 * log_exposure)[:, None].float().expand(COUNT, 3)
     photographs, cameras, points = survey(truth)
     metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
-    error = (estimate_gains(photographs, cameras, points, TRAIN, metadata) / relative(truth)).log().abs()
-    without = (estimate_gains(photographs, cameras, points, TRAIN) / relative(truth)).log().abs()
+    error = (gains(photographs, cameras, points, TRAIN, metadata) / relative(truth)).log().abs()
+    without = (gains(photographs, cameras, points, TRAIN) / relative(truth)).log().abs()
     assert error.max() < 0.02
     assert without[list(TEST)].max() > 0.1
 
@@ -171,10 +183,10 @@ def test_held_out_photographs_as_taken_have_gains_that_suit_the_others_at_a_comm
     divided_by = (0.8 * taken).double().numpy()  # the others are 1.25 times the ground now
     divided_by[list(TEST)] = 1.0
     photographs, cameras, points = survey(taken / torch.from_numpy(divided_by).float())
-    found = estimate_gains(photographs, cameras, points, TRAIN, metadata, divided_by)
+    found = gains(photographs, cameras, points, TRAIN, metadata, divided_by)
     assert found[list(TRAIN)].log().abs().max() < 0.01
     assert (found / (0.8 * taken)).log()[list(TEST)].abs().max() < 0.02
-    unaware = estimate_gains(photographs, cameras, points, TRAIN, metadata)
+    unaware = gains(photographs, cameras, points, TRAIN, metadata)
     assert (unaware / (0.8 * taken)).log()[list(TEST)].abs().max() > 0.1
 
 
@@ -182,7 +194,7 @@ def test_exposures_that_the_photographs_contradict_are_ignored():
     log_exposure = torch.linspace(-1, 1, COUNT, dtype=torch.float64).flip(0)[torch.arange(COUNT) * 5 % COUNT]
     photographs, cameras, points = survey(torch.ones(COUNT, 3))
     metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
-    found = estimate_gains(photographs, cameras, points, TRAIN, metadata)
+    found = gains(photographs, cameras, points, TRAIN, metadata)
     assert found.log().abs().max() < 0.02
 
 
@@ -209,12 +221,10 @@ def test_without_sparse_points_gains_follow_exif_or_are_one():
     photographs, cameras, _ = survey(planted())
     log_exposure = torch.linspace(0, 1, COUNT, dtype=torch.float64)
     nothing = np.full(COUNT, math.nan)
-    found = estimate_gains(photographs, cameras, None, TRAIN, Exposures(log_exposure.numpy(), nothing))
+    found = gains(photographs, cameras, None, TRAIN, Exposures(log_exposure.numpy(), nothing))
     assert torch.allclose(found[-1].log() - found[0].log(), torch.full((3,), 0.45), atol=1e-5)
-    assert torch.equal(estimate_gains(photographs, cameras, None, TRAIN), torch.ones(COUNT, 3))
-    assert torch.equal(
-        estimate_gains(photographs, cameras, None, TRAIN, Exposures(nothing, nothing)), torch.ones(COUNT, 3)
-    )
+    assert torch.equal(gains(photographs, cameras, None, TRAIN), torch.ones(COUNT, 3))
+    assert torch.equal(gains(photographs, cameras, None, TRAIN, Exposures(nothing, nothing)), torch.ones(COUNT, 3))
 
 
 SWINDALE = SHARED / "scenes" / "swindale" / "images"

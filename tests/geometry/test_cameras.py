@@ -152,7 +152,7 @@ def test_a_cropped_camera_keeps_its_pixels(own: Cameras):
 
 
 def test_indexing_keeps_the_order_of_the_indices():
-    own = bent()
+    own = replace(bent(), shading=torch.rand(3, 15, 3))
     assert len(own) == 3
     assert len(own[1]) == 1
     assert (own[1].width, own[1].height) == (80, 60)

@@ -19,7 +19,7 @@ def exposure_factor(scene: Scene, which: Sequence[int]) -> Float[torch.Tensor, "
 
 def at_common_exposure(scene: Scene, index: int, factor: Float[torch.Tensor, "3"]) -> UInt8[np.ndarray, "H W 3"]:
     """A photograph at the common exposure, as all other methods see it, times a factor."""
-    colour = scene.photographs[index].float() / scene.cameras.gain[index] * factor
+    colour = scene.photographs[index].float() / scene.cameras[index].gain_of_rows() * factor
     return colour.round().clamp(0, 255).to(torch.uint8).numpy()
 
 

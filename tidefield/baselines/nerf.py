@@ -209,7 +209,8 @@ def draw_pixels(
     for index in which.unique().tolist():
         mine = which == index
         u, v = pixel[mine].long().unbind(-1)
-        colour[mine] = scene.photographs[index][v, u].float() / (255 * scene.cameras.gain[index])
+        gain = scene.cameras[index].gain_at(pixel[None, mine] + 0.5)[0]
+        colour[mine] = scene.photographs[index][v, u].float() / (255 * gain)
         if scene.photographs.masks:
             used[mine] = scene.photographs.used(index)[v, u]
     return which[used], pixel[used] + 0.5, colour[used]
@@ -226,7 +227,7 @@ def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:
             _, seen = network(rays, scene.background_rgb is None)
             parts.append(torch.cat([seen.colour, seen.depth[:, None], seen.opacity[:, None]], dim=-1).cpu())
         colour, depth, opacity = torch.cat(parts).reshape(camera.height, camera.width, 5).split([3, 1, 1], dim=-1)
-        colour = colour * camera.gain[0]
+        colour = colour * camera.gain_of_rows()
         if scene.background_rgb is not None:
             colour = colour + (1 - opacity) * torch.tensor(scene.background_rgb)
         return Rendering(colour.clamp(0, 1), depth[..., 0], opacity[..., 0].clamp(0, 1))

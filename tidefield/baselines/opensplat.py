@@ -293,7 +293,7 @@ def renderer(folder: Path, device: torch.device) -> Render:
 def _render(splats: Splats, camera: Cameras, factor: Float[torch.Tensor, "3"], device: torch.device) -> Rendering:
     """Render a view at the camera's own gain."""
     view = render_splats(splats, with_half_pixels(camera), BACKGROUND_RGB, device)
-    return replace(view, colour=(view.colour / factor * camera.gain[0]).clamp(0, 1))
+    return replace(view, colour=(view.colour / factor * camera.gain_of_rows()).clamp(0, 1))
 
 
 def with_half_pixels(cameras: Cameras) -> Cameras:

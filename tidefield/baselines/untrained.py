@@ -1,4 +1,4 @@
-"""The untrained baselines: `nearest`, `plane_sweep` and `sparse_depth` make a `Render` from a scene at once.
+"""The untrained baselines: `nearest`, `plane_sweep`, `sparse_depth` make a `Render` from a scene at once.
 
 All read nothing but the training photographs and, except for the plane sweep, the sparse points. Where no photograph
 sees a pixel's surface point, the colours next to it are continued, and the opacity is 0.
@@ -8,11 +8,14 @@ Alphabet: V photographs, P points, H W pixels.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras, angle_between
@@ -52,7 +55,7 @@ def read_photograph(scene: Scene, index: int, uv_px: Float[Tensor, "P 2"]) -> Fl
     texel = 2 * (uv_px - low) - 0.5  # twice as many texels, of which the first is centred on the first pixel
     grid = texel / uv_px.new_tensor([crop.shape[3], crop.shape[2]]) - 1
     colour = F.grid_sample(upsample_twice(crop), grid[None, None], padding_mode="border", align_corners=False)
-    return colour[0, :, 0].T / 255 / scene.cameras.gain[index].to(uv_px)
+    return colour[0, :, 0].T / 255 / scene.cameras[index].gain_at(uv_px[None])[0].to(uv_px)
 
 
 def nearest(scene: Scene) -> Render:
@@ -96,6 +99,17 @@ def sparse_depth(scene: Scene) -> Render:
     return render
 
 
+def sparse_depth_as_given(scene: Scene) -> Render:
+    """Blend like `sparse_depth`, without the lens residual and the shading that are estimated when a scene is opened.
+
+    It tells what these two bring, which every other method shares (docs/method.md, sections 12 and 14).
+    """
+    width = int(scene.cameras.size_px[:, 0].max())
+    given = load_scene(scene.root, width=width, allow_missing=True, hold_out=bool(scene.test), calibrate=False)
+    render = sparse_depth(given)
+    return lambda camera: render(replace(camera, residual=None, shading=None))
+
+
 def plane_sweep(scene: Scene, *, depths: int = DEPTHS, neighbours: int = NEIGHBOURS) -> Render:
     """Blend photographs at the depth at which they match best (Collins, 1996); reads no sparse points.
 
@@ -134,7 +148,7 @@ def _filled(
 ) -> Rendering:
     """A rendering at the camera's exposure, with unseen pixels filled from those next to them."""
     visible = seen.reshape(depth.shape)
-    filled = fill_unseen(colour.reshape(*depth.shape, 3), visible) * camera.gain[0]
+    filled = fill_unseen(colour.reshape(*depth.shape, 3), visible) * camera.gain_of_rows()
     return Rendering(colour=filled.clamp(0, 1), depth=depth, opacity=visible.to(depth))
 
 

@@ -55,9 +55,8 @@ SUPPORT = 10
 
 
 def estimate_gains(
-    photographs: Photographs,
+    seen: Seen | None,
     cameras: Cameras,
-    points: SparsePoints | None,
     train: Sequence[int],
     metadata: Exposures | None = None,
     divided_by: Float64[np.ndarray, "V 3"] | None = None,
@@ -65,19 +64,17 @@ def estimate_gains(
     """Estimate the gain of every photograph and channel, with geometric mean 1 over the training photographs.
 
     Args:
-        photographs: the pixels; only training photographs' are read, and used only around sparse points.
+        seen: what the training photographs show of the sparse points (`observe`); without, the gains follow from the
+            EXIF exposures, and are 1 without these.
         cameras: one per photograph, for their positions; their own gains are ignored.
-        points: with their observations; without points the gains follow from the EXIF exposures, and are 1 without
-            these.
         train: indices of the training photographs; all others are held out.
         metadata: exposures and times (`exif.read_exposures`), if any.
         divided_by: gains that the photographs' files were divided by, ones if not given. EXIF is of photographs as
             taken, so the gains are estimated of these, and divided by the same at the end.
     """
     count, learned = len(cameras), np.asarray(train, dtype=np.int64)
-    exposure, clock = _exposure_and_clock(metadata, count)
+    exposure, clock = exposure_and_clock(metadata, count)
     applied = np.zeros((count, 3)) if divided_by is None else np.log(divided_by)
-    seen = observe(photographs, points, train) if points is not None else None
     if seen is not None and len(seen.value):
         seen = replace(seen, value=seen.value + applied[seen.photograph])
         gains = _solve(seen, exposure, clock, cameras.position_world.double().cpu().numpy(), learned)
@@ -122,6 +119,11 @@ class Seen:
     photograph: Int64[np.ndarray, " O"]
     row: Int64[np.ndarray, " O"]
 
+    def part(self, chosen: Bool[np.ndarray, " O"]) -> Seen:
+        """Select observations; points are numbered anew."""
+        point = np.unique(self.point[chosen], return_inverse=True)[1]
+        return Seen(self.value[chosen], point, self.photograph[chosen], self.row[chosen])
+
     def centred(
         self, value: Float64[np.ndarray, "O C"], weight: Float64[np.ndarray, " O"] | None = None
     ) -> Float64[np.ndarray, "O C"]:
@@ -133,7 +135,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class Pairs:
     """N pairs a, b of photographs with similar gains, and their distances in time or space, relative to the median."""
 
     a: Int64[np.ndarray, " N"]
@@ -145,7 +147,7 @@ class _Pairs:
 
 
 _NO_INDEX = np.zeros(0, dtype=np.int64)
-_NO_PAIRS = _Pairs(_NO_INDEX, _NO_INDEX, np.zeros(0))
+_NO_PAIRS = Pairs(_NO_INDEX, _NO_INDEX, np.zeros(0))
 
 
 def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> Seen:
@@ -190,7 +192,7 @@ def _solve(
     count = len(exposure)
     first, noise = robust_gains(seen, np.zeros(count))
     supported = train[np.bincount(seen.photograph, minlength=count)[train] >= SUPPORT]
-    sequence = _in_sequence(clock, supported)
+    sequence = in_sequence(clock, supported)
     # Log gain per log exposure, from consecutive photographs: over a longer time automatic exposure follows the
     # daylight, and both cancel.
     change = sequence.difference(exposure)
@@ -199,7 +201,7 @@ def _solve(
     prior = float(np.clip(follows / total, 0.0, 1.0)) * exposure
     pairs, weights = [], []
     for supporting, everyone in (
-        (sequence, _in_sequence(clock, np.arange(count))),
+        (sequence, in_sequence(clock, np.arange(count))),
         (_nearby(position, supported), _nearby(position, np.arange(count))),
     ):
         # A random walk: the variance of a difference grows with the distance.
@@ -207,7 +209,7 @@ def _solve(
         variance = max(((rest**2).mean(1) / supporting.distance).mean(), 1e-6) if len(rest) else 1.0
         pairs.append(everyone)
         weights.append(noise**2 / (variance * everyone.distance))
-    both = _Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "distance")))
+    both = Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "distance")))
     gains, _ = robust_gains(seen, prior, both, np.concatenate(weights))
     return gains
 
@@ -215,7 +217,7 @@ def _solve(
 def robust_gains(
     seen: Seen,
     prior: Float64[np.ndarray, " V"],
-    pairs: _Pairs = _NO_PAIRS,
+    pairs: Pairs = _NO_PAIRS,
     pair_weight: Float64[np.ndarray, " N"] | None = None,
 ) -> tuple[Float64[np.ndarray, "V 3"], float]:
     """Estimate log gains by iteratively reweighted least squares, and the residuals' standard deviation.
@@ -277,7 +279,7 @@ def huber_weights(residual: Float64[np.ndarray, "O 3"]) -> tuple[Float64[np.ndar
     return np.minimum(1.0, HUBER * noise / np.maximum(size, 1e-12)), noise
 
 
-def _exposure_and_clock(
+def exposure_and_clock(
     metadata: Exposures | None, count: int
 ) -> tuple[Float64[np.ndarray, " V"], Float64[np.ndarray, " V"]]:
     """Centred log exposures (0 where missing), and times in seconds, or the photographs' order without times."""
@@ -293,26 +295,26 @@ def _exposure_and_clock(
     return centred, time - time.min() + 1e-3 * order if usable else order
 
 
-def _in_sequence(clock: Float64[np.ndarray, " V"], which: Int64[np.ndarray, " S"]) -> _Pairs:
+def in_sequence(clock: Float64[np.ndarray, " V"], which: Int64[np.ndarray, " S"]) -> Pairs:
     """Pair each of the given photographs with the next one."""
     order = which[np.argsort(clock[which], kind="stable")]
     median = np.median(np.diff(np.sort(clock))) if len(clock) > 1 else 1.0
     distance = np.maximum(np.diff(clock[order]) / max(median, 1e-9), 0.1)
-    return _Pairs(order[:-1], order[1:], distance)
+    return Pairs(order[:-1], order[1:], distance)
 
 
-def _nearby(position: Float64[np.ndarray, "V 3"], which: Int64[np.ndarray, " S"]) -> _Pairs:
+def _nearby(position: Float64[np.ndarray, "V 3"], which: Int64[np.ndarray, " S"]) -> Pairs:
     """Pair each of the given photographs with the two taken closest to it."""
     if len(which) < 3:
         return _NO_PAIRS
     median = np.median(KDTree(position).query(position, k=2)[0][:, 1])
     found = KDTree(position[which]).query(position[which], k=3)
     distance, neighbour = (np.asarray(column)[:, 1:].ravel() for column in found)
-    return _Pairs(np.repeat(which, 2), which[neighbour], np.maximum(distance / max(median, 1e-9), 0.1))
+    return Pairs(np.repeat(which, 2), which[neighbour], np.maximum(distance / max(median, 1e-9), 0.1))
 
 
 def to_common_exposure(
     scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)
 ) -> Float[Tensor, "h w 3"]:
-    """Read a part of a photograph at the common exposure: divided by its gain (docs/method.md, section 12)."""
-    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras.gain[index])
+    """Read a part of a photograph in the common light: divided by gain and shading (docs/method.md, section 12)."""
+    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras[index].gain_of_rows(rows, columns))

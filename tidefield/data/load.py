@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tidefield.data.calibrate import calibrate_lenses
 from tidefield.data.exif import read_exposures
-from tidefield.data.exposure import estimate_gains
+from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.holdout import read_holdout
 from tidefield.data.hull import visual_hull
 from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, read_header
@@ -25,6 +25,7 @@ from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
+from tidefield.data.shading import estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
@@ -94,6 +95,7 @@ def load_scene(
     width: int | None = None,
     allow_missing: bool = False,
     hold_out: bool = True,
+    calibrate: bool = True,
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Scene:
@@ -105,6 +107,8 @@ def load_scene(
             own widths.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
         hold_out: otherwise all photographs are training photographs.
+        calibrate: estimate what is left of the lens and the shading of the photographs (docs/method.md, sections 12
+            and 14).
         progress: called with (ready, all) while photographs are decoded; not called when they are cached.
         cache: folder for decoded photographs; the user's if not given.
 
@@ -151,14 +155,19 @@ def load_scene(
         near_far=_float32(near_far),
         gain=torch.ones(len(pinholes), 3),
     )
-    if sparse is not None:
+    if calibrate and sparse is not None:
         cameras, sparse = calibrate_lenses(cameras, sparse, posed.lenses, train)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    gain = estimate_gains(photographs, cameras, sparse, train, read_exposures(posed.paths), posed.divided_by)
+    seen = None if sparse is None else observe(photographs, sparse, train)
+    exposures = read_exposures(posed.paths)
+    cameras = replace(cameras, gain=estimate_gains(seen, cameras, train, exposures, posed.divided_by))
+    if calibrate and seen is not None and sparse is not None:
+        shading = estimate_shading(seen, cameras, sparse, posed.lenses, train, exposures)
+        cameras = replace(cameras, shading=shading)
     return Scene(
         root=root,
         names=posed.names,
-        cameras=replace(cameras, gain=gain),
+        cameras=cameras,
         photographs=photographs,
         points=sparse,
         train=train,

@@ -21,9 +21,12 @@ from tidefield.errors import SceneError
 _PARALLEL = 0.02
 """Smallest eigenvalue of the mean projection across the axes (the mean squared sine of their angle to one direction)
 below which they count as parallel: they lie within 8 degrees of it, and where they meet is ill-determined."""
-RESIDUAL_REACH = 2.0
-"""Tangent of the angle to the axis, across and along, beyond which a lens residual stays as it is there: a polynomial
-would fold the picture of what lies far outside of it back into it. Pinholes reach 1.7 (`lenses.WIDEST_DEG`)."""
+FRAME_REACH = 2.0
+"""Tangent of the angle to the axis, across and along, beyond which lens residual and shading stay as they are there: a
+polynomial would fold the picture of what lies far outside of it back into it. Pinholes reach 1.7
+(`lenses.WIDEST_DEG`)."""
+SHADING_DEGREE = 4
+"""Degree of the polynomial of a photograph's shading."""
 _INVERSE_STEPS = 5
 """Of the fixed point that inverts a residual: each divides the error by a hundred and more."""
 
@@ -43,6 +46,8 @@ class Cameras:
         names: of the photographs, to index by; empty where the cameras have none. The view of a scene's own photograph
             is rendered without that photograph, as if it were held out; with `dataclasses.replace(camera, names=())` it
             serves as any other.
+        shading: of the photograph beside its gain, in the plane z = 1: a pixel at (x, y) has exp of the sum of the K
+            rows times `monomials` times the light that it has in the scene's common light. None without.
         residual: of the lens, in the plane z = 1: a point that a pinhole shows at (x, y) is shown at (x, y) plus the
             sum of the six rows times 1, x, y, x^2, x y, y^2 (docs/method.md, section 14). None without.
     """
@@ -55,6 +60,7 @@ class Cameras:
     gain: Float[Tensor, "V 3"]
     names: tuple[str, ...] = ()
     residual: Float[Tensor, "V 6 2"] | None = None
+    shading: Float[Tensor, "V K 3"] | None = None
 
     def __len__(self) -> int:
         return self.T_world_camera.shape[0]
@@ -83,8 +89,8 @@ class Cameras:
         return self._each(lambda tensor: tensor.to(device), self.names)
 
     def _each(self, change: Callable[[Tensor], Tensor], names: tuple[str, ...]) -> Cameras:
-        residual = None if self.residual is None else change(self.residual)
-        return Cameras(**{name: change(getattr(self, name)) for name in _TENSORS}, names=names, residual=residual)
+        values = {n: change(value) for n in (*_TENSORS, *_OF_SOME) if (value := getattr(self, n)) is not None}
+        return replace(self, names=names, **values)
 
     @property
     def width(self) -> int:
@@ -141,7 +147,7 @@ class Cameras:
 
     @staticmethod
     def _residual_at(xy: Float[Tensor, "V P 2"], residual: Float[Tensor, "V 6 2"]) -> Float[Tensor, "V P 2"]:
-        x, y = xy.clamp(-RESIDUAL_REACH, RESIDUAL_REACH).split(1, -1)
+        x, y = xy.clamp(-FRAME_REACH, FRAME_REACH).split(1, -1)
         one, of_x, of_y, of_xx, of_xy, of_yy = (row[:, None] for row in residual.unbind(1))
         along_x = torch.addcmul(torch.addcmul(of_x, x, of_xx), y, of_xy)
         return torch.addcmul(torch.addcmul(one, x, along_x), y, torch.addcmul(of_y, y, of_yy))
@@ -154,6 +160,29 @@ class Cameras:
                 xy = shown - self._residual_at(xy, self.residual)
         xyz = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return xyz @ self.T_world_camera[:, :, :3].transpose(1, 2)
+
+    def gain_at(self, uv_px: Float[Tensor, "V P 2"]) -> Float[Tensor, "V P 3"]:
+        """Compute what pixels of the photographs are divided by for the scene's common light: gain times shading."""
+        gain = self.gain[:, None]
+        if self.shading is None:
+            return gain.expand(*uv_px.shape[:2], 3)
+        xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
+        return gain * (monomials(xy, SHADING_DEGREE) @ self.shading).exp()
+
+    def gain_of_rows(self, rows: slice = slice(None), columns: slice = slice(None)) -> Float[Tensor, "#h #w 3"]:
+        """Compute `gain_at` of all pixels of a part of a single camera's image, or its one gain without shading."""
+        if self.shading is None:
+            return self.gain[0].expand(1, 1, 3)
+        sides = []
+        for axis, (chosen, size) in enumerate(((columns, self.width), (rows, self.height))):
+            pixel = torch.arange(size, device=self.gain.device)[chosen] + 0.5
+            at = ((pixel - self.principal_px[0, axis]) / self.focal_px[0, axis]).clamp(-FRAME_REACH, FRAME_REACH)
+            sides.append(at[:, None] ** torch.arange(SHADING_DEGREE + 1, device=at.device))
+        x, y = sides
+        table = x.new_zeros(SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
+        for (of_x, of_y), row in zip(_exponents(SHADING_DEGREE), self.shading[0], strict=True):
+            table[of_y, of_x] = row
+        return self.gain[0] * torch.einsum("ha,abc,wb->hwc", y, table, x).exp()
 
     def resized(self, width: int, height: int) -> Cameras:
         """Scale the images to width x height pixels."""
@@ -172,13 +201,25 @@ class Cameras:
 def concatenate(cameras: Sequence[Cameras]) -> Cameras:
     """Join cameras into one set, without their names."""
     parts = {name: torch.cat([getattr(one, name) for one in cameras]) for name in _TENSORS}
-    residual = None
-    if any(one.residual is not None for one in cameras):
-        none = [one.focal_px.new_zeros(len(one), 6, 2) for one in cameras]
-        residual = torch.cat(
-            [zeros if one.residual is None else one.residual for one, zeros in zip(cameras, none, strict=True)]
-        )
-    return Cameras(**parts, names=(), residual=residual)
+    of_some: dict[str, Tensor] = {}
+    for name in _OF_SOME:
+        own = [getattr(one, name) for one in cameras]
+        like = next((value for value in own if value is not None), None)
+        if like is not None:
+            counts = [len(one) for one in cameras]
+            own = [like.new_zeros(n, *like.shape[1:]) if v is None else v for n, v in zip(counts, own, strict=True)]
+            of_some[name] = torch.cat(own)
+    return Cameras(**parts, names=(), **of_some)
+
+
+def monomials(xy: Float[Tensor, "*B 2"], degree: int) -> Float[Tensor, "*B K"]:
+    """Return the products of powers of x and y up to a degree: 1, x, y, x^2, x y, y^2, x^3, ..."""
+    x, y = xy.clamp(-FRAME_REACH, FRAME_REACH).unbind(-1)
+    return torch.stack([x**of_x * y**of_y for of_x, of_y in _exponents(degree)], dim=-1)
+
+
+def _exponents(degree: int) -> list[tuple[int, int]]:
+    return [(total - of_y, of_y) for total in range(degree + 1) for of_y in range(total + 1)]
 
 
 def project_with_slopes(
@@ -197,7 +238,8 @@ def project_with_slopes(
     return xy, (R[:, :, :2] - R[:, :, 2:] * xy[:, None]) / z[:, None, None]
 
 
-_TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", "residual"))
+_OF_SOME = ("residual", "shading")
+_TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", *_OF_SOME))
 
 
 def find_name(name: str, names: Sequence[str], where: str) -> int:

@@ -144,7 +144,9 @@ class FeatureCache:
         last = (_block_counts(size) - 1).clamp(min=1)
         corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
-        part = colours[top:bottom, left:right].float() / (255 * self.scene.cameras.gain[block.photograph])
+        camera = self.pyramid.cameras[int(self.pyramid.row(torch.tensor(block.photograph), torch.tensor(block.level)))]
+        gain = camera.gain_of_rows(slice(top, bottom), slice(left, right))
+        part = colours[top:bottom, left:right].float() / (255 * gain)
         corner_px = corner[None].to(part).to(self.device)
         encoded = self.network.encode(part.permute(2, 0, 1)[None].to(self.device), corner_px)
         if self.scene.photographs.masks:

@@ -96,8 +96,9 @@ class Renderer:
         colour, opacity, depth, visibility = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
         white = scene.background_rgb
         mean_colour = torch.stack([colour for i, colour in self.mean_colours.items() if i in sources]).mean(0)
-        behind = mean_colour * camera.gain[0] if white is None else torch.tensor(white)
-        colour = colour * camera.gain[0] + (1 - opacity) * behind
+        gain = camera.gain_of_rows()
+        behind = mean_colour * gain if white is None else torch.tensor(white)
+        colour = colour * gain + (1 - opacity) * behind
         if self.fills_unseen:
             colour = fill_unseen(colour, visibility[..., 0] > 0.5)
         colour = colour.clamp(0, 1)

@@ -241,7 +241,9 @@ class Stream:
         shift = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
         light = torch.from_numpy(np.exp(random.normal(scale=own.exposure_error, size=(len(scene.names), 1)))).float()
         principal, gain = scene.cameras.principal_px + shift, scene.cameras.gain[:, own.channels] * light
-        cameras = replace(scene.cameras, principal_px=principal, gain=gain)
+        shading = scene.cameras.shading
+        shading = None if shading is None else shading[:, :, own.channels]
+        cameras = replace(scene.cameras, principal_px=principal, gain=gain, shading=shading)
         points = scene.points if own.points_share else None
         if points is not None and own.points_share < 1:
             points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))

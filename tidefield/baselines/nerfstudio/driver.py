@@ -176,7 +176,7 @@ def read_rendering(file: Path, camera: Cameras, colours: Colours) -> Rendering:
     file.unlink()
     opacity = opacity.clamp(0, 1)
     behind = (1 - opacity[..., None]) * torch.tensor(colours.background_rgb or (0.0, 0.0, 0.0))
-    colour = (colour - behind) / colours.factor * camera.gain[0] + behind
+    colour = (colour - behind) / colours.factor * camera.gain_of_rows() + behind
     return Rendering(colour.clamp(0, 1), depth, opacity)
 
 
@@ -251,7 +251,7 @@ def export(scene: Scene, folder: Path) -> Colours:
     colours = Colours(cameras.gain.amin(0).clamp(max=1.0), scene.background_rgb)
     for index, file in enumerate(files):
         colour, alpha = _straight(scene, index)
-        colour = colour / cameras.gain[index] * colours.factor
+        colour = colour / cameras[index].gain_of_rows() * colours.factor
         pixels = torch.cat([colour, *([] if scene.background_rgb is None else [255 * alpha])], dim=-1)
         Image.fromarray(pixels.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
     masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]

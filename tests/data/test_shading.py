@@ -1,0 +1,117 @@
+"""Shading of a survey whose light is known."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from captures import survey
+from torch import Tensor
+
+from tidefield.data.exposure import Seen
+from tidefield.data.scene import SparsePoints
+from tidefield.data.shading import estimate_shading
+from tidefield.geometry.cameras import Cameras, concatenate, pixel_grid
+
+COUNT, NOISE = 39, 0.01
+LENSES = ["wide"] * COUNT
+TRAIN = tuple(i for i in range(COUNT) if i % 8 != 4)
+HELD_OUT = tuple(range(4, COUNT, 8))
+
+
+def planted() -> Tensor:
+    """Vignetting, and a light across the frame that wanders along the flight."""
+    shading = torch.zeros(COUNT, 15, 3)
+    shading[:, 3] = shading[:, 5] = -0.15
+    time = torch.arange(COUNT)
+    shading[:, 1] = 0.08 * torch.sin(time / 4)[:, None]
+    shading[:, 2] = 0.08 * torch.cos(time / 5)[:, None]
+    return shading
+
+
+def observed(shading: Tensor | None) -> tuple[Tensor, Cameras, SparsePoints]:
+    """Log colours of all observations in a light; cameras that know nothing of it; and the points."""
+    scene = survey()
+    points = scene.points
+    assert points is not None
+    generator = torch.Generator().manual_seed(2)
+    colour = torch.rand(len(points.xyz_world), 3, generator=generator).add(0.3).log()
+    noise = NOISE * torch.randn(len(points.uv_px), 3, generator=generator)
+    return colour[points.point_index] + light(scene.cameras, points, shading) + noise, scene.cameras, points
+
+
+def light(cameras: Cameras, points: SparsePoints, shading: Tensor | None) -> Tensor:
+    lit = replace(cameras, shading=shading)
+    return lit[points.camera_index].gain_at(points.uv_px[:, None])[:, 0].log()
+
+
+def seen_in(which: tuple[int, ...], value: Tensor, points: SparsePoints) -> Seen:
+    row = torch.isin(points.camera_index, torch.tensor(which)).nonzero()[:, 0].numpy()
+    all_seen = Seen(
+        value.double().numpy(), points.point_index.numpy(), points.camera_index.numpy(), np.arange(len(value))
+    )
+    return all_seen.part(np.isin(np.arange(len(value)), row))
+
+
+def differences(value: Tensor, points: SparsePoints, which: tuple[int, ...]) -> float:
+    """How much photographs differ from the training photographs in the points' colours, but for their means."""
+    train = torch.isin(points.camera_index, torch.tensor(TRAIN))
+    total = torch.zeros(400, 3).index_add(0, points.point_index[train], value[train])
+    rest = value - (total / torch.bincount(points.point_index[train], minlength=400)[:, None])[points.point_index]
+    own = [rest[points.camera_index == i] for i in which]
+    return float(torch.cat([one - one.mean(0) for one in own]).square().mean().sqrt())
+
+
+def test_the_light_is_found_and_foretold_for_held_out_photographs(caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.DEBUG, "tidefield")
+    value, cameras, points = observed(planted())
+    found = estimate_shading(seen_in(TRAIN, value, points), cameras, points, LENSES, TRAIN)
+    even = value - light(cameras, points, found)
+    assert differences(value, points, TRAIN) > 0.03
+    assert differences(even, points, TRAIN) < 1.3 * NOISE
+    assert differences(even, points, HELD_OUT) < 0.6 * differences(value, points, HELD_OUT)
+    assert "applied" in caplog.text
+
+
+def test_photographs_in_one_light_get_no_shading(caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.DEBUG, "tidefield")
+    value, cameras, points = observed(None)
+    assert estimate_shading(seen_in(TRAIN, value, points), cameras, points, LENSES, TRAIN) is None
+    assert "not applied" in caplog.text
+
+
+def test_too_few_photographs_get_no_shading():
+    value, cameras, points = observed(planted())
+    few = TRAIN[:11]
+    assert estimate_shading(seen_in(few, value, points), cameras, points, LENSES, few) is None
+
+
+def test_each_lens_has_its_own_vignetting():
+    shading = planted()
+    shading[20:, 3] = shading[20:, 5] = 0.1
+    value, cameras, points = observed(shading)
+    lenses = ["wide"] * 20 + ["other"] * 19
+    found = estimate_shading(seen_in(TRAIN, value, points), cameras, points, lenses, TRAIN)
+    assert differences(value - light(cameras, points, found), points, TRAIN) < 1.3 * NOISE
+
+
+def test_the_light_of_a_picture_is_that_of_its_pixels_at_every_size():
+    cameras = replace(survey().cameras, shading=planted(), gain=torch.rand(COUNT, 3) + 0.5)
+    camera = cameras[5]
+    uv = pixel_grid(400, 300)[None]
+    whole = camera.gain_of_rows()
+    torch.testing.assert_close(whole, camera.gain_at(uv)[0].reshape(300, 400, 3))
+    torch.testing.assert_close(camera.gain_of_rows(slice(10, 30), slice(None, None, 3)), whole[10:30, ::3])
+    small = camera.resized(200, 150).gain_at(uv[:, : 150 * 200] / 2)
+    torch.testing.assert_close(small, camera.gain_at(uv[:, : 150 * 200]))
+    assert torch.equal(replace(camera, shading=None).gain_of_rows(), camera.gain[0].expand(1, 1, 3))
+
+
+def test_cameras_with_and_without_shading_are_joined_and_selected():
+    with_light = replace(survey().cameras, shading=planted())
+    both = concatenate([with_light[:3], survey().cameras[:2]])
+    assert both.shading is not None
+    assert torch.equal(both.shading[:3], planted()[:3])
+    assert not both.shading[3:].any()
+    assert torch.equal(with_light[7].shading[0], planted()[7])

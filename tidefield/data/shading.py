@@ -1,0 +1,235 @@
+"""Shading: a smooth factor over each photograph's frame that relates it to the scene's common light.
+
+docs/method.md, section 12. Photograph i shows sparse point p at x, in the plane z = 1, as
+
+    log I_ip = g_i + s_l(x) + t_i(x) + a_p:
+
+the point's own colour a_p, the photograph's gain g_i (`exposure`), a polynomial s of degree 4 that all photographs of
+one lens share (vignetting, and light that comes from one side all through the flight), and a polynomial t of degree 3
+of the photograph's own (clouds, the sun and what mirrors it). Consecutive photographs with one heading have similar
+t_i, and so a held-out photograph's comes from its neighbours, never from its pixels.
+
+How much photographs differ is chosen by what it explains in photographs that are left out, and nothing is changed
+unless it explains some of each.
+
+Alphabet: V photographs, O observations of sparse points, K coefficients of a polynomial, N unknowns.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
+from torch import Tensor
+
+from tidefield.data.exif import Exposures
+from tidefield.data.exposure import HUBER, Pairs, Seen, exposure_and_clock, huber_weights, in_sequence
+from tidefield.data.scene import SparsePoints
+from tidefield.geometry.cameras import SHADING_DEGREE, Cameras, monomials
+
+OWN_DEGREE = 3
+"""Degree of a photograph's own polynomial."""
+OWN_TERMS = (OWN_DEGREE + 1) * (OWN_DEGREE + 2) // 2
+SPREADS = (0.003, 0.01, 0.03)
+"""Standard deviations of a linear term among photographs to choose from, natural logarithms. Terms of degree d have
+this over d."""
+CORRELATION = 0.5
+"""Of the terms of consecutive photographs with one heading."""
+SAME_HEADING, LONGEST_GAP = 0.8, 5.0
+"""Cosine of the angle between the vertical axes of two photographs from which they have one heading, and the time
+between consecutive ones, relative to the median, from which they are not related."""
+SHARED_RIDGE = 0.003
+"""Cost of the shared polynomials, relative to that of the errors."""
+FEWEST_PHOTOGRAPHS = 12
+"""Training photographs with observations for shading to be estimated."""
+FOLDS = 4
+LEAST_GAIN = 0.01
+"""By which the cost of left-out photographs has to fall in every fold."""
+MOST_OBSERVATIONS = 40_000
+ROUNDS = 3
+"""Of robust weights."""
+
+_log = logging.getLogger(__name__)
+
+
+def estimate_shading(
+    seen: Seen,
+    cameras: Cameras,
+    points: SparsePoints,
+    lenses: Sequence[Hashable],
+    train: Sequence[int],
+    metadata: Exposures | None = None,
+) -> Float[Tensor, "V K 3"] | None:
+    """Estimate the shading of every photograph (`Cameras.shading`); None where it explains nothing.
+
+    Args:
+        seen: observations of the points in the training photographs (`exposure.observe`).
+        cameras: with the photographs' gains.
+        points: that are observed.
+        lenses: of each photograph; equal ones are one physical camera.
+        train: the training photographs.
+        metadata: for the order in which the photographs were taken.
+    """
+    train_index = np.asarray(train, dtype=np.int64)
+    supported = np.unique(seen.photograph)
+    if len(supported) < FEWEST_PHOTOGRAPHS:
+        return None
+    step = -(-len(seen.value) // MOST_OBSERVATIONS)
+    seen = seen.part(seen.point % step == 0)
+    model = _Model.of(seen, cameras, points, lenses, metadata)
+    fold = np.full(len(cameras), -1)
+    fold[train_index] = np.arange(len(train_index)) % FOLDS
+    weight, noise = huber_weights(seen.centred(model.value))
+    none = np.array([model.cost(None, fold == k, noise) for k in range(FOLDS)])
+    costs, whole = np.zeros((len(SPREADS), FOLDS)), None
+    for row, spread in zip(costs, SPREADS, strict=True):
+        whole = model.solve(spread, noise, weight, whole)
+        for k in range(FOLDS):
+            kept = weight * (fold[seen.photograph] != k)
+            row[k] = model.cost(model.solve(spread, noise, kept, whole), fold == k, noise)
+    best = int(costs.sum(1).argmin())
+    helps = bool((costs[best] < (1 - LEAST_GAIN) * none).all())
+    _log.debug(
+        "shading with a spread of %.1f%%: left-out photographs' differences cost %.1f%% less: %s",
+        100 * SPREADS[best],
+        100 * (1 - costs[best].sum() / none.sum()),
+        "applied" if helps else "not applied",
+    )
+    if not helps:
+        return None
+    found = model.solve(SPREADS[best], noise, weight, whole)
+    for _ in range(ROUNDS - 1):
+        weight, noise = huber_weights(seen.centred(model.value - model.design @ found, weight))
+        found = model.solve(SPREADS[best], noise, weight, found)
+    return model.polynomials(found)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Log colours as linear functions of the photographs' and lenses' terms, which are orthonormal on the observations.
+
+    Attributes:
+        seen: the observations.
+        value: their log colours at the common exposure.
+        design: derivative of the values with respect to the unknowns: OWN_TERMS of each photograph, then those of the
+            lenses.
+        prior: inverse covariance of the unknowns of the photographs, at a spread of 1.
+        to_monomials: from coefficients of the orthonormal terms to those of monomials.
+        lens: of each photograph.
+    """
+
+    seen: Seen
+    value: Float64[np.ndarray, "O 3"]
+    design: sparse.csr_array
+    prior: sparse.csr_array
+    to_monomials: Float64[np.ndarray, "K K"]
+    lens: Int64[np.ndarray, " V"]
+
+    @staticmethod
+    def of(
+        seen: Seen, cameras: Cameras, points: SparsePoints, lenses: Sequence[Hashable], metadata: Exposures | None
+    ) -> _Model:
+        count, photograph = len(cameras), seen.photograph
+        which = torch.from_numpy(photograph)
+        xy = (points.uv_px[torch.from_numpy(seen.row)] - cameras.principal_px[which]) / cameras.focal_px[which]
+        terms = monomials(xy.double(), SHADING_DEGREE).numpy()
+        to_monomials = np.linalg.inv(np.linalg.qr(terms, mode="r")) * np.sqrt(len(terms))
+        terms = terms @ to_monomials
+        names = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
+        lens = np.array([names[own] for own in lenses])
+        own, shared = terms[:, :OWN_TERMS], terms[:, 1:]
+        design = sparse.hstack([_blocks(own, photograph, count), _blocks(shared, lens[photograph], len(names))])
+        chain = _chain(cameras, in_sequence(exposure_and_clock(metadata, count)[1], np.arange(count)))
+        degree = np.repeat(np.arange(OWN_DEGREE + 1), np.arange(OWN_DEGREE + 1) + 1)
+        precision = np.maximum(degree, 1.0) ** 2
+        gain = cameras.gain.double().numpy()
+        return _Model(
+            seen=seen,
+            value=seen.value - np.log(gain)[photograph],
+            design=sparse.csr_array(design),
+            prior=sparse.csr_array(sparse.kron(chain, sparse.diags_array(precision))),
+            to_monomials=to_monomials,
+            lens=lens,
+        )
+
+    def solve(
+        self,
+        spread: float,
+        noise: float,
+        weight: Float64[np.ndarray, " O"],
+        start: Float64[np.ndarray, "N 3"] | None = None,
+    ) -> Float64[np.ndarray, "N 3"]:
+        """Find the most probable unknowns; the points' colours are eliminated.
+
+        Args:
+            start: unknowns near the solution, from which the iterative solution starts.
+        """
+        design, seen, own = self.design, self.seen, OWN_TERMS * len(self.lens)
+        share = weight / np.maximum(np.bincount(seen.point, weight), 1e-12)[seen.point]
+        mean = sparse.csr_array((share, (seen.point, np.arange(len(share)))))
+        diagonal = np.asarray((design.multiply(design)).T @ weight)
+        ridge = sparse.diags_array(SHARED_RIDGE * diagonal[own:] + 1e-9)
+        prior = sparse.csr_array(sparse.block_diag([self.prior * (noise / spread) ** 2, ridge]))
+
+        def remaining(values: np.ndarray) -> np.ndarray:
+            return design.T @ (weight[:, None] * (values - (mean @ values)[seen.point]))
+
+        def normal(x: np.ndarray) -> np.ndarray:
+            x = x.reshape(-1, 3)
+            return (remaining(design @ x) + prior @ x).ravel()
+
+        right = remaining(self.value)
+        system = LinearOperator(shape=(right.size, right.size), matvec=normal, dtype=np.float64)  # type: ignore[call-arg]
+        inverse = sparse.diags_array(np.repeat(1 / (diagonal + prior.diagonal()), 3))
+        return cg(system, right.ravel(), None if start is None else start.ravel(), rtol=1e-3, M=inverse)[0].reshape(
+            -1, 3
+        )
+
+    def cost(self, unknowns: Float64[np.ndarray, "N 3"] | None, left: Bool[np.ndarray, " V"], noise: float) -> float:
+        """Huber's cost of how the left-out photographs' values differ from the points' colours in the others."""
+        value = self.value if unknowns is None else self.value - self.design @ unknowns
+        out, count = left[self.seen.photograph], int(self.seen.point.max()) + 1
+        mean = np.stack([np.bincount(self.seen.point[~out], c[~out], count) for c in value.T], 1)
+        views = np.bincount(self.seen.point[~out], minlength=count)
+        usable = out & (views[self.seen.point] > 0)
+        point, photograph = self.seen.point[usable], self.seen.photograph[usable]
+        rest = value[usable] - mean[point] / views[point, None]
+        # A photograph's mean is its gain's, which other evidence determines.
+        for index in np.unique(photograph):
+            rest[photograph == index] -= np.median(rest[photograph == index], axis=0)
+        size = np.sqrt((rest**2).mean(1)) / noise
+        return float(np.where(size < HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
+
+    def polynomials(self, unknowns: Float64[np.ndarray, "N 3"]) -> Float[Tensor, "V K 3"]:
+        count, own = len(self.lens), OWN_TERMS * len(self.lens)
+        coefficients = np.zeros((count, len(self.to_monomials), 3))
+        coefficients[:, :OWN_TERMS] = unknowns[:own].reshape(count, -1, 3)
+        coefficients[:, 1:] += unknowns[own:].reshape(-1, len(self.to_monomials) - 1, 3)[self.lens]
+        return torch.from_numpy(self.to_monomials @ coefficients).float()
+
+
+def _blocks(terms: Float64[np.ndarray, "O K"], group: Int64[np.ndarray, " O"], count: int) -> sparse.csr_array:
+    """A matrix with each observation's terms in the columns of its group."""
+    observations, each = terms.shape
+    columns = group[:, None] * each + np.arange(each)
+    rows = np.arange(observations + 1) * each
+    return sparse.csr_array((terms.ravel(), columns.ravel(), rows), shape=(observations, count * each))
+
+
+def _chain(cameras: Cameras, sequence: Pairs) -> sparse.sparray:
+    """Inverse covariance of unit variances that are correlated along the sequence (an autoregression of order 1)."""
+    down = cameras.T_world_camera[:, :, 1].double().numpy()
+    related = ((down[sequence.a] * down[sequence.b]).sum(1) > SAME_HEADING) & (sequence.distance < LONGEST_GAP)
+    a, b = sequence.a[related], sequence.b[related]
+    rows = np.tile(np.arange(len(a)), 2)
+    ones = np.ones(len(a))
+    difference = sparse.csr_array((np.r_[-ones, ones], (rows, np.r_[a, b])), shape=(len(a), len(cameras)))
+    own = (1 - CORRELATION) / (1 + CORRELATION)
+    link = CORRELATION / (1 - CORRELATION**2)
+    return own * sparse.eye_array(len(cameras)) + link * (difference.T @ difference)
