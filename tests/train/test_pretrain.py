@@ -69,7 +69,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(stream, "POOL_SIZE", 2)
     monkeypatch.setattr(stream, "STEPS_EACH", 4)
     generator = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
         names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
     assert set(names[0]) == {"7-000000", "7-000001"}
     assert set(names[1]) == {"7-000001", "7-000002"}
@@ -77,7 +77,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "cache").exists(), "the user's cache would grow without end"
     made = (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns
     again = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
         for _ in range(8):
             scenes.draw(0, again)  # the first is made once more, ...
         assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
@@ -110,7 +110,7 @@ def test_augmentation_is_few_points_and_photographs_and_exposures_that_are_off(t
         stream.Draw(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
         stream.Draw(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
     )
-    with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 1, CPU, SMALL) as scenes:
         whole, few = scenes._augmented(at, easy), scenes._augmented(at, hard)
         none = scenes._augmented(at, replace(easy, points_share=0.0))
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)

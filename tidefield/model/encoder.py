@@ -82,6 +82,18 @@ def _stage(inputs: int, outputs: int, blocks: int, norm: bool) -> nn.Sequential:
     return nn.Sequential(first, *(_Block(outputs, outputs, 1, norm) for _ in range(blocks - 1)))
 
 
+def double(maps: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C H W"]:
+    """Maps with twice as many texels: every second one is a texel of `maps`, the others lie halfway between.
+
+    A convolution with stride 2 centres its texel k on texel 2 k of what it read, so that is where it must return to.
+    `F.interpolate` would place it half a texel further, and neighbours flown the other way would be displaced the
+    other way.
+    """
+    height, width = maps.shape[-2:]
+    between = F.interpolate(maps, size=(2 * height - 1, 2 * width - 1), mode="bilinear", align_corners=True)
+    return F.pad(between, (0, 1, 0, 1), mode="replicate")
+
+
 class _Up(nn.Module):
     """3x3 upconv x2, then a 3x3 convolution on [skip, upsampled] (layers 6-7 and 8-9 of Table 1)."""
 
@@ -91,7 +103,5 @@ class _Up(nn.Module):
         self.merge = _ConvNorm(skip + outputs, outputs, 3, 1, norm)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        # By 2 exactly, then cut: an odd size was rounded up on the way down, and fitting it would shift features.
-        x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-        x = x[..., : skip.shape[-2], : skip.shape[-1]]
+        x = double(x)[..., : skip.shape[-2], : skip.shape[-1]]
         return F.relu(self.merge(torch.cat([skip, F.relu(self.widen(x))], dim=1)))
