@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
-from multiprocessing.pool import AsyncResult
 from pathlib import Path
 
 import numpy as np
@@ -203,17 +203,17 @@ class Stream:
         self.real = [scene for path in real for scene in at_several_widths(path, widths)]
         self.matches_surface = network_class(config.network).matches_surface
         self.pool: dict[int, Drawn] = {}
-        self.pending: dict[int, AsyncResult[None]] = {}
+        self.pending: dict[int, Future[None]] = {}
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
-        self.maker = get_context("spawn").Pool(1, start_worker)
+        self.maker = ProcessPoolExecutor(1, get_context("spawn"), start_worker)
         folder.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Stream:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.maker.terminate()
-        self.maker.join()
+        # The scene that is being made is completed: ending a process that holds a lock of the pool's may hang.
+        self.maker.shutdown(cancel_futures=True)
 
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step, the same for the same step, seed and state of the generator.
@@ -225,7 +225,7 @@ class Stream:
         for gone in [k for k in {*self.pool, *self.pending} if k < first]:
             self.pool.pop(gone, None)
             if gone in self.pending:  # made, but never drawn
-                self.pending.pop(gone).get()
+                self.pending.pop(gone).result()
             shutil.rmtree(self._path(gone), ignore_errors=True)
         for soon in range(first, first + POOL_SIZE + 1):
             self._order(soon)
@@ -240,14 +240,14 @@ class Stream:
 
     def _made(self, number: int) -> Scene:
         if number in self.pending:
-            self.pending.pop(number).get()
+            self.pending.pop(number).result()
         return load_scene(self._path(number), cache=self._path(number) / "decoded")  # deleted with the scene
 
     def _order(self, number: int) -> None:
         """Start making a procedural scene, unless it exists or is pending."""
         recipe_ = self._describe(number).recipe
         if recipe_ is not None and number not in self.pending and not self._path(number).exists():
-            self.pending[number] = self.maker.apply_async(make, (recipe_, self._path(number)))
+            self.pending[number] = self.maker.submit(make, recipe_, self._path(number))
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
