@@ -34,7 +34,7 @@ def finite_forward_and_backward(own: Network, result: TileRendering) -> set[str]
 def test_every_kind_of_network_is_finite_forward_and_backward(name: str, opaque: bool):
     own = network(NETWORKS[name], stir=0.02)
     tiles, views, start = looking(own, scene())
-    result = own(tiles, views, start, opaque, torch.Generator().manual_seed(0))
+    result = own(tiles, views, start, opaque, generator=torch.Generator().manual_seed(0))
     assert result.colour.shape == (2, 256, 3)
     assert result.depth.shape == result.opacity.shape == (2, 256)
     assert len(result.inverse_depths) == len(result.coarse_colours) + 1 == len(own.grids)
@@ -172,7 +172,7 @@ def test_without_a_generator_rendering_repeats_and_with_one_it_varies_with_the_s
     given = looking(own, scene())
     with torch.inference_mode():
         first, again = own(*given, True), own(*given, True)
-        one, other = (own(*given, True, torch.Generator().manual_seed(s)) for s in (1, 2))
+        one, other = (own(*given, True, generator=torch.Generator().manual_seed(s)) for s in (1, 2))
     assert torch.equal(first.colour, again.colour)
     assert not torch.equal(one.colour, other.colour)
 

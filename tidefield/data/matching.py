@@ -52,6 +52,8 @@ HALF_PX = 3.0
 """Half of the interval that is left to search, in pixels of parallax."""
 FRAME_PX, OVERLAP_PX = 768, 96
 """Side of the parts of a camera that are matched at once, and how far they overlap."""
+MARGIN_PX = 2.0
+"""Pixels at the borders of photographs that are not compared: other depths would be read outside of them."""
 KEPT_BYTES = 300_000_000
 """Memory for photographs without their means and contrasts; those that were not read for the longest time go first."""
 
@@ -100,9 +102,7 @@ class Matcher:
         seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
         return DepthPrior(result, torch.where(seen, detail, 0.0))
 
-    def _match(
-        self, camera: Cameras, start: Float[Tensor, "H W"], reach: float
-    ) -> tuple[Float[Tensor, "H W"], float]:
+    def _match(self, camera: Cameras, start: Float[Tensor, "H W"], reach: float) -> tuple[Float[Tensor, "H W"], float]:
         """Inverse depths of the surface, and the inverse depth that is a pixel of parallax (0 if nothing matches).
 
         Args:
@@ -111,6 +111,8 @@ class Matcher:
         step, found = 0.0, start
         coarsest = _smaller(camera, LEVELS - 1)
         weight, views = self._views(coarsest, _resized(start, coarsest))
+        if not len(views):
+            return start, 0.0
         for level in reversed(range(LEVELS)):
             small, first = _smaller(camera, level), level == LEVELS - 1
             own = FIRST_STEPS if first else STEPS
@@ -202,7 +204,9 @@ class Matcher:
             source = self.pyramid.cameras[int(self.pyramid.row(torch.tensor(photograph), torch.tensor(level)))]
             image = self._image(photograph, level, source)
             looks.append(
-                _Look(image, source, rows, columns, view[rows, columns], rays[rows, columns], origin, start[rows, columns])
+                _Look(
+                    image, source, rows, columns, view[rows, columns], rays[rows, columns], origin, start[rows, columns]
+                )
             )
         return looks
 
@@ -247,6 +251,9 @@ class _Look:
         far, near = rays @ matrix[:, :3].T, matrix[:, :3] @ origin_world + matrix[:, 3]
         uv = _over(far[..., :2] + start[..., None] * near[:2], (far[..., 2] + start * near[2])[..., None])
         self.parallax_px = _over(near[:2] - uv * near[2], (far[..., 2] + start * near[2])[..., None]).norm(dim=-1)
+        # The weights are of the coarsest level's pixels, which may lie half outside of the photograph.
+        inside = (uv > MARGIN_PX).all(-1) & (uv < source.size_px[0] - MARGIN_PX).all(-1)
+        self.weight = self.weight * inside
         moved = source.displaced(uv.reshape(1, -1, 2)).reshape(uv.shape) - uv
         # From pixels to what `grid_sample` takes: -1 to 1 from border to border.
         scale = 2 / source.size_px[0]

@@ -40,7 +40,6 @@ class Tiles:
         count = self.side_px // stride + 2 * margin
         return self.corner_px[:, None] + (pixel_grid(count, count, self.corner_px.device) - margin) * stride
 
-
     def pixels_per_unit(self, inverse_depth: Float[Tensor, "T R M"]) -> Float[Tensor, "T P"]:
         """Pixels that a unit of length shows as at samples' inverse z-depths, the samples of all rays one after the
         other."""

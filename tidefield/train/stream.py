@@ -195,9 +195,7 @@ class Stream:
         config: of the network that learns.
     """
 
-    def __init__(
-        self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, config: Config
-    ) -> None:
+    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, config: Config) -> None:
         self.folder, self.seed, self.device = folder, seed, device
         widths = WHOLE_WIDTHS if config.train.crop_px is None else WIDTHS
         self.real = [scene for path in real for scene in at_several_widths(path, widths)]
