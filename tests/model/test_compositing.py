@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.model.compositing import composite, weights
-from tidefield.model.swift import surface_logits, surface_shares
+from tidefield.model.swift import surface_logits, surface_shares, widths
 
 
 def random_ray(rays: int = 20, samples: int = 9, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -113,3 +113,21 @@ def test_surface_logits_and_their_gradients_are_finite_for_samples_that_cannot_b
         assert logits.isfinite().all()
         assert given.grad is not None
         assert given.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("where", ["evenly", "unevenly"])
+def test_more_samples_of_one_density_stop_no_more_light(where: str):
+    """The surface's distribution is a function of the place on the ray: sampling it densely changes nothing."""
+
+    def opacity(samples: int, before: float) -> Tensor:
+        s = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples
+        if where == "unevenly":
+            s = s**1.5
+        score = (-2 * (s - 0.4) ** 2)[None] + widths(s[None]).log()
+        sigma = F.softplus(surface_logits(score, torch.tensor(-0.7, dtype=torch.float64)))
+        return weights(sigma, torch.ones_like(sigma))[s[None] < before].sum()
+
+    for before in (0.5, 1.0):
+        few, many = opacity(24, before), opacity(384, before)
+        assert 0.1 < many < 0.9
+        assert abs(few - many) < 0.03, "a sample's width is 0.04"

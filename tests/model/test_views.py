@@ -121,3 +121,18 @@ def test_colours_come_from_the_photographs_at_full_resolution_whatever_the_featu
     towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
     colours = views.read(4, points, towards, MIDDLE, torch.ones(points.shape[:2])).colours
     assert (colours - wall.texture(points[:, None, :, :2])).abs().max() < 0.08
+
+
+def test_a_view_of_half_the_size_is_an_octave_coarser():
+    own, at = network(SWIFT.network).eval(), scene()
+    with torch.inference_mode():
+        tiles, views, _ = looking(own, at)
+        points = torch.tensor([[0.1, -0.2, wall.DEPTH], [0.7, 0.3, wall.DEPTH]]).expand(2, 2, 3)
+        towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
+        scale = tiles.pixels_per_unit(torch.full((2, 1, 2), 1 / wall.DEPTH))
+        same = views.read(1, points, towards, MIDDLE, scale).octaves_coarser
+        larger = views.read(1, points, towards, MIDDLE, 2 * scale).octaves_coarser
+        far_larger = views.read(1, points, towards, MIDDLE, 100 * scale).octaves_coarser
+    torch.testing.assert_close(same, torch.zeros_like(same), atol=1e-5, rtol=0)
+    torch.testing.assert_close(larger, torch.ones_like(same))
+    torch.testing.assert_close(far_larger, torch.full_like(same, 2.0))

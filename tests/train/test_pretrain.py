@@ -15,6 +15,7 @@ import torch.multiprocessing as processes
 from networks import SMALL
 from rich.console import Console
 from safetensors import safe_open
+from scenes_on_disk import PINHOLE, survey, write_colmap
 from torch.nn import functional as F
 
 from tidefield.commands.pretrain import Pretrain
@@ -102,6 +103,26 @@ def test_scenes_are_procedural_and_real_augmented_of_their_own() -> None:
     assert len({own.exposure_error for own in every}) > 10
     assert 30 < sum(own.channels != (0, 1, 2) for own in every) < 60
     assert len({own.channels for own in every}) == 6
+
+
+def test_real_scenes_take_part_at_every_width_that_their_files_have(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    scenes = stream.at_several_widths(tmp_path / "flats", (32, 48, 256))
+    assert [int(one.cameras.size_px[0, 0]) for one in scenes] == [32, 48, 64]
+    torch.testing.assert_close(scenes[0].cameras.focal_px * 2, scenes[2].cameras.focal_px)
+    (whole,) = stream.at_several_widths(tmp_path / "flats", (400,))
+    assert int(whole.cameras.size_px[0, 0]) == 64
+
+
+def test_networks_that_encode_whole_photographs_learn_from_smaller_ones(tmp_path: Path, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(stream, "at_several_widths", lambda path, widths: asked.append(widths) or [])
+    for config in (SMALL, PRESETS["paper"]):
+        with Stream(tmp_path / config.preset, [tmp_path], 1, CPU, config):
+            pass
+    assert asked == [stream.WIDTHS, stream.WHOLE_WIDTHS]
+    assert max(stream.WHOLE_WIDTHS) <= 400
+    assert {200, 1600} <= set(stream.WIDTHS)
 
 
 def test_augmentation_is_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from tidefield.data.depth_prior import STRIDE, DepthPrior, read_prior
+from tidefield.data.depth_prior import STRIDE, DepthPrior
 from tidefield.data.neighbours import BORDER, from_border
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
@@ -332,6 +332,10 @@ def _parts(camera: Cameras) -> list[tuple[_Box, _Box]]:
     for side in (camera.width, camera.height):
         count = max(1, -(-side // FRAME_PX))
         edges = [round(k * side / count) for k in range(count + 1)]
-        sides.append([(max(0, a - OVERLAP_PX), min(side, b + OVERLAP_PX), a, b) for a, b in zip(edges, edges[1:])])
+        sides.append([(max(0, a - OVERLAP_PX), min(side, b + OVERLAP_PX), a, b) for a, b in pairwise(edges)])
     columns, rows = sides
-    return [(((l, t), (r, b)), ((x0, y0), (x1, y1))) for t, b, y0, y1 in rows for l, r, x0, x1 in columns]
+    return [
+        (((left, top), (right, bottom)), ((x0, y0), (x1, y1)))
+        for top, bottom, y0, y1 in rows
+        for left, right, x0, x1 in columns
+    ]

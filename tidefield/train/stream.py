@@ -205,6 +205,8 @@ class Stream:
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
         self.maker = ProcessPoolExecutor(1, get_context("spawn"), start_worker)
         folder.mkdir(parents=True, exist_ok=True)
+        # Of a training that was ended: some may never be drawn.
+        self.left = {int(path.name.split("-")[1]) for path in folder.glob(f"{seed}-*") if path.name[-6:].isdigit()}
 
     def __enter__(self) -> Stream:
         return self
@@ -220,7 +222,8 @@ class Stream:
         """
         first = step // STEPS_EACH
         number = first + int(torch.randint(POOL_SIZE, (), generator=generator))
-        for gone in [k for k in {*self.pool, *self.pending} if k < first]:
+        for gone in [k for k in {*self.pool, *self.pending, *self.left} if k < first]:
+            self.left.discard(gone)
             self.pool.pop(gone, None)
             if gone in self.pending:  # made, but never drawn
                 self.pending.pop(gone).result()
