@@ -35,7 +35,7 @@ class Encoder(nn.Module):
         # Skips at strides 8 and 4 (layers 3 and 2 of Table 1), then, for finer outputs, 2 (layer 1) and 1 (the input).
         channels, skips = (w3, w2, w1, w0, min(w0, 8)), (w2, w1, w0, 3)
         steps = 2 + sum(min(self.strides) < stride for stride in (4, 2))
-        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm) for k in range(steps))
+        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm, config.aligned) for k in range(steps))
         at_stride = {4: w1, 2: w0, 1: min(w0, 8)}
         self.out = nn.ModuleList(nn.Conv2d(at_stride[s], c, 1) for s, c in outputs)
 
@@ -97,11 +97,14 @@ def double(maps: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C H W"]:
 class _Up(nn.Module):
     """3x3 upconv x2, then a 3x3 convolution on [skip, upsampled] (layers 6-7 and 8-9 of Table 1)."""
 
-    def __init__(self, inputs: int, skip: int, outputs: int, norm: bool) -> None:
+    def __init__(self, inputs: int, skip: int, outputs: int, norm: bool, aligned: bool) -> None:
         super().__init__()
+        self.aligned = aligned
         self.widen = _ConvNorm(inputs, outputs, 3, 1, norm)
         self.merge = _ConvNorm(skip + outputs, outputs, 3, 1, norm)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        x = double(x)[..., : skip.shape[-2], : skip.shape[-1]]
+        # By 2 exactly, then cut: an odd size was rounded up on the way down, and fitting it would shift features.
+        x = double(x) if self.aligned else F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+        x = x[..., : skip.shape[-2], : skip.shape[-1]]
         return F.relu(self.merge(torch.cat([skip, F.relu(self.widen(x))], dim=1)))
