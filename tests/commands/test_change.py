@@ -81,6 +81,44 @@ def test_the_numbers_tell_volumes_intervals_and_where_they_come_from(compared: t
         assert [row["volume"] for row in csv.DictReader(file)][:3] == ["net", "cut", "fill"]
 
 
+def test_clouds_are_compared_as_surfaces_and_by_m3c2(tmp_path: Path):
+    import laspy
+    from pyproj import CRS
+
+    rng = np.random.default_rng(0)
+    for name, lower in (("early", 0.0), ("late", 0.3)):
+        xy = rng.uniform(0, 40, (30_000, 2))
+        pit = np.hypot(*(xy - 12).T) < 6
+        las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+        las.header.add_crs(CRS.from_epsg(32630))
+        las.header.scales, las.header.offsets = np.full(3, 0.001), np.array([400_000.0, 5_700_000.0, 0.0])
+        las.x, las.y = 400_000 + xy[:, 0], 5_700_000 + xy[:, 1]
+        las.z = 2 - lower * pit + rng.normal(0, 0.03, len(xy))
+        las.write(str(tmp_path / f"{name}.laz"))
+    call("change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "out", "-q")
+    numbers = json.loads((tmp_path / "out" / "change.json").read_text())
+    assert numbers["earlier"]["file"] == "early.laz"
+    cut = numbers["volumes"]["cut"]
+    assert cut["low_m3"] < 0.3 * np.pi * 36 < cut["high_m3"]
+    m3c2 = laspy.read(tmp_path / "out" / "m3c2.laz")
+    assert m3c2.header.parse_crs().to_epsg() == 32630
+    inside = np.hypot(np.asarray(m3c2.x) - 400_012, np.asarray(m3c2.y) - 5_700_012) < 5
+    assert np.median(np.asarray(m3c2["M3C2_distance"])[inside]) == pytest.approx(-0.3, abs=0.01)
+    assert np.asarray(m3c2["significant"])[inside].mean() > 0.95
+
+
+def test_a_cloud_and_a_surface_are_not_compared(
+    compared: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+):
+    early = compared[0].parent / "early_0.tif"
+    (tmp_path / "late.laz").write_bytes(b"LASF")
+    told = fails(capsys, monkeypatch, "change", early, tmp_path / "late.laz", tmp_path / "new")
+    assert "two surfaces or two clouds" in told
+    (tmp_path / "early.laz").write_bytes(b"LASF" + bytes(300))
+    told = fails(capsys, monkeypatch, "change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "new")
+    assert "cannot be read as a point cloud" in told
+
+
 def test_mistakes_are_told_in_one_message(
     compared: tuple[Path, np.ndarray],
     tmp_path: Path,

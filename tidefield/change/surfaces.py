@@ -110,7 +110,8 @@ class Surface:
         nodata: value of pixels without a height, declared or found; None if there is none.
         metres: length of one unit of the heights.
         sigma: raster of their standard errors, if there is one.
-        orthophoto: of the same survey, if there is one.
+        orthophoto, cloud: of the same survey, if there are any.
+        source: name of the cloud that the surface was made of.
         date: YYYY-MM-DD of the photographs, if the file or its name tells.
         remarks: what a user should know of how it was read.
     """
@@ -125,13 +126,14 @@ class Surface:
     sigma: Path | None = None
     orthophoto: Path | None = None
     cloud: Path | None = None
+    source: str | None = None
     date: str | None = None
     remarks: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:
         """Date, or the file's name."""
-        return self.date or self.path.stem
+        return self.date or self.source or self.path.stem
 
     @contextmanager
     def on_grid(self, grid: Grid, shift_m: tuple[float, float] = (0.0, 0.0)) -> Iterator[Read]:
@@ -279,7 +281,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                 remarks.append(
                     f"{path.name} declares no nodata, but has {nodata:g} where no height can be: read as such"
                 )
-        date = date or _date(dataset.tags().get("TIFFTAG_DATETIME", "")) or _date(path.stem)
+        date = date or date_in(dataset.tags().get("TIFFTAG_DATETIME", "")) or date_in(path.stem)
         return Surface(
             path,
             crs,
@@ -314,7 +316,7 @@ def _undeclared(dataset: Any) -> float | None:
     return None
 
 
-def _date(text: str) -> str | None:
+def date_in(text: str) -> str | None:
     """A date in a text, as YYYY-MM-DD, or None."""
     found = re.search(r"(?<!\d)(19|20)(\d\d)[-_:.]?(0[1-9]|1[0-2])[-_:.]?(0[1-9]|[12]\d|3[01])(?!\d)", text)
     return "{}{}-{}-{}".format(*found.groups()) if found else None

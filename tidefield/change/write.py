@@ -316,7 +316,7 @@ def summary(change: Change, command: str) -> dict[str, Any]:
 
 def _survey(surface: Any) -> dict[str, Any]:
     return {
-        "file": surface.path.name,
+        "file": surface.source or surface.path.name,
         "date": surface.date,
         "crs": surface.crs.name if surface.crs is not None else None,
         "pixel": [abs(surface.transform.a), abs(surface.transform.e)],

@@ -7,6 +7,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -31,7 +32,8 @@ class Change:
     """
 
     earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
-    """The earlier survey: a surface (GeoTIFF of heights), or a folder of `tidefield map` or ODM."""
+    """The earlier survey: a surface (GeoTIFF of heights), a point cloud (LAS, LAZ), or a folder of `tidefield map` or
+    ODM."""
     later: Annotated[Positional[Path], arg(metavar="LATER")]
     """The later survey, likewise."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
@@ -54,6 +56,8 @@ class Change:
     window: int | None = None
     """Cells along each side of the window in which change is tested, odd; chosen from the correlation of the errors if
     not given."""
+    m3c2: bool = False
+    """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
     dates: tuple[str, str] | None = None
     """Dates of the surveys, if files and names do not tell: YYYY-MM-DD YYYY-MM-DD."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
@@ -61,16 +65,23 @@ class Change:
 
 def change(options: Change, console: Console) -> None:
     """Run `tidefield change`."""
-    from tidefield.change.inputs import open_survey
+    refuse_existing(options.out, replaceable=False)
+    _check(options)
+    with TemporaryDirectory() as work:
+        _compare(options, console, Path(work))
+
+
+def _compare(options: Change, console: Console, work: Path) -> None:
+    from tidefield.change.clouds import compare_clouds, write_distances
+    from tidefield.change.inputs import open_pair
     from tidefield.change.measure import Options, measure
     from tidefield.change.regions import read_regions
     from tidefield.change.write import write_all
     from tidefield.progress import ProgressBar
 
-    refuse_existing(options.out, replaceable=False)
-    _check(options)
     dates = options.dates or (None, None)
-    earlier, later = open_survey(options.earlier, dates[0]), open_survey(options.later, dates[1])
+    pair = open_pair(options.earlier, options.later, work, dates, options.cell, options.m3c2)
+    earlier, later = pair.earlier, pair.later
     if earlier.date and later.date and earlier.date > later.date:
         raise RunError(
             f"{options.earlier} is of {earlier.date}, {options.later} of {later.date}: expected the earlier survey "
@@ -87,6 +98,13 @@ def change(options: Change, console: Console) -> None:
         log.warning(remark)
     with completed_folder(options.out) as folder:
         write_all(found, folder, shlex.join(["tidefield", *sys.argv[1:]]))
+        if pair.clouds is not None:
+            registration = found.errors.registration
+            with ProgressBar(console, "Measuring M3C2 distances") as bar:
+                distances = compare_clouds(
+                    *pair.clouds, found.grid.cell_m, registration.systematic_m, registration.vertical_m, bar
+                )
+            write_distances(distances, pair.clouds[0].crs, folder / "m3c2.laz")
     for name, volume in (("net", found.net), ("cut", found.cut), ("fill", found.fill)):
         low, high = volume.interval_m3
         console.print(
