@@ -255,6 +255,25 @@ def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) ->
     print(out)
 
 
+def change(
+    data: Path | None = None,
+    runs: Path = MEASURED,
+    out: Path = Path("docs/change-results.md"),
+) -> None:
+    """Measure `tidefield change` against published figures; write the page.
+
+    Args:
+        data: Folder with bmx and st_leonards; without it, their figures stay as they are stored.
+        runs: Store the figures in this folder's change.json.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.change import measure_change, write_page
+
+    measure_change(data, runs, partial(print, flush=True))
+    write_page(runs, out)
+    print(out)
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -294,7 +313,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, kills, fuzz)
+    functions = (speed, frames, memory, scales, table, robustness, card, surveys, change, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

@@ -16,6 +16,7 @@ RANK = {
     "evaluation": 3,
     "render": 3,
     "train": 4,
+    "change": 4,
     "baselines": 5,
     "methods": 6,
     "api": 7,

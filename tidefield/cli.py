@@ -22,6 +22,7 @@ from tidefield.commands import (
     ablate,
     baselines,
     cache,
+    change,
     compare,
     demo,
     evaluate,
@@ -47,6 +48,7 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
     "train": (train, train.Train, "train"),
     "evaluate": (evaluate, evaluate.Evaluate, "evaluate"),
     "render": (render, render.Render, "render"),
+    "change": (change, change.Change, "change"),
     "compare": (compare, compare.Compare, "compare"),
     "ablate": (ablate, ablate.Ablate, "ablate"),
     "baselines": (baselines, baselines.Baselines, "baselines"),
@@ -63,6 +65,7 @@ The usual order of commands:
   tidefield train SCENE RUN         learn the scene
   tidefield evaluate RUN            measure quality on held-out photographs
   tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+  tidefield change EARLIER LATER OUT    what changed between two surveys, with volumes and intervals
 
 tidefield demo does all of it on a built-in scene."""
 
