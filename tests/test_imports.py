@@ -17,6 +17,7 @@ RANK = {
     "render": 3,
     "train": 4,
     "baselines": 5,
+    "maps": 5,
     "methods": 6,
     "api": 7,
     "compare": 7,

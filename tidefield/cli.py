@@ -26,6 +26,7 @@ from tidefield.commands import (
     demo,
     evaluate,
     import_,
+    map_,
     prepare,
     pretrain,
     render,
@@ -47,6 +48,7 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
     "train": (train, train.Train, "train"),
     "evaluate": (evaluate, evaluate.Evaluate, "evaluate"),
     "render": (render, render.Render, "render"),
+    "map": (map_, map_.Map, "map_"),
     "compare": (compare, compare.Compare, "compare"),
     "ablate": (ablate, ablate.Ablate, "ablate"),
     "baselines": (baselines, baselines.Baselines, "baselines"),
@@ -63,6 +65,7 @@ The usual order of commands:
   tidefield train SCENE RUN         learn the scene
   tidefield evaluate RUN            measure quality on held-out photographs
   tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+  tidefield map RUN OUT             orthophoto, surface model and point cloud; with --zero-shot from SCENE
 
 tidefield demo does all of it on a built-in scene."""
 
