@@ -18,6 +18,7 @@ RANK = {
     "train": 4,
     "change": 4,
     "baselines": 5,
+    "maps": 5,
     "methods": 6,
     "api": 7,
     "compare": 7,
