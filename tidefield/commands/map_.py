@@ -35,6 +35,8 @@ class Map:
     """Map only this polygon of a GeoJSON file."""
     heights: str | None = None
     """Vertical system of the scene's heights, such as EPSG:5701, where the scene does not state it."""
+    check: Path | None = None
+    """Check points, besides those of the scene: a file like gcp_list.txt, or with lines `x y z name`."""
     fill: bool = False
     """Fill cells that fewer than two photographs see, and mark them in odm_dem/filled.tif."""
     device: Device = "auto"
@@ -53,6 +55,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     from tidefield.device import choose_device
     from tidefield.files import only_writer
     from tidefield.maps.area import bounds_of, read_shapes
+    from tidefield.maps.check_points import check_files, read_check_points
     from tidefield.maps.grid import make_grid, map_frame
     from tidefield.maps.make import Job, delete_tiles, make_map
     from tidefield.maps.rasters import need
@@ -76,7 +79,8 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         widest = max(file.lens.width for file in scene.photographs.files)
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, bounds_of(area))
-        job = Job(full, grid, render, area, options.fill, {"method": record})
+        points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
+        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points))
         console.print(
             f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
             f"heights: {frame.heights}",
@@ -93,4 +97,16 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         highlight=False,
         soft_wrap=True,
     )
+    if "check_points" in result:
+        found = result["check_points"]
+        console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit)}", soft_wrap=True)
     return result
+
+
+def _describe(found: dict[str, Any], unit: str) -> str:
+    """The statistics of heights at check points, in one line."""
+    if not found["n"]:
+        return "none of them is on the map"
+    return (
+        f"heights: RMSE {found['rmse']:.3f}, mean {found['mean']:+.3f}, NMAD {found['nmad']:.3f} {unit}, n {found['n']}"
+    )

@@ -24,10 +24,11 @@ from tidefield.errors import RunError
 from tidefield.files import completed_file, delete_partials, read_json, write_json
 from tidefield.machine import cores
 from tidefield.maps.area import inside, touches
+from tidefield.maps.check_points import CheckPoint, check, summary
 from tidefield.maps.cloud import UNCLASSIFIED, cloud_writer
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.orthophoto import render_tile
-from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
+from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer, read_raster
 from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
@@ -60,6 +61,7 @@ class Job:
         area: outside of which nothing is mapped; None for no limit.
         fill: fill cells that fewer than two photographs see, and mark them.
         settings: what else the tiles depend on, for resuming.
+        check_points: surveyed points that the map is compared with.
     """
 
     scene: Scene
@@ -68,6 +70,7 @@ class Job:
     area: BaseGeometry | None
     fill: bool
     settings: dict[str, Any]
+    check_points: tuple[CheckPoint, ...] = ()
 
     @property
     def tile_side(self) -> int:
@@ -296,6 +299,9 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
     if not found["cells"]:
         raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
     grid = job.grid
+    if job.check_points:
+        height, sigma = read_raster(out / DSM)[0], read_raster(out / SIGMA)[0]
+        found["check_points"] = summary(check(job.check_points, job.scene, grid, height, sigma))
     result = {
         **record,
         "key": job.key,
