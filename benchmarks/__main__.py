@@ -280,19 +280,21 @@ def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) ->
 
 def change(
     data: Path | None = None,
+    pairs: int = 20,
     runs: Path = MEASURED,
     out: Path = Path("docs/change-results.md"),
 ) -> None:
-    """Measure `tidefield change` against published figures; write the page.
+    """Measure `tidefield change` against published figures and on pairs of known change (10 minutes); write the page.
 
     Args:
         data: Folder with bmx and st_leonards; without it, their figures stay as they are stored.
+        pairs: Of built-in surveys for each amount of change; 0 leaves their figures as they are stored.
         runs: Store the figures in this folder's change.json.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.change import measure_change, write_page
 
-    measure_change(data, runs, partial(print, flush=True))
+    measure_change(data, runs, pairs, partial(print, flush=True))
     write_page(runs, out)
     print(out)
 

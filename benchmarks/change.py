@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import shapely
 
+from benchmarks.change_pairs import measure_pairs, summarise
 from tidefield.change.errors import anderson_terms, nmad
 from tidefield.change.m3c2 import m3c2
 from tidefield.change.measure import measure
 from tidefield.change.regions import Region, read_regions
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
-from tidefield.compare.tables import Table
+from tidefield.compare.tables import NOTHING, Table
 from tidefield.files import read_json, write_json, write_text
 from tidefield.machine import describe
 
@@ -150,13 +151,20 @@ def _st_leonards(folder: Path) -> list[dict[str, Any]]:
     return steps
 
 
-def measure_change(data: Path | None, runs: Path, say: Callable[[str], None]) -> dict[str, Any]:
+def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Measure all parts, and store them in RUNS/change.json as they are done."""
     record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
     record |= {"command": "python -m benchmarks change", **describe()}
     if data is not None:
         say("published figures")
         record["published"] = published(data)
+        write_json(runs / CHANGE_FILE, record)
+    if pairs:
+        say(f"{pairs} pairs of built-in surveys for each amount of change")
+        record["pairs"] = [
+            {key: found[key] for key in ("change_m", "stable_ground")} | summarise(found)
+            for found in measure_pairs(range(pairs), say)
+        ]
         write_json(runs / CHANGE_FILE, record)
     return record
 
@@ -166,6 +174,8 @@ def tables(record: dict[str, Any]) -> list[Table]:
     made = []
     if "published" in record:
         made += _published_tables(record["published"])
+    if "pairs" in record:
+        made.append(_pairs_table(record["pairs"]))
     return made
 
 
@@ -226,6 +236,26 @@ def _published_tables(found: dict[str, Any]) -> list[Table]:
             volumes,
         ),
     ]
+
+
+def _pairs_table(pairs: list[dict[str, Any]]) -> Table:
+    rows = []
+    for of in pairs:
+        n, nothing = of["pairs"], of["change_m"] == 0
+        rows.append(
+            [
+                "none" if nothing else f"{100 * of['change_m']:+.0f} cm",
+                f"{100 * of['false_alarms']:.1f}%",
+                f"{100 * of['detection_m']:.1f} cm",
+                NOTHING if nothing else f"{100 * of['detected']:.0f}%",
+                NOTHING if nothing else f"{100 * of['outlined']:.0f}%",
+                f"{1000 * (of['bias_m'] if nothing else of['bias_where_changed_m']):+.1f} mm",
+                *(f"{of[key]} of {n}" for key in ("net", "cut_inside", "fill_inside", "cut", "fill")),
+            ]
+        )
+    header = ["change", "false alarms", "detected from", "cells found", "outlined", "bias where changed"]
+    header += ["net", "cut in outlines", "fill in outlines", "all cut", "all fill"]
+    return Table("Pairs of built-in surveys: 95% intervals that contain the truth", header, rows)
 
 
 def _volume(volume: dict[str, Any]) -> str:

@@ -42,6 +42,6 @@ def test_cloudcompare_and_anderson_are_met(figures):
 
 def test_missing_data_are_told_of(tmp_path):
     with pytest.raises(ChangeError, match="bmx"):
-        measure_change(tmp_path, tmp_path, print)
+        measure_change(tmp_path, tmp_path, 0, print)
     with pytest.raises(ChangeError, match="benchmarks change"):
         write_page(tmp_path, tmp_path / "page.md")

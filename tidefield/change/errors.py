@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -34,6 +34,9 @@ _BLOCKS = 512
 """Rows and columns to which a region is reduced before its covariances are summed."""
 _BINS_PER_OCTAVE = 4
 _LEAST_PAIRS = 200
+_LEAST_PATCHES = 12
+_WORTH = 6.0
+"""A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
 _CLIP = 4.0
 """Residuals are limited to this many deviations before they are squared: moved objects are no part of the noise."""
 _NEAR = 4
@@ -69,10 +72,24 @@ class Variogram:
         """The longest range; 0 without correlation."""
         return max(self.ranges_m, default=0.0)
 
+    def degrees_of_freedom(self, area_m2: float) -> float:
+        """Of the variance of a large region's sum, if sills and ranges were measured on ground of this area.
+
+        A structure of range a has as many independent samples there as patches of pi a^2 / 5 fit in, less one for the
+        mean; structures are weighted by what they add to the variance of a sum (Satterthwaite 1946).
+        """
+        if not self.sills:
+            return math.inf
+        parts = [(s * a**2, max(1.0, 5 * area_m2 / (math.pi * a**2) - 1)) for s, a in self._structures()]
+        return sum(c for c, _ in parts) ** 2 / sum(c**2 / n for c, n in parts)
+
+    def _structures(self) -> list[tuple[float, float]]:
+        return list(zip(self.sills, self.ranges_m, strict=True))
+
     def correlation(self, distance_m: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
         """Correlation at distances above 0; at 0 that of neighbours infinitely close, without the nugget."""
         total = np.zeros(np.shape(distance_m))
-        for sill, reach in zip(self.sills, self.ranges_m, strict=True):
+        for sill, reach in self._structures():
             h = np.minimum(distance_m / reach, 1)
             total += sill * (1 - 1.5 * h + 0.5 * h**3)
         return total
@@ -167,12 +184,43 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     if len(table) < 4:
         return UNCORRELATED
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
-    return _fitted(lags, gammas, pairs)
+    return _with_patches(_fitted(lags, gammas, pairs), residuals / np.float32(residuals[finite].std()), cell_m)
 
 
 def _padded(rows: int, columns: int) -> tuple[int, int]:
     """Size of a Fourier transform in which no offset of a raster comes round to another."""
     return next_fast_len(2 * rows) or 2 * rows, next_fast_len(2 * columns) or 2 * columns
+
+
+def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Variogram:
+    """Add what the means of large patches scatter beyond what a variogram says, as a structure of twice their side.
+
+    A variogram hardly shows what is correlated over a good part of the stable ground, because its mean is taken out; it
+    is what the errors of volumes hang on. Means of disjoint patches show it (Rolstad et al. 2009, doi
+    10.3189/002214309789470950).
+    """
+    side = min(residuals.shape) // 3
+    while side >= 8:
+        rows, columns = residuals.shape[0] // side, residuals.shape[1] // side
+        blocks = residuals[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        counts = np.isfinite(blocks).sum(axis=(1, 3))
+        sums = np.where(np.isfinite(blocks), blocks, 0).clip(-_CLIP, _CLIP).sum(axis=(1, 3), dtype=np.float64)
+        full = counts > side**2 / 2
+        if full.sum() >= _LEAST_PATCHES:
+            break
+        side = side * 3 // 4
+    else:
+        return fitted
+    means = sums[full] / counts[full]
+    predicted = fitted.nugget / side**2 + mean_correlation(fitted, side * cell_m)
+    reach = 2 * side * cell_m
+    share = mean_correlation(Variogram((1.0,), (reach,)), side * cell_m)
+    sill = (float(np.mean(means**2)) - predicted) / share
+    if sill <= 0:
+        return fitted
+    whole = 1 + sill
+    ordered = sorted(zip((*fitted.ranges_m, reach), (*fitted.sills, sill), strict=True))
+    return replace(fitted, sills=tuple(s / whole for _, s in ordered), ranges_m=tuple(a for a, _ in ordered))
 
 
 def _pieces(values: np.ndarray) -> list[np.ndarray]:
@@ -211,7 +259,7 @@ def _fitted(lags: np.ndarray, gammas: np.ndarray, pairs: np.ndarray) -> Variogra
         found = _least_squares(lags, gammas, weight, variance, structures)
         cost = float((weight**2 * (_model(found, lags) - gammas) ** 2).sum())
         criterion = len(lags) * math.log(cost + 1e-12 * variance**2) + 2 * len(found)  # Akaike
-        if best is None or criterion < best[0] - 4:
+        if best is None or criterion < best[0] + _WORTH:
             best = criterion, found
     assert best is not None
     nugget, *rest = best[1]
@@ -265,12 +313,6 @@ def _least_squares(
 def mean_correlation(variogram: Variogram, side_m: float) -> float:
     """Mean correlation of all pairs of points in a square, without the nugget."""
     return float(_block_correlation(variogram, side_m, np.zeros(1), np.zeros(1))[0])
-
-
-def centre_correlation(variogram: Variogram, side_m: float) -> float:
-    """Mean correlation of the points of a square with its centre, without the nugget."""
-    u = (np.arange(_QUADRATURE) + 0.5) / _QUADRATURE - 0.5
-    return float(variogram.correlation(np.hypot(u[:, None], u[None]) * side_m).mean())
 
 
 def _block_correlation(variogram: Variogram, side_m: float, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:

@@ -10,15 +10,16 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import maximum_filter, uniform_filter
 
+from tidefield.change.choice import repeat_choice
 from tidefield.change.errors import Z95, Variogram, deviation95, fit_variogram, nmad
-from tidefield.change.outlines import Outlines, find_outlines
+from tidefield.change.outlines import WINDOWS, Outlines, find_outlines
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.registration import (
     LEAST_STABLE,
@@ -29,6 +30,7 @@ from tidefield.change.registration import (
     fit,
     statistics,
 )
+from tidefield.change.shift import Shift, find_shift
 from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid
 from tidefield.change.volumes import ErrorModel, Volume
 
@@ -36,6 +38,8 @@ log = logging.getLogger(__name__)
 
 Register = Literal["auto", "none", "vertical", "tilt"]
 _TURNS = 4
+_STANDS_OUT = 3.0
+"""Deviations of a window's mean."""
 _MOST_SAMPLED = 2_000_000
 """Cells that quantiles are computed from."""
 _NMAD_CELLS = 1000
@@ -49,14 +53,16 @@ class Options:
     Attributes:
         cell_m: side of the cells; the coarsest of the surveys' pixels if None.
         register: what is subtracted from the later survey; auto is vertical.
+        shift: horizontally, from the orthophotos: where they tell it; not at all; or refused where they do not.
         datum_error_m: one sigma of the error that all cells share, as the user knows it.
-        window: cells along each side of the window in which change is tested; chosen from the correlation if None.
+        windows: cells along each side of the windows in which change is tested.
     """
 
     cell_m: float | None = None
     register: Register = "auto"
+    shift: Literal["auto", "none", "images"] = "auto"
     datum_error_m: float | None = None
-    window: int | None = None
+    windows: tuple[int, ...] = WINDOWS
 
 
 @dataclass(frozen=True)
@@ -151,8 +157,10 @@ def measure(
     """
     options = options or Options()
     grid = common_grid([earlier, later], options.cell_m)
-    dz, own = read_difference(earlier, later, grid, tick=tick)
     remarks = [*earlier.remarks, *later.remarks]
+    shift = _shift(earlier, later, grid, options, remarks)
+    moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
+    dz, own = read_difference(earlier, later, grid, moved, tick=tick)
     if (earlier.sigma is None) != (later.sigma is None):
         remarks.append("only one survey has standard errors of its cells; they are not used")
     given = rasterised(stable(grid), grid) if stable is not None else None
@@ -173,9 +181,13 @@ def measure(
     model: Model = "vertical" if options.register == "auto" else options.register
     settled = _settle(dz, own, grid, given, model, options)
     registration, variogram, sigma, ground = settled
+    if shift is not None and shift.known:
+        registration = replace(registration, shift_m=moved, shift_error_m=shift.error_m, words=[shift.words()])
+        sigma = _with_slopes(sigma, earlier, grid, shift.error_m)
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
-    errors = ErrorModel(sigma, variogram, registration, grid)
+    degrees = variogram.degrees_of_freedom(float(ground.sum()) * grid.cell_area_m2)
+    errors = ErrorModel(sigma, variogram, registration, grid, degrees)
     alarms = _false_alarms(dz, errors, ground)
     if area is not None:
         dz[~area] = np.nan
@@ -188,8 +200,46 @@ def measure(
             f"stable ground was found, not given: {100 * ground.sum() / max(known, 1):.0f}% of the cells, where no "
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
-    outlines = find_outlines(dz, sigma, registration.systematic_m, variogram, grid.cell_m, options.window)
+    outlines = find_outlines(dz, sigma, registration.systematic_m, variogram, grid.cell_m, options.windows)
     return _summed(earlier, later, dz, errors, ground, given is not None, outlines, alarms, regions, remarks)
+
+
+def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remarks: list[str]) -> Shift | None:
+    """The horizontal shift that the orthophotos tell, if it is asked for and there are any.
+
+    Raises:
+        ChangeError: it must be known, and is not.
+    """
+    if options.shift == "none" or (options.shift == "auto" and options.register == "none"):
+        return None
+    if earlier.orthophoto is None or later.orthophoto is None:
+        if options.shift == "images":
+            raise ChangeError(
+                "--shift images was given, but one survey has no orthophoto: expected two; name them (--orthophotos)"
+            )
+        return None
+    shift = find_shift(earlier.orthophoto, later.orthophoto, grid)
+    if not shift.known:
+        if options.shift == "images":
+            raise ChangeError(f"{shift.words()}: expected at least a quarter; give control, or leave --shift out")
+        remarks.append(shift.words())
+    return shift
+
+
+def _with_slopes(
+    sigma: Float32[np.ndarray, "rows columns"] | float, earlier: Surface, grid: Grid, error_m: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Standard errors with what an error of the horizontal shift does to heights on slopes."""
+    out = np.empty(grid.shape, np.float32)
+    with earlier.on_grid(grid) as read:
+        for rows in grid.strips():
+            heights = read(max(0, rows.start - 1), min(grid.rows, rows.stop + 1))
+            north, east = np.gradient(heights, grid.cell_m)
+            inner = slice(rows.start - max(0, rows.start - 1), None)
+            slope = np.nan_to_num(np.hypot(north, east)[inner][: rows.stop - rows.start])
+            own = sigma[rows] if isinstance(sigma, np.ndarray) else np.float32(sigma)
+            out[rows] = np.hypot(own, slope * np.float32(error_m))
+    return out
 
 
 def _settle(
@@ -201,7 +251,7 @@ def _settle(
     options: Options,
 ) -> tuple[Registration, Variogram, Float32[np.ndarray, "rows columns"] | float, Bool[np.ndarray, "rows columns"]]:
     """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given."""
-    ground = np.isfinite(dz) if given is None else given
+    ground = guess = _unchanged(dz, own) if given is None else given
     turns = _TURNS if given is None else 1
     found = None
     for turn in range(turns):
@@ -224,9 +274,7 @@ def _settle(
         scaled = residual if own is None else residual / own
         values = _sampled(scaled, ground)
         values = values - np.median(values)
-        # Before change is outlined, only what most cells have in common is stable.
-        first = given is None and turn == 0
-        size = nmad(values) if first else deviation95(values)
+        size = deviation95(values)
         if len(values) < _NMAD_CELLS:
             size = max(size, nmad(values))
         if size == 0:
@@ -248,10 +296,34 @@ def _settle(
         moved = np.empty_like(dz)
         for rows in grid.strips():
             moved[rows] = dz[rows] - found.plane(grid, rows)
-        outlines = find_outlines(moved, sigma, found.systematic_m, variogram, grid.cell_m, options.window)
-        changed = np.asarray(binary_dilation(outlines.labels > 0, iterations=outlines.window), bool)
-        ground = np.isfinite(dz) & ~changed
+        outlines = find_outlines(moved, sigma, found.systematic_m, variogram, grid.cell_m, options.windows)
+        ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
     raise AssertionError("the last turn returns")
+
+
+def _unchanged(
+    dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None
+) -> Bool[np.ndarray, "rows columns"]:
+    """Ground where no window's mean stands out from what most windows have in common, as a first guess."""
+    known = np.isfinite(dz)
+    ground = known
+    for window in (5, 11):
+        share = uniform_filter(known.astype(np.float32), window, mode="constant")
+        scaled = np.where(known, dz if own is None else dz / own, np.float32(0))
+        mean = uniform_filter(scaled, window, mode="constant") / np.maximum(share, np.float32(1e-6))
+        middle, spread = 0.0, math.inf
+        for _ in range(_TURNS):
+            some = _sampled(mean, ground)
+            middle, spread = float(np.median(some)), nmad(some)
+            ground = known & (np.abs(mean - middle) <= _STANDS_OUT * spread)
+    return ground
+
+
+def dilated(region: Bool[np.ndarray, "rows columns"], cells: int) -> Bool[np.ndarray, "rows columns"]:
+    """A region with a margin of this many cells, a square around each."""
+    if cells == 0:
+        return region
+    return np.asarray(maximum_filter(region.view(np.uint8), 2 * cells + 1, mode="constant"), np.uint8).view(bool)
 
 
 def _false_alarms(
@@ -293,8 +365,13 @@ def _summed(
         detection.append(sigma[known[rows]][:: max(1, grid.columns * grid.rows // _MOST_SAMPLED)])
     low, middle, high = (Z95 * np.quantile(np.concatenate(detection), (0.05, 0.5, 0.95))).tolist()
     lower, higher = outlines.cells(-1), outlines.cells(1)
-    cut = errors.volume(dz, lower, -1.0, outlines.bias_m[0])
-    fill = errors.volume(dz, higher, 1.0, outlines.bias_m[1])
+    cut, fill = errors.volume(dz, lower, -1.0), errors.volume(dz, higher)
+    if len(outlines.signs):
+        systematic = errors.registration.systematic_m
+        of_lower, of_higher = repeat_choice(dz, errors.sigma, systematic, errors.variogram, grid.cell_m, outlines)
+        area = grid.cell_area_m2
+        cut = cut.chosen(-of_lower.bias * area, of_lower.deviation * area)
+        fill = fill.chosen(of_higher.bias * area, of_higher.deviation * area)
     each = []
     for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
         each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
@@ -355,6 +432,7 @@ def _in_box(
             own.correlated * area,
             float(middle) * len(values) * area,
             len(values) * area,
+            degrees_of_freedom=errors.degrees_of_freedom,
         ),
         float(np.abs(values).max()),
     )

@@ -1,16 +1,11 @@
-"""Outlines of change: regions whose mean over a small window is significant, and what choosing them by noise does.
+"""Outlines of change: regions where the mean of a small window is significant.
 
-A window of neighbouring cells averages what is independent between them, so that a change of a few centimetres is found
-that no cell shows alone. Windows are tested with the false discovery rate held at 5% (Benjamini and Hochberg 1995): of
-all outlined ground, at most that share is expected to be unchanged. Where nothing changed, nothing is outlined.
-
-Outlines follow the noise at their edges: of two cells that changed alike, the one whose error points the same way is
-in. The sum of dz in them is too large by
-
-    sum_i E[e_i 1(s_i > t)] = sum_i Cov(e_i, s_i) f_i(t)
-
-for normal errors (Stein 1981, doi 10.1214/aos/1176345632, for an indicator), with f_i the density of the window mean
-s_i at the threshold t. The density is that of the means that were measured: their number close to the threshold.
+Windows of cells average what is independent between them, so that a change of a few centimetres is found that no cell
+shows alone: small windows find narrow changes, large ones faint changes. The smallest p-value of a cell's windows,
+times their number (Bonferroni), is tested with the false discovery rate held at 0.1% (Benjamini and Hochberg 1995): of
+all ground that is found, at most that share is expected to be unchanged. Where nothing changed, nothing is outlined.
+Outlines are what is connected with it beyond 2.3 deviations, and a margin for the edges of the change, which are below
+any threshold; what is unchanged there adds no more than its errors, which cancel out.
 """
 
 from __future__ import annotations
@@ -20,18 +15,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
-from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
+from scipy.ndimage import find_objects, label, median_filter, uniform_filter
 from scipy.special import ndtr
 
-from tidefield.change.errors import Variogram, centre_correlation, mean_correlation
+from tidefield.change.errors import Variogram, mean_correlation
 
-FALSE_DISCOVERIES = 0.05
-_WINDOW_LIMITS = (3, 15)
+FALSE_DISCOVERIES = 0.001
+WINDOWS = (5, 11, 21)
 _BIN = 0.02
 """Of the histogram of |z|."""
 _LARGEST_Z = 40.0
-_NEAR_THRESHOLD = 0.3
-"""Means are counted as close to the threshold within this many deviations."""
+_SHOWS = 1.0
+"""z of the smallest window where a larger one is believed."""
+_CONNECTED = 2.3
+"""z of what is outlined when it is connected with what is found."""
+_LIMIT = np.float32(3)
 _STRIP = 512
 _EIGHT = np.ones((3, 3), bool)
 
@@ -41,33 +39,25 @@ class Outlines:
     """Regions of significant change.
 
     Attributes:
-        labels: number of each cell's region, from 1; 0 outside.
+        labels: number of each cell's region with its margin, from 1; 0 outside.
         signs: of each region: -1 lower, +1 higher.
         boxes: rows and columns of each region.
-        window: cells along each side of the window.
+        windows: cells along each side of the windows.
+        margin: cells that were added around what is significant.
         threshold: z of a window's mean that is significant; infinite where nothing is.
-        bias_m: sum over cells of what the choice of outlines adds to dz, for lower and for higher ground (negative and
-            positive), metres times cells.
     """
 
     labels: Int32[np.ndarray, "rows columns"]
     signs: np.ndarray
     boxes: list[tuple[slice, slice]]
-    window: int
+    windows: tuple[int, ...]
+    margin: int
     threshold: float
-    bias_m: tuple[float, float]
 
     def cells(self, sign: int) -> Bool[np.ndarray, "rows columns"]:
         """Cells of all regions of one sign."""
         lookup = np.concatenate([[False], self.signs == sign])
         return lookup[self.labels]
-
-
-def default_window(variogram: Variogram, cell_m: float) -> int:
-    """As wide as the shortest correlation: what is averaged within it is nearly one measurement, beyond it blurs."""
-    reach = min(variogram.ranges_m, default=0.0)
-    low, high = _WINDOW_LIMITS
-    return min(high, max(low, 2 * round(reach / (2 * cell_m)) + 1))
 
 
 def find_outlines(
@@ -76,55 +66,86 @@ def find_outlines(
     systematic_m: float,
     variogram: Variogram,
     cell_m: float,
-    window: int | None = None,
-    least_cells: int | None = None,
+    windows: tuple[int, ...] = WINDOWS,
 ) -> Outlines:
-    """Outline significant change.
+    """Outline significant change. Regions smaller than the smallest window are left out.
 
     Args:
         dz: difference, NaN where unknown.
         sigma: one sigma of each cell's own error.
         systematic_m: one sigma of the error that all cells share.
-        window: cells along each side; odd.
-        least_cells: of a region; those of a window if None.
+        windows: cells along each side of the windows; odd.
     """
-    window = window or default_window(variogram, cell_m)
-    least_cells = least_cells or window**2
-    z = window_z(dz, sigma, systematic_m, variogram, cell_m, window)
-    threshold = _threshold(z)
-    empty = np.zeros(0, np.int8)
-    if math.isinf(threshold):
-        return Outlines(np.zeros(dz.shape, np.int32), empty, [], window, threshold, (0.0, 0.0))
+    limited = _limited(dz, sigma)
+    z = window_z(limited, sigma, systematic_m, variogram, cell_m, windows[0])
+    first = z.copy()
+    for window in windows[1:]:
+        other = window_z(limited, sigma, systematic_m, variogram, cell_m, window)
+        for rows in _strips(len(z)):
+            # A large window reaches beyond the edge of a change; the smallest one has to show a little of it, too.
+            larger = np.abs(other[rows]) > np.abs(z[rows])
+            np.copyto(z[rows], other[rows], where=larger & (first[rows] * np.sign(other[rows]) > _SHOWS))
+    del limited, first
+    threshold = _threshold(z, len(windows))
+    margin = sorted(windows)[len(windows) // 2] // 2 + 1
     labels = np.zeros(dz.shape, np.int32)
+    if math.isinf(threshold):
+        return Outlines(labels, np.zeros(0, np.int8), [], windows, margin, threshold)
     signs: list[int] = []
-    boxes: list[tuple[slice, slice]] = []
-    bias = []
     for sign in (-1, 1):
-        beyond = z * sign > threshold  # False where z is NaN
         numbered = np.zeros(dz.shape, np.int32)
-        count = int(label(beyond, _EIGHT, output=numbered))  # type: ignore[arg-type]
+        # False where z is NaN.
+        count = int(label(z * sign > min(_CONNECTED, threshold), _EIGHT, output=numbered))  # type: ignore[arg-type]
         sizes = np.bincount(numbered.ravel(), minlength=count + 1)
-        sizes[0] = 0
-        kept = np.flatnonzero(sizes >= least_cells)
+        found = np.bincount(numbered[z * sign > threshold], minlength=count + 1) > 0
+        kept = np.flatnonzero(found & (sizes >= min(windows) ** 2) & (np.arange(count + 1) > 0))
         lookup = np.zeros(count + 1, np.int32)
         lookup[kept] = np.arange(1, len(kept) + 1) + len(signs)
-        found = find_objects(numbered)
-        boxes += [found[k - 1] for k in kept]
         signs += [sign] * len(kept)
-        mine = lookup[numbered]
-        labels += mine
-        # Means close to the threshold, where the outlines that are kept might run differently.
-        near = np.abs(z * sign - threshold) < _NEAR_THRESHOLD
-        near &= np.asarray(binary_dilation(mine > 0, _EIGHT, iterations=window), bool)
-        bias.append(sign * _edge_bias(near, sigma, systematic_m, variogram, cell_m, window))
-    return Outlines(labels, np.array(signs, np.int8), boxes, window, threshold, (bias[0], bias[1]))
+        labels += lookup[numbered]
+    del z
+    _add_margin(labels, margin)
+    labels[~np.isfinite(dz)] = 0
+    boxes = [box for box in find_objects(labels) if box is not None]
+    assert len(boxes) == len(signs)
+    return Outlines(labels, np.array(signs, np.int8), boxes, windows, margin, threshold)
 
 
-def _shares(variogram: Variogram, cell_m: float, window: int) -> tuple[float, float]:
-    """Variance of a window's mean, and covariance of its centre with it, over that of a cell."""
-    own = variogram.nugget / window**2
-    side = window * cell_m
-    return own + mean_correlation(variogram, side), own + centre_correlation(variogram, side)
+def _limited(
+    dz: Float32[np.ndarray, "rows columns"], sigma: Float32[np.ndarray, "rows columns"] | float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Limit single cells to three deviations from the median of their neighbours: a mismatch is no change."""
+    out = np.empty_like(dz)
+    for rows in _strips(len(dz)):
+        low, high = max(0, rows.start - 1), min(len(dz), rows.stop + 1)
+        part = np.where(np.isfinite(dz[low:high]), dz[low:high], np.float32(0))
+        middle = median_filter(part, 3)[rows.start - low : rows.stop - low]
+        own = sigma[rows] if isinstance(sigma, np.ndarray) else np.float32(sigma)
+        out[rows] = np.clip(dz[rows], middle - _LIMIT * own, middle + _LIMIT * own)
+    return out
+
+
+def _add_margin(labels: Int32[np.ndarray, "rows columns"], margin: int) -> None:
+    """Grow all regions into what is free around them, one cell at a time."""
+    for _ in range(margin):
+        free = labels == 0
+        grown = labels.copy()
+        for axis in (0, 1):
+            for step in (1, -1):
+                moved = np.zeros_like(labels)
+                to, of = (
+                    (slice(step, None), slice(None, -step)) if step > 0 else (slice(None, step), slice(-step, None))
+                )
+                index = (to, slice(None)), (of, slice(None))
+                if axis:
+                    index = (slice(None), to), (slice(None), of)
+                moved[index[0]] = labels[index[1]]
+                np.copyto(grown, moved, where=free & (grown == 0))
+        labels[:] = grown
+
+
+def _strips(rows: int) -> list[slice]:
+    return [slice(first, min(first + _STRIP, rows)) for first in range(0, rows, _STRIP)]
 
 
 def window_z(
@@ -154,8 +175,8 @@ def window_z(
     return z
 
 
-def _threshold(z: Float32[np.ndarray, "rows columns"]) -> float:
-    """The smallest |z| at which the expected share of unchanged cells beyond it is at most 5%; inf if there is none."""
+def _threshold(z: Float32[np.ndarray, "rows columns"], tests: int) -> float:
+    """The smallest |z| at which the expected share of unchanged cells beyond it is at most 0.1%; else inf."""
     bins = round(_LARGEST_Z / _BIN)
     counts = np.zeros(bins, np.int64)
     for first in range(0, len(z), _STRIP):
@@ -164,19 +185,5 @@ def _threshold(z: Float32[np.ndarray, "rows columns"]) -> float:
         counts += np.bincount(np.minimum(size / _BIN, bins - 1).astype(np.int64), minlength=bins)
     beyond = counts[::-1].cumsum()[::-1]
     edges = np.arange(bins) * _BIN
-    passing = (2 * ndtr(-edges) * counts.sum() <= FALSE_DISCOVERIES * beyond) & (beyond > 0)
+    passing = (2 * tests * ndtr(-edges) * counts.sum() <= FALSE_DISCOVERIES * beyond) & (beyond > 0)
     return float(edges[np.argmax(passing)]) if passing.any() else math.inf
-
-
-def _edge_bias(
-    near: Bool[np.ndarray, "rows columns"],
-    sigma: Float32[np.ndarray, "rows columns"] | float,
-    systematic_m: float,
-    variogram: Variogram,
-    cell_m: float,
-    window: int,
-) -> float:
-    """Sum of Cov(e, s) / deviation(s) times the density of z at the threshold, over the cells near it."""
-    variance, with_centre = _shares(variogram, cell_m, window)
-    own = (sigma[near] if isinstance(sigma, np.ndarray) else np.full(int(near.sum()), sigma)).astype(np.float64)
-    return float((own**2 * with_centre / np.sqrt(own**2 * variance + systematic_m**2)).sum()) / (2 * _NEAR_THRESHOLD)

@@ -180,7 +180,7 @@ def warped(
     source = plain if crs is None or grid.crs is None else crs.to_wkt()
     target = plain if crs is None or grid.crs is None else grid.crs
     moved = replace(grid, west_m=grid.west_m - shift_m[0], north_m=grid.north_m - shift_m[1]).transform
-    with _opened(path) as dataset:
+    with opened(path) as dataset:
         own = dataset.transform
         # Cells on the file's own pixels are copied, not interpolated.
         offset = (moved.c - own.c) / own.a, (moved.f - own.f) / own.e
@@ -225,7 +225,7 @@ def warped(
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
     """A raster file, opened."""
     rasterio = require_rasterio()
     with reading_from(path):
@@ -250,7 +250,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
         ChangeError: it is no raster of heights on a north-up grid.
     """
     remarks: list[str] = []
-    with _opened(path) as dataset:
+    with opened(path) as dataset:
         if dataset.count > 2 and dataset.dtypes[0] == "uint8":
             raise ChangeError(
                 f"{path} has {dataset.count} bands of bytes, which is a picture: expected one band of heights; name "

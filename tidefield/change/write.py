@@ -35,7 +35,7 @@ CHANGE_BANDS = (
 )
 SIGNIFICANT_BANDS = (
     "cell by cell: -1 lower, 1 higher, 0 neither, at 95%",
-    "outlined: -1 lower, 1 higher, 0 neither; of windows of cells, 5% false discoveries",
+    "outlined: -1 lower, 1 higher, 0 neither; by windows of cells",
 )
 
 
@@ -294,10 +294,10 @@ def summary(change: Change, command: str) -> dict[str, Any]:
         "level_of_detection_m": {"q05": low, "median": middle, "q95": high},
         "null_test": {"significant_share_of_stable_cells": change.false_alarms, "expected": 0.05},
         "outlines": {
-            "window_cells": change.outlines.window,
+            "windows_cells": list(change.outlines.windows),
+            "margin_cells": change.outlines.margin,
             "threshold_z": change.outlines.threshold if math.isfinite(change.outlines.threshold) else None,
             "number": len(change.each),
-            "bias_of_choice_m3": [b * change.grid.cell_area_m2 for b in change.outlines.bias_m],
         },
         "volumes": {
             "net": change.net.to_json(),

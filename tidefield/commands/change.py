@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -48,14 +48,18 @@ class Change:
     register: Literal["auto", "none", "vertical", "tilt"] = "auto"
     """What is taken from the later survey over stable ground: nothing, which is right for surveys with the same ground
     control; a vertical shift; or a shift and a tilt, with stable ground on all sides. auto is vertical."""
+    shift: Literal["auto", "none", "images"] = "auto"
+    """Move the later survey horizontally by what the orthophotos tell: where they tell it; not at all; or refuse where
+    they do not. Heights of flats do not tell it."""
+    orthophotos: tuple[Path, Path] | None = None
+    """Orthophotos of both surveys (GeoTIFF), if they are not in the folders."""
     datum_error: float | None = None
     """Standard error in metres that all heights of the difference share, as control gives it; added to what stable
     ground shows, or with --register none used instead."""
     cell: float | None = None
     """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
-    window: int | None = None
-    """Cells along each side of the window in which change is tested, odd; chosen from the correlation of the errors if
-    not given."""
+    windows: tuple[int, ...] = (5, 11, 21)
+    """Cells along each side of the windows in which change is tested, odd numbers."""
     m3c2: bool = False
     """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
     dates: tuple[str, str] | None = None
@@ -82,12 +86,17 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     dates = options.dates or (None, None)
     pair = open_pair(options.earlier, options.later, work, dates, options.cell, options.m3c2)
     earlier, later = pair.earlier, pair.later
+    if options.orthophotos is not None:
+        earlier, later = (
+            replace(surface, orthophoto=path)
+            for surface, path in zip((earlier, later), options.orthophotos, strict=True)
+        )
     if earlier.date and later.date and earlier.date > later.date:
         raise RunError(
             f"{options.earlier} is of {earlier.date}, {options.later} of {later.date}: expected the earlier survey "
             "first; exchange them, or state their --dates"
         )
-    asked = Options(options.cell, options.register, options.datum_error, options.window)
+    asked = Options(options.cell, options.register, options.shift, options.datum_error, options.windows)
     reads = [
         None if path is None else (lambda grid, path=path: read_regions(path, grid))
         for path in (options.stable, options.within, options.polygons)
@@ -125,8 +134,9 @@ def _check(options: Change) -> None:
     """Raises: RunError when an option has no meaning."""
     if options.datum_error is not None and not 0 <= options.datum_error < 100:
         raise RunError(f"--datum-error {options.datum_error} was asked for: expected 0 to 100 metres; choose another")
-    if options.window is not None and (options.window < 1 or options.window % 2 == 0 or options.window > 101):
-        raise RunError(f"--window {options.window} was asked for: expected an odd number from 1 to 101; choose another")
+    if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
+        given = " ".join(map(str, options.windows))
+        raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
     for date in options.dates or ():
         if len(date) != 10 or date[4] != "-" or date[7] != "-" or not date.replace("-", "").isdigit():
             raise RunError(f"--dates {date} was given: expected YYYY-MM-DD; write it so")
