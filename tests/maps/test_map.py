@@ -125,6 +125,16 @@ def test_rasters_are_cloud_optimised_and_say_that_the_frame_is_local(out: Path):
         assert main.read(1).max() <= len(json.loads(main.tags()["PHOTOGRAPHS"]))
 
 
+def test_terrain_contours_and_hillshades_lie_on_the_same_cells(out: Path):
+    with rasterio.open(out / DSM) as dsm, rasterio.open(out / make.DTM) as dtm:
+        surface, ground = dsm.read(1, masked=True), dtm.read(1, masked=True)
+    assert (ground <= surface).all() or np.percentile(ground - surface, 99) < 0.1
+    with rasterio.open(out / make.DTM_HILLSHADE) as shade:
+        assert shade.read(1).min() >= 1
+    about = json.loads((out / MAP_FILE).read_text())["contours"]
+    assert len(json.loads((out / "contours" / "contours.geojson").read_text())["features"]) == about["lines"] > 0
+
+
 def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
     cloud = laspy.read(out / CLOUD)
     assert (cloud.header.version.major, cloud.header.version.minor, cloud.header.point_format.id) == (1, 4, 7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.errors import RunError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,6 +39,10 @@ class Map:
     """Vertical system of the scene's heights, such as EPSG:5701, where the scene does not state it."""
     check: Path | None = None
     """Check points, besides those of the scene: a file like gcp_list.txt, or with lines `x y z name`."""
+    contours: float | None = None
+    """Interval of the contours, in metres; a round one for about 20 contours if not given."""
+    sections: Path | None = None
+    """Cut cross-sections along the lines of this GeoJSON file."""
     fill: bool = False
     """Fill cells that fewer than two photographs see, and mark them in odm_dem/filled.tif."""
     device: Device = "auto"
@@ -61,8 +67,10 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     from tidefield.maps.rasters import need
     from tidefield.progress import ProgressBar
 
-    for library in ("rasterio", "laspy"):
+    for library in ("rasterio", "laspy", "pyogrio"):
         need(library)
+    if options.contours is not None and not 0.001 <= options.contours < math.inf:
+        raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
     device = choose_device(options.device)
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
@@ -73,14 +81,15 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             opened = open_trained(options.source, device, options.allow_missing, console, hold_out=False)
             scene, render, record = stack.enter_context(opened)
         frame = map_frame(scene, read_georeference(scene.root), options.heights)
-        area = None
+        area, interval = None, options.contours and options.contours * frame.metre_up
         if options.area is not None:
             area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
         widest = max(file.lens.width for file in scene.photographs.files)
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, bounds_of(area))
+        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
         points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
-        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points))
+        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points), interval, lines)
         console.print(
             f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
             f"heights: {frame.heights}",

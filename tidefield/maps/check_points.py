@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SurveyError
 from tidefield.maps.grid import Grid, MapFrame
+from tidefield.maps.rasters import sample
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
 from tidefield.survey.survey import CHECK_FILE
 
@@ -124,8 +125,8 @@ def check(
     points: Sequence[CheckPoint],
     scene: Scene,
     grid: Grid,
-    height: Float[np.ndarray, "h w"],
-    sigma: Float[np.ndarray, "h w"],
+    dsm: Path,
+    sigma: Path,
 ) -> list[Checked]:
     """Compare a map with check points.
 
@@ -133,24 +134,15 @@ def check(
         points: the check points.
         scene: whose cameras show their marks.
         grid: of the map.
-        height, sigma: of its cells, NaN where it is empty.
+        dsm, sigma: rasters of its heights and their standard errors.
     """
+    place = np.array([point.surveyed[:2] for point in points])
+    values = sample([dsm, sigma], place, grid)
     result = []
-    for point in points:
-        at = np.array([[(point.surveyed[0] - grid.west) / grid.cell, (grid.north - point.surveyed[1]) / grid.cell]])
+    for point, (height, error) in zip(points, values, strict=True):
         found = _intersected(point, scene, grid.frame)
-        result.append(Checked(point, _interpolated(height, at), _interpolated(sigma, at), found))
+        result.append(Checked(point, float(height), float(error), found))
     return result
-
-
-def _interpolated(values: np.ndarray, at: np.ndarray) -> float:
-    u, v = (at[0] - 0.5).astype(np.float64)
-    left, top = math.floor(u), math.floor(v)
-    if not (0 <= left < values.shape[1] - 1 and 0 <= top < values.shape[0] - 1):
-        return math.nan
-    part = values[top : top + 2, left : left + 2].astype(np.float64)
-    across = part @ np.array([left + 1 - u, u - left])
-    return float(across @ np.array([top + 1 - v, v - top]))
 
 
 def _intersected(point: CheckPoint, scene: Scene, frame: MapFrame) -> Float64[np.ndarray, "3"]:

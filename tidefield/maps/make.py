@@ -26,10 +26,13 @@ from tidefield.machine import cores
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
 from tidefield.maps.cloud import UNCLASSIFIED, cloud_writer
+from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.orthophoto import render_tile
-from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer, read_raster
+from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
+from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
+from tidefield.maps.terrain import write_hillshade, write_terrain
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
 
@@ -41,6 +44,10 @@ ORTHOPHOTO = "odm_orthophoto/odm_orthophoto.tif"
 VIEWS = "odm_orthophoto/views.tif"
 MAIN = "odm_orthophoto/photograph.tif"
 DSM, SIGMA, FILLED = "odm_dem/dsm.tif", "odm_dem/dsm_sigma.tif", "odm_dem/filled.tif"
+DTM = "odm_dem/dtm.tif"
+DSM_HILLSHADE, DTM_HILLSHADE = "odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif"
+CONTOURS, SECTIONS = "contours", "sections"
+"""Folders."""
 CLOUD = "odm_georeferencing/odm_georeferenced_model.laz"
 MARGIN = 16
 """Cells that a tile shares with each of its neighbours' margins, across which both fade."""
@@ -62,6 +69,8 @@ class Job:
         fill: fill cells that fewer than two photographs see, and mark them.
         settings: what else the tiles depend on, for resuming.
         check_points: surveyed points that the map is compared with.
+        interval: between contours, vertical units; a round one if None.
+        sections: lines to cut the surface along, and their properties.
     """
 
     scene: Scene
@@ -71,6 +80,8 @@ class Job:
     fill: bool
     settings: dict[str, Any]
     check_points: tuple[CheckPoint, ...] = ()
+    interval: float | None = None
+    sections: tuple[tuple[BaseGeometry, dict[str, Any]], ...] = ()
 
     @property
     def tile_side(self) -> int:
@@ -276,6 +287,25 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
     }
 
 
+def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Write what follows from the surface: terrain, hillshades, contours and sections; returns figures of them."""
+    grid, unit = job.grid, job.grid.frame.unit
+    write_terrain(out / DSM, out / SIGMA, Raster(out / DTM, ("height of the ground",), unit=unit), grid)
+    progress(1, 4)
+    for heights, shaded in ((DSM, DSM_HILLSHADE), (DTM, DTM_HILLSHADE)):
+        write_hillshade(out / heights, Raster(out / shaded, ("hillshade",), "uint8", 0.0), grid)
+    progress(2, 4)
+    height, coarse = read_reduced(out / DTM, grid)
+    interval = job.interval or interval_of(height)
+    lines = contours(height, coarse, interval)
+    write_contours(lines, grid.frame, out / CONTOURS)
+    progress(3, 4)
+    if job.sections:
+        write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, unit)
+    progress(4, 4)
+    return {"contours": {"interval": interval, "lines": len(lines)}, "sections": len(job.sections)}
+
+
 def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
     """Make a map in a folder: a new one, or one that was interrupted.
 
@@ -299,9 +329,10 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
     if not found["cells"]:
         raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
     grid = job.grid
+    with bar("Terrain") as meter:
+        found |= derive(job, out, meter)
     if job.check_points:
-        height, sigma = read_raster(out / DSM)[0], read_raster(out / SIGMA)[0]
-        found["check_points"] = summary(check(job.check_points, job.scene, grid, height, sigma))
+        found["check_points"] = summary(check(job.check_points, job.scene, grid, out / DSM, out / SIGMA))
     result = {
         **record,
         "key": job.key,

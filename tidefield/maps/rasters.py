@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from tidefield import __version__
 from tidefield.errors import RunError
@@ -146,3 +147,35 @@ def read_raster(path: Path, band: int = 1) -> tuple[np.ndarray, Any]:
             return values, dict(dataset.profile)
     except rasterio.errors.RasterioError as error:
         raise RunError(f"{path} is no raster ({error}): expected a GeoTIFF") from error
+
+
+def sample(paths: Sequence[Path], place: Float64[np.ndarray, "N 2"], grid: Grid) -> Float64[np.ndarray, "N K"]:
+    """Interpolate rasters of a grid bilinearly at places; NaN where one of the four cells has no value.
+
+    Args:
+        paths: of K rasters.
+        place: easting and northing.
+        grid: of the rasters.
+    """
+    rasterio = need("rasterio")
+    u, v = (place[:, 0] - grid.west) / grid.cell - 0.5, (grid.north - place[:, 1]) / grid.cell - 0.5
+    left, top = np.floor(u).astype(int), np.floor(v).astype(int)
+    inside = (left >= 0) & (top >= 0) & (left < grid.columns - 1) & (top < grid.rows - 1)
+    result = np.full((len(place), len(paths)), np.nan)
+    a, b = u - left, v - top
+    for k, path in enumerate(paths):
+        with rasterio.open(path) as dataset:
+            block: dict[tuple[int, int], np.ndarray] = {}
+            for i in np.flatnonzero(inside):
+                row, column = int(top[i]), int(left[i])
+                key = row // BLOCK, column // BLOCK
+                if key not in block:  # the block with the next one's first row and column
+                    first, west = key[0] * BLOCK, key[1] * BLOCK
+                    last, east = min(first + BLOCK + 1, grid.rows), min(west + BLOCK + 1, grid.columns)
+                    values = dataset.read(1, window=((first, last), (west, east))).astype(np.float64)
+                    values[values == dataset.nodata] = np.nan
+                    block = {key: values}
+                row, column = row % BLOCK, column % BLOCK
+                four = block[key][row : row + 2, column : column + 2]
+                result[i, k] = np.array([1 - b[i], b[i]]) @ four @ np.array([1 - a[i], a[i]])
+    return result
