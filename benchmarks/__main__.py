@@ -242,6 +242,29 @@ def scales(
     print(out)
 
 
+def maps(
+    runs: Path = Path("runs/maps"),
+    categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
+    width: int = 2000,
+    views: int = 20,
+    half: float = 12.0,
+) -> None:
+    """Maps of built-in flats against the exact truth, and two floors: sparse points, semi-global matching (an hour).
+
+    Args:
+        runs: Folder for flats, maps and maps.json; what it holds is not measured again.
+        categories: Of flats.
+        width: Of the photographs in pixels.
+        views: Photographs of each survey.
+        half: Half the side of the square that is mapped, metres.
+    """
+    tune_process()
+    from benchmarks.maps import measure_maps, tables
+
+    for table in tables(measure_maps(runs, categories, width, views, half, partial(print, flush=True))):
+        print(table.markdown(), end="\n\n")
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -252,6 +275,27 @@ def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) ->
     from benchmarks.robustness import write_robustness
 
     write_robustness(runs, out)
+    print(out)
+
+
+def change(
+    data: Path | None = None,
+    pairs: int = 20,
+    runs: Path = MEASURED,
+    out: Path = Path("docs/change-results.md"),
+) -> None:
+    """Measure `tidefield change` against published figures and on pairs of known change (10 minutes); write the page.
+
+    Args:
+        data: Folder with bmx and st_leonards; without it, their figures stay as they are stored.
+        pairs: Of built-in surveys for each amount of change; 0 leaves their figures as they are stored.
+        runs: Store the figures in this folder's change.json.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    from benchmarks.change import measure_change, write_page
+
+    measure_change(data, runs, pairs, partial(print, flush=True))
+    write_page(runs, out)
     print(out)
 
 
@@ -294,7 +338,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, kills, fuzz)
+    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

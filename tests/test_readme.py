@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
-GENERATED = {"results.md", "surveys.md"}
+GENERATED = {"results.md", "surveys.md", "change-results.md"}
 
 
 def blocks(text: str, language: str) -> list[str]:

@@ -22,10 +22,12 @@ from tidefield.commands import (
     ablate,
     baselines,
     cache,
+    change,
     compare,
     demo,
     evaluate,
     import_,
+    map_,
     prepare,
     pretrain,
     render,
@@ -47,6 +49,8 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
     "train": (train, train.Train, "train"),
     "evaluate": (evaluate, evaluate.Evaluate, "evaluate"),
     "render": (render, render.Render, "render"),
+    "map": (map_, map_.Map, "map_"),
+    "change": (change, change.Change, "change"),
     "compare": (compare, compare.Compare, "compare"),
     "ablate": (ablate, ablate.Ablate, "ablate"),
     "baselines": (baselines, baselines.Baselines, "baselines"),
@@ -63,6 +67,8 @@ The usual order of commands:
   tidefield train SCENE RUN         learn the scene
   tidefield evaluate RUN            measure quality on held-out photographs
   tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+  tidefield map RUN OUT             orthophoto, surface model and point cloud; with --zero-shot from SCENE
+  tidefield change FIRST LATER OUT  what changed between two surveys, with volumes and intervals
 
 tidefield demo does all of it on a built-in scene."""
 

@@ -252,3 +252,25 @@ def test_marks_in_photographs_without_a_pose_are_left_out(flight):
     assert all(item.kind == "mark" and "lost.jpg" in item.name for item in found.left_out)
     with pytest.raises(SurveyError, match="could not be placed"):
         located(flight, with_marks(survey, lambda m: replace(m, photograph="lost.jpg")))
+
+
+def test_check_points_take_no_part_however_wrong_they_are(flight):
+    survey = with_control(flight)
+    model, found = located(flight, survey)
+    assert survey.control is not None
+    name = sorted(survey.control.points)[0]
+
+    def renamed(point: str) -> str:
+        return f"CHK_{point}" if point == name else point
+
+    points = {renamed(point): xyz for point, xyz in survey.control.points.items()}
+    marks = tuple(replace(mark, point=renamed(mark.point)) for mark in survey.control.marks)
+    x, y, z = points[renamed(name)]
+    wrong = {**points, renamed(name): (x + 50.0, y, z - 7.0)}
+    results = []
+    for places in (points, wrong):
+        model, found = located(flight, replace(survey, control=replace(survey.control, points=places, marks=marks)))
+        results.append(np.array([model.points3D[k].xyz for k in sorted(model.points3D)]))
+        assert renamed(name) not in (*found.control.names, *found.check.names)
+    # The frame's origin comes from the control alone, too.
+    np.testing.assert_array_equal(results[0], results[1])

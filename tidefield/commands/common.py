@@ -86,13 +86,13 @@ class Footprint:
         return Sampling(cones=not self.no_cones, rays_per_side=side)
 
 
-def load(scene: Path, width: int | None, allow_missing: bool, console: Console) -> Scene:
+def load(scene: Path, width: int | None, allow_missing: bool, console: Console, hold_out: bool = True) -> Scene:
     """Read a scene, with progress while photographs are decoded."""
     from tidefield.data.load import load_scene
     from tidefield.progress import ProgressBar
 
     with ProgressBar(console, "Reading photographs") as bar:
-        return load_scene(scene, width=width, allow_missing=allow_missing, progress=bar)
+        return load_scene(scene, width=width, allow_missing=allow_missing, hold_out=hold_out, progress=bar)
 
 
 def open_zero_shot(
@@ -114,8 +114,12 @@ def open_trained(
     allow_missing: bool,
     console: Console,
     sampling: Sampling = USUAL_SAMPLING,
+    hold_out: bool = True,
 ) -> Iterator[tuple[Scene, Render, dict[str, Any]]]:
-    """The scene and the method of a run, while the block lasts, and its record."""
+    """The scene and the method of a run, while the block lasts, and its record.
+
+    Without `hold_out` all photographs are sources, as for products.
+    """
     from tidefield.data.load import is_scene
     from tidefield.methods import trained
     from tidefield.train.checkpoint import RUN_FILE, read_run
@@ -126,7 +130,7 @@ def open_trained(
             f"the scene without training, or train first: `tidefield train {folder} RUN`"
         )
     run = read_run(folder)
-    scene = load(run.scene, run.width, allow_missing, console)
+    scene = load(run.scene, run.width, allow_missing, console, hold_out)
     with trained(folder, run, scene, device, sampling) as (render, progress):
         record = {"seed": run.seed, "weights": run.weights, "run": run.id, "trained_width": scene.cameras.width}
         record["trained"] = {"steps": progress.step, "seconds": progress.seconds}

@@ -71,13 +71,21 @@ class Renderer:
         lines = slice(None, None, BEHIND_STEP)
         self.mean_colours = {i: to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few}
 
-    def __call__(self, camera: Cameras) -> Rendering:
-        """Render the view of one camera, at its own gain, from its sources (`Scene.sources`)."""
+    def __call__(self, camera: Cameras, prior: Float[Tensor, "3 h w"] | None = None) -> Rendering:
+        """Render the view of one camera, at its own gain, from its sources (`Scene.sources`).
+
+        Args:
+            camera: a single camera.
+            prior: where its rays are sampled, on cells of its pixels (`depth_prior.surface_prior`); that of the scene's
+                points if not given.
+        """
         side = self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
-        return render_with_rays(self._render, camera, side)
+        if prior is not None and side > 1:
+            prior = prior.repeat_interleave(side, 1).repeat_interleave(side, 2)
+        return render_with_rays(partial(self._render, cells=prior), camera, side)
 
     @torch.inference_mode()
-    def _render(self, camera: Cameras) -> Rendering:
+    def _render(self, camera: Cameras, cells: Float[Tensor, "3 h w"] | None = None) -> Rendering:
         scene = self.scene
         sources = scene.sources(camera)
         if not sources:
@@ -85,9 +93,12 @@ class Renderer:
                 f"{scene.root} has no training photograph besides the camera's own: expected another to render its "
                 "view from; add photographs"
             )
-        prior = DepthPrior(surface_prior(camera, scene.points, scene.cameras, scene.hull))
-        if self.matcher is not None:
-            prior = self.matcher(camera, prior.cells)
+        if cells is None:
+            prior = DepthPrior(surface_prior(camera, scene.points, scene.cameras, scene.hull))
+            if self.matcher is not None:
+                prior = self.matcher(camera, prior.cells)
+        else:
+            prior = DepthPrior(cells)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
         picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
         for top in range(0, rows, BLOCK_TILES):

@@ -24,6 +24,7 @@ from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import reduced_folders, write_images, write_masks, write_reduced_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.io.gcp_file import write_check_points
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs, without
 from tidefield.survey.quality.measures import Measures
@@ -270,6 +271,7 @@ def georeference_model(
         located = replace(located, notes=(*located.notes, remark))
     write_model(reconstruction, sparse)
     located.write(sparse.parents[1])
+    write_check_points(good.control, sparse.parents[1])
     return {"placed": placed}
 
 

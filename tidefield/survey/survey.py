@@ -125,6 +125,30 @@ class Control:
     points: dict[str, tuple[float, float, float]]
     marks: tuple[Mark, ...]
 
+    def fitted(self) -> Control | None:
+        """The points that a model is fitted to: all but check points; None if there are none."""
+        return self._of({name for name in self.points if not is_check_point(name)})
+
+    def checks(self) -> Control | None:
+        """The check points; None if there are none."""
+        return self._of({name for name in self.points if is_check_point(name)})
+
+    def _of(self, names: set[str]) -> Control | None:
+        points = {name: xyz for name, xyz in self.points.items() if name in names}
+        marks = tuple(mark for mark in self.marks if mark.point in names)
+        return Control(self.crs, points, marks) if points else None
+
+
+CHECK_PREFIX = "CHK"
+"""Begins the names of check points, in any case."""
+CHECK_FILE = "check_points.txt"
+"""Check points of a scene, in its folder: a file like gcp_list.txt."""
+
+
+def is_check_point(name: str) -> bool:
+    """Whether a surveyed point is kept out of the adjustment, by its name."""
+    return name.upper().startswith(CHECK_PREFIX)
+
 
 @dataclass(frozen=True)
 class Survey:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,7 +18,7 @@ from tidefield.synthetic.plants import Plants, Shadows, grow, marsh_map
 from tidefield.synthetic.rays import Parallel, Pinhole, View, height_field_depth, normalised
 from tidefield.synthetic.settings import Settings
 from tidefield.synthetic.shading import Ground, Light, make_ground, to_srgb
-from tidefield.synthetic.terrain import make_terrain
+from tidefield.synthetic.terrain import Terrain, make_terrain
 
 _RAYS = 1 << 16
 """Rays shaded at once: bounds memory, and small enough for the cache."""
@@ -33,9 +34,13 @@ class TidalFlat:
 
     Attributes:
         surface: the higher of ground and water, without plants.
+        bed: the ground, under water and plants too.
+        marsh: how densely plants cover the ground, 0 to 1.
     """
 
     surface: Raster
+    bed: Raster
+    marsh: Raster
     ground: Ground
     plants: Plants
     light: Light
@@ -118,10 +123,17 @@ def _averaged(radiance: Float[Tensor, "3 R"], view: View, split: int) -> Float[T
 
 
 def make_flat(
-    settings: Settings, extent: Extent, sun_elevation_deg: float, sun_azimuth_deg: float, random: np.random.Generator
+    settings: Settings,
+    extent: Extent,
+    sun_elevation_deg: float,
+    sun_azimuth_deg: float,
+    random: np.random.Generator,
+    change: Callable[[Terrain], Terrain] | None = None,
 ) -> TidalFlat:
-    """Build a flat over an extent."""
+    """Build a flat over an extent; `change` is made to its ground before plants grow."""
     terrain = make_terrain(settings, extent, random)
+    if change is not None:
+        terrain = change(terrain)
     marsh = marsh_map(settings, terrain, random)
     plants = grow(settings, terrain, marsh, random)
     light = Light.make(sun_elevation_deg, sun_azimuth_deg, Noise(random, channels=1))
@@ -132,4 +144,5 @@ def make_flat(
     points = torch.cat([extent.nodes(), surface.values.reshape(1, -1)])
     shade = blurred(shadows.sunlit(points).reshape(terrain.ground.shape), 1)
     ground = make_ground(settings, terrain, marsh, light.sun, shade, random)
-    return TidalFlat(surface, ground, plants, light, shadows)
+    bed, density = Raster(extent, terrain.ground[None]), Raster(extent, marsh[None])
+    return TidalFlat(surface, bed, density, ground, plants, light, shadows)

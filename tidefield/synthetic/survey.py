@@ -110,12 +110,26 @@ def make_survey(
     settings = settings_for(category, random)
     if flight.wetness is not None:
         settings = replace(settings, wetness=flight.wetness)
-    cameras = _fly(flight, views, width, random)
-    extent = _ground_extent(cameras, flight)
+    cameras = fly(flight, views, width, random)
+    extent = ground_extent(cameras, flight)
     elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
     azimuth = random.uniform(0, 360)
     # As a task of its own: then the flat does not depend on the number of cores.
     [flat] = in_parallel([partial(make_flat, settings, extent, elevation, azimuth, random)], "cpu")
+    return photograph_flat(category, seed, flat, cameras, flight, supersample, random)
+
+
+def photograph_flat(
+    category: str,
+    seed: int,
+    flat: TidalFlat,
+    cameras: Cameras,
+    flight: Flight,
+    supersample: int,
+    random: np.random.Generator,
+) -> Survey:
+    """Take the photographs of a flight, and make their sparse points."""
+    views = len(cameras)
     # In single precision, on which the photographs of a seed depend.
     seconds = torch.tensor([i * flight.water_motion for i in range(views)]).tolist()
 
@@ -130,7 +144,7 @@ def make_survey(
     return Survey(category, seed, flat, cameras, photographs, depth, points)
 
 
-def _fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
+def fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
     """Plan a lawn-mower flight over the origin: strips north and south in turn, image tops in flight direction."""
     height = round(width * flight.aspect)
     across = flight.altitude_m / flight.focal_ratio
@@ -172,7 +186,7 @@ def _attitude(heading: float, turn: np.ndarray) -> np.ndarray:
     return np.array([[cos, -sin, 0], [-sin, -cos, 0], [0, 0, -1]]) @ (about_z @ about_y @ about_x)
 
 
-def _ground_extent(cameras: Cameras, flight: Flight) -> Extent:
+def ground_extent(cameras: Cameras, flight: Flight) -> Extent:
     """Bound the ground in the photographs, out to four flight heights, with a margin for shadows and crowns."""
     corners = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]]) * cameras.size_px[:, None].float()
     direction = cameras.directions_world(corners)

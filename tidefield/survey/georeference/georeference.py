@@ -41,7 +41,8 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
     """
     registered = camera_centres(model)
     photographs = [photograph for photograph in survey.photographs if photograph.name in registered]
-    positions, control = given_positions(photographs), survey.control
+    positions = given_positions(photographs)
+    control = survey.control and survey.control.fitted()
     if control is None:
         if not positions.names:
             return _level_only(model, photographs, positions)

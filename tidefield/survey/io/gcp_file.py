@@ -3,6 +3,7 @@
 The file begins with a coordinate reference system; then each line is `x y z px py image [point]`, separated by spaces
 or tabs (https://docs.opendronemap.org/gcp/). Pixels count from the top left corner of the image as stored,
 before the EXIF orientation is applied, with the first pixel's centre at (0.5, 0.5), as in the tools for marking.
+Points whose names begin with CHK are check points: no model is fitted to them, and maps are compared with them.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.errors import SurveyError, list_names
+from tidefield.files import write_text
 from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
-from tidefield.survey.survey import Control, Mark, Photograph
+from tidefield.survey.survey import CHECK_FILE, Control, Mark, Photograph
 
 CONTROL_FILES = ("gcp_list.txt",)
 """Looked for in the folder of the photographs."""
@@ -110,6 +112,24 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
             f"{path.name} marks points in photographs that do not exist (left out): {list_names(list(missing))}."
         )
     return control, remarks + [f"{path.name}: {reason} and is left out." for reason in outside]
+
+
+def write_check_points(control: Control | None, folder: Path) -> None:
+    """Write the check points of a control file into a scene's folder, for maps; without any, none stays there.
+
+    Raises:
+        RunError: the folder cannot be written to.
+    """
+    path = folder / CHECK_FILE
+    checks = control and control.checks()
+    if checks is None:
+        path.unlink(missing_ok=True)
+        return
+    lines = [
+        "\t".join([*(repr(value) for value in (*checks.points[m.point], *m.uv_px)), m.photograph, m.point])
+        for m in checks.marks
+    ]
+    write_text(path, "\n".join([checks.crs, *lines]) + "\n")
 
 
 def _parse_line(where: str, line: str) -> tuple[list[float], str]:

@@ -1,0 +1,284 @@
+"""Measure `tidefield change`: against published figures, on pairs of known change, and its memory and time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from benchmarks.change_pairs import measure_pairs, summarise
+from tidefield.change.errors import anderson_terms, nmad
+from tidefield.change.m3c2 import m3c2
+from tidefield.change.measure import measure
+from tidefield.change.regions import Region, read_regions
+from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
+from tidefield.compare.tables import NOTHING, Table
+from tidefield.files import read_json, write_json, write_text
+from tidefield.machine import describe
+
+CHANGE_FILE = "change.json"
+VOLUMES = ("net", "cut", "fill")
+INTRODUCTION = """# Change: what was measured
+
+`python -m benchmarks change --data DATA` measures this, and writes the page."""
+LEO = ("20180606", "20180713", "20180920", "20190211", "20190328", "20190731")
+SANDPYPER_NMAD = (0.101219, 0.111155, 0.071532, 0.111180, 0.098167)
+"""Of St Leonards' five steps (npucino/sandpyper, tests and notebook 3)."""
+SANDPYPER_NET_M3 = (-228.33, 219.21, 146.64, 9.60, -421.58)
+"""Of sand along transects, from the same notebook."""
+
+
+def _dsm(folder: Path, date: str) -> Path:
+    return folder / "st_leonards" / "dsm" / f"leo_{date}_dsm_resampled_1m.tif"
+
+
+def published(folder: Path) -> dict[str, Any]:
+    """Figures of others, and ours beside them.
+
+    Args:
+        folder: with bmx and st_leonards, as `shared/data/change` has them.
+
+    Raises:
+        ChangeError: they are not there.
+    """
+    for name in ("bmx", "st_leonards"):
+        if not (folder / name).is_dir():
+            raise ChangeError(f"{folder / name} is not there: expected the folder with bmx and st_leonards; name it")
+    random, correlated, systematic = anderson_terms(
+        682_640, 0.25, 0.11584754, 2.3546, math.sqrt(0.0071469), 0.104254974
+    )
+    return {
+        "anderson_m3": [1.96 * random, 1.96 * correlated, systematic],
+        "m3c2": _bmx(folder / "bmx"),
+        "st_leonards": _st_leonards(folder),
+    }
+
+
+def _bmx(folder: Path) -> dict[str, float]:
+    """Largest differences from CloudCompare's table."""
+    import laspy
+
+    table = np.genfromtxt(folder / "autzen-bmx-cc.txt", delimiter=",", names=True)
+    assert table.dtype.names is not None
+    columns = [np.asarray(table[name]) for name in table.dtype.names]
+    cores, normals = np.stack(columns[:3], axis=1), np.stack(columns[-3:], axis=1)
+    early, late = (np.asarray(laspy.read(folder / f"autzen-bmx-{y}.las").xyz, np.float64) for y in (2010, 2023))
+    found = m3c2(early, late, cores, normals, 2.890432, 5.5)
+    counts = np.stack([table["Npoints_cloud1"], table["Npoints_cloud2"]], axis=1)
+    return {
+        "core_points": len(cores),
+        "equal_counts": int((found.counts == counts).all(axis=1).sum()),
+        "distance_m": float(np.nanmax(np.abs(found.distance_m - table["M3C2_distance"]))),
+        "detection_m": float(np.nanmax(np.abs(found.detection_m - table["distance_uncertainty"]))),
+    }
+
+
+def _beach(folder: Path, grid: Grid, dates: tuple[str, str]) -> list[Region]:
+    """The beach without what was water at either date."""
+    from pyogrio import raw
+
+    vector = folder / "st_leonards" / "vector"
+    beach = next(region for region in read_regions(vector / "shoremasks.gpkg", grid) if region.name == "leo").geometry
+    meta, _, _, columns = raw.read(vector / "watermasks.gpkg")
+    fields = dict(zip(meta["fields"].tolist(), columns, strict=True))
+    water = read_regions(vector / "watermasks.gpkg", grid)
+    wet = [
+        region.geometry
+        for region, date in zip(water, fields["raw_date"], strict=True)
+        if region.name == "leo" and str(date) in dates
+    ]
+    return [Region("beach", beach.difference(shapely.union_all(wet)))]
+
+
+def _st_leonards(folder: Path) -> list[dict[str, Any]]:
+    """Five steps: deviations of stable ground by sandpyper's pixels and by ours, and volumes."""
+    import rasterio
+
+    lines = folder / "st_leonards" / "vector" / "leo_lod_transects.gpkg"
+    grid = common_grid([open_surface(_dsm(folder, LEO[0]))])
+    regions = read_regions(lines, grid)
+    points = np.array(
+        [
+            shapely.get_coordinates(region.geometry.interpolate(s))[0]
+            for region in regions
+            for s in range(int(region.geometry.length))
+        ]
+    )
+
+    def heights(date: str, whole: bool) -> np.ndarray:
+        """Heights at the points: of the pixel whose corner is nearest (theirs), or of the one the point is in."""
+        with rasterio.open(_dsm(folder, date)) as file:
+            values, transform = file.read(1), file.transform
+        column, row = ((points - [transform.c, transform.f]) / [transform.a, transform.e]).T
+        column, row = ((np.round if whole else np.floor)(x).astype(int) for x in (column, row))
+        inside = (column >= 0) & (row >= 0) & (column < values.shape[1]) & (row < values.shape[0])
+        found = np.full(len(points), np.nan)
+        found[inside] = values[row[inside], column[inside]]
+        found[found < -9000] = np.nan
+        return found
+
+    steps = []
+    for k, (one, other) in enumerate(pairwise(LEO)):
+        dh = [heights(other, whole) - heights(one, whole) for whole in (True, False)]
+        dh = [values[np.isfinite(values)] for values in dh]
+        change = measure(
+            open_surface(_dsm(folder, one)),
+            open_surface(_dsm(folder, other)),
+            stable=lambda grid: read_regions(lines, grid),
+            within=lambda grid, dates=(one, other): _beach(folder, grid, dates),
+        )
+        steps.append(
+            {
+                "earlier": one,
+                "later": other,
+                "published_nmad_m": SANDPYPER_NMAD[k],
+                "nmad_with_their_pixels_m": nmad(dh[0]),
+                "nmad_m": nmad(dh[1]),
+                "median_m": float(np.median(dh[1])),
+                "points": len(dh[1]),
+                "sum_abs_dh_with_their_pixels_m": float(np.abs(dh[0]).sum()),
+                "published_net_m3": SANDPYPER_NET_M3[k],
+                "detection_m": change.detection_m[1],
+                "shift_m": change.errors.registration.vertical_m,
+                **{what: getattr(change, what).to_json() for what in ("net", "cut", "fill")},
+            }
+        )
+    return steps
+
+
+def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Measure all parts, and store them in RUNS/change.json as they are done."""
+    record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
+    record |= {"command": "python -m benchmarks change", **describe()}
+    if data is not None:
+        say("published figures")
+        record["published"] = published(data)
+        write_json(runs / CHANGE_FILE, record)
+    if pairs:
+        say(f"{pairs} pairs of built-in surveys for each amount of change")
+        record["pairs"] = [
+            {key: found[key] for key in ("change_m", "stable_ground")} | summarise(found)
+            for found in measure_pairs(range(pairs), say)
+        ]
+        write_json(runs / CHANGE_FILE, record)
+    return record
+
+
+def tables(record: dict[str, Any]) -> list[Table]:
+    """What was measured, for the page."""
+    made = []
+    if "published" in record:
+        made += _published_tables(record["published"])
+    if "pairs" in record:
+        made.append(_pairs_table(record["pairs"]))
+    return made
+
+
+def _published_tables(found: dict[str, Any]) -> list[Table]:
+    random, correlated, systematic = found["anderson_m3"]
+    m3c2_, steps = found["m3c2"], found["st_leonards"]
+    compared = [
+        ["random error (95%)", "11.725 m³", f"{random:.3f} m³"],
+        ["correlated error (95%)", "63.664 m³", f"{correlated:.3f} m³"],
+        ["systematic error", "4,448.04 m³", f"{systematic:,.2f} m³"],
+    ]
+    clouds = [
+        ["core points with equal counts", f"{m3c2_['equal_counts']} of {m3c2_['core_points']}"],
+        ["largest difference of a distance", f"{1000 * m3c2_['distance_m']:.2f} mm"],
+        ["largest difference of a level of detection", f"{1000 * m3c2_['detection_m']:.2f} mm"],
+    ]
+    stable = [
+        [
+            _step(s),
+            f"{s['published_nmad_m']:.6f}",
+            f"{s['nmad_with_their_pixels_m']:.6f}",
+            f"{s['sum_abs_dh_with_their_pixels_m']:.4f}",
+            f"{s['nmad_m']:.3f}",
+            f"{s['median_m']:+.3f}",
+            f"{s['points']}",
+        ]
+        for s in steps
+    ]
+    volumes = [
+        [
+            _step(s),
+            f"{s['published_net_m3']:+.0f}",
+            *(_volume(s[w]) for w in VOLUMES),
+            f"{s['net']['area_m2']:,.0f}",
+            f"{s['detection_m']:.2f}",
+        ]
+        for s in steps
+    ]
+    return [
+        Table("Anderson's terms, from the inputs of the U.S. Geological Survey", ["", "published", "ours"], compared),
+        Table("M3C2 against CloudCompare's table", ["", ""], clouds),
+        Table(
+            "St Leonards: stable ground (m)",
+            [
+                "step",
+                "NMAD, published",
+                "with their pixels",
+                "sum of absolute dz, likewise",
+                "NMAD",
+                "median",
+                "points",
+            ],
+            stable,
+        ),
+        Table(
+            "St Leonards: volumes of the beach (m³, with 95% intervals)",
+            ["step", "net of sand on transects, published", "net", "cut", "fill", "area (m²)", "detected from (m)"],
+            volumes,
+        ),
+    ]
+
+
+def _pairs_table(pairs: list[dict[str, Any]]) -> Table:
+    rows = []
+    for of in pairs:
+        n, nothing = of["pairs"], of["change_m"] == 0
+        rows.append(
+            [
+                "none" if nothing else f"{100 * of['change_m']:+.0f} cm",
+                f"{100 * of['false_alarms']:.1f}%",
+                f"{100 * of['detection_m']:.1f} cm",
+                NOTHING if nothing else f"{100 * of['detected']:.0f}%",
+                NOTHING if nothing else f"{100 * of['outlined']:.0f}%",
+                f"{1000 * (of['bias_m'] if nothing else of['bias_where_changed_m']):+.1f} mm",
+                *(f"{of[key]} of {n}" for key in ("net", "cut_inside", "fill_inside", "cut", "fill")),
+            ]
+        )
+    header = ["change", "false alarms", "detected from", "cells found", "outlined", "bias where changed"]
+    header += ["net", "cut in outlines", "fill in outlines", "all cut", "all fill"]
+    return Table("Pairs of built-in surveys: 95% intervals that contain the truth", header, rows)
+
+
+def _volume(volume: dict[str, Any]) -> str:
+    if volume["area_m2"] == 0:
+        return "none outlined"
+    return f"{volume['value_m3']:+.0f} ({volume['low_m3']:+.0f} to {volume['high_m3']:+.0f})"
+
+
+def _step(step: dict[str, Any]) -> str:
+    return " to ".join(f"{d[:4]}-{d[4:6]}-{d[6:]}" for d in (step["earlier"], step["later"]))
+
+
+def write_page(runs: Path, out: Path) -> None:
+    """Write the page from what is stored.
+
+    Raises:
+        ChangeError: nothing is.
+    """
+    record = read_json(runs / CHANGE_FILE)
+    if record is None:
+        raise ChangeError(
+            f"{runs / CHANGE_FILE} is not there: expected figures; run `python -m benchmarks change` first"
+        )
+    parts = [INTRODUCTION, *(table.markdown() for table in tables(record))]
+    machine = f"Measured on {record['date']}, version {record['version']}, on {record['machine']['processor']}."
+    write_text(out, "\n\n".join([*parts, machine]) + "\n")

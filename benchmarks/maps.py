@@ -1,0 +1,273 @@
+"""Maps of built-in flats against the exact truth, next to two floors.
+
+The floors are the surface of the sparse points, and OpenCV's semi-global matching (Hirschmüller, Stereo processing by
+semiglobal matching and mutual information, 2008) of pairs of photographs, fused into the map's grid. Both know the
+exact poses, as the map does.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tidefield.compare.tables import Table
+from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
+from tidefield.files import completed_folder, read_json, write_json
+from tidefield.machine import describe
+from tidefield.maps.grid import Grid, map_frame
+from tidefield.maps.make import DSM, MAP_FILE, ORTHOPHOTO, SIGMA
+from tidefield.maps.surface import COARSEST, sparse_surface
+
+MAPS_FILE = "maps.json"
+SEED = 41
+PAIRS = 16
+"""Pairs of photographs of semi-global matching: those whose bases are nearest to the middle of the map."""
+BASE = (0.12, 0.45)
+"""Least and largest base of a pair, as a share of the height."""
+
+
+def measure_maps(
+    runs: Path, categories: Sequence[str], width: int, views: int, half_m: float, say: Callable[[str], object]
+) -> dict[str, Any]:
+    """Map the middle of a flat of each category, and compare with the truth; what was measured is kept.
+
+    Args:
+        runs: folder for flats, maps and maps.json.
+        categories: of flats.
+        width: of the photographs, pixels.
+        views: photographs of each survey.
+        half_m: half the side of the square that is mapped.
+        say: reports progress.
+    """
+    from rich.console import Console
+
+    from tidefield.commands.common import ZeroShot
+    from tidefield.commands.map_ import Map, map_
+    from tidefield.synthetic import make_survey, write_survey
+
+    record = read_json(runs / MAPS_FILE) or {"figures": {}}
+    square = [[x * half_m, y * half_m] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    write_json(runs / "area.json", {"type": "Polygon", "coordinates": [square]})
+    for category in categories:
+        name = f"{category}, {width} px, {views} photographs"
+        if name in record["figures"]:
+            continue
+        folder = runs / f"{category}_{width}_{views}"
+        if not (folder / "scene").exists():
+            say(f"{name}: photographs")
+            with completed_folder(folder / "scene") as partial:
+                write_survey(make_survey(category, seed=SEED, views=views, width=width), partial)
+        made = read_json(folder / "map" / MAP_FILE) or {}
+        if not made.get("complete"):
+            say(f"{name}: map")
+            options = Map(folder / "scene", folder / "map", ZeroShot(zero_shot=True), area=runs / "area.json")
+            made = map_(options, Console(quiet=True))
+        say(f"{name}: floors")
+        record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
+        command = f"python -m benchmarks maps --width {width} --views {views} --half {half_m:g}"
+        write_json(runs / MAPS_FILE, {**record, **describe(), "command": command})
+    return record
+
+
+def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
+    """Measure a map and the floors against the truth of a built-in flat, on cells that have a height in all of them."""
+    import rasterio
+
+    scene = load_scene(root, hold_out=False)
+    with rasterio.open(out / DSM) as dataset:
+        height = dataset.read(1, masked=True).filled(np.nan)
+        transform = dataset.transform
+    with rasterio.open(out / SIGMA) as dataset:
+        sigma = dataset.read(1, masked=True).filled(np.nan)
+    with rasterio.open(out / ORTHOPHOTO) as dataset:
+        shown = dataset.read([1, 2, 3]).transpose(1, 2, 0).astype(np.float64)
+    assert scene.points is not None
+    middle = float(np.median(scene.points.xyz_world[:, 2].numpy()))
+    frame = map_frame(scene, None)
+    grid = Grid(frame, transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
+    true, colour = _truth(root, grid)
+    # The grid of coarse cells begins at the same corner.
+    start = sparse_surface(scene, grid.coarser(COARSEST))
+    sparse = start.on(_whole(grid), 0, 1)[0][: grid.rows, : grid.columns]
+    stereo = semi_global(scene, grid)
+    kept = np.isfinite(height) & np.isfinite(true) & np.isfinite(stereo)
+    # The photographs' common exposure differs from the truth by a factor of each channel.
+    shown *= colour[kept].mean(0) / shown[kept].mean(0)
+    mse = ((shown[kept].clip(0, 255) - colour[kept]) ** 2).mean()
+    found = {"map": height, "sparse points": sparse, "semi-global": stereo}
+    return {
+        "cells": int(kept.sum()),
+        "cell_m": grid.cell,
+        "heights": {name: errors((values - true)[kept]) for name, values in found.items()},
+        "within": float((np.abs(height - true) < 1.96 * sigma)[kept].mean()),
+        "sigma_median_m": float(np.median(sigma[kept])),
+        "orthophoto_psnr": float(10 * np.log10(255**2 / mse)),
+    }
+
+
+def errors(error: np.ndarray) -> dict[str, float]:
+    """RMSE, mean and NMAD (Höhle and Höhle, 2009), metres."""
+    middle = np.median(error)
+    return {
+        "rmse_m": float(np.sqrt((error**2).mean())),
+        "mean_m": float(error.mean()),
+        "nmad_m": float(1.4826 * np.median(np.abs(error - middle))),
+    }
+
+
+def _whole(grid: Grid) -> Any:
+    from tidefield.maps.grid import Tile
+
+    return Tile(grid, 0, 0, max(grid.rows, grid.columns), 0)
+
+
+def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    about = json.loads((root / "truth" / "truth.json").read_text())["map"]
+    west, north = about["first_pixel_centre_east_north_m"]
+    cell = about["pixel_step_east_north_m"][0]
+    east = (grid.west + (np.arange(grid.columns) + 0.5) * grid.cell - west) / cell
+    south = (north - (grid.north - (np.arange(grid.rows) + 0.5) * grid.cell)) / cell
+    u, v = np.meshgrid(east.astype(np.float32), south.astype(np.float32))
+    height = cv2.remap(np.load(root / "truth" / "surface.npy"), u, v, cv2.INTER_LINEAR)
+    picture = cv2.imread(str(root / "truth" / "orthophoto.png"))
+    assert picture is not None
+    return height, cv2.remap(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), u, v, cv2.INTER_LINEAR).astype(np.float64)
+
+
+def semi_global(scene: Scene, grid: Grid) -> np.ndarray:
+    """Match pairs of photographs with OpenCV's StereoSGBM, and fuse their heights into a grid: the median of a cell.
+
+    Cells without a height take that of the nearest cell with one.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    cameras = scene.cameras
+    pose = cameras.T_world_camera.double().numpy()
+    position = pose[:, :, 3]
+    assert scene.points is not None
+    ground = scene.points.xyz_world.numpy()
+    above = float(np.median(position[:, 2]) - np.median(ground[:, 2]))
+    middle = grid.frame.to_scene(np.array([[*_whole(grid).centre, grid.height]]))[0]
+    pairs = [
+        (np.linalg.norm((position[i] + position[j])[:2] / 2 - middle[:2]), i, j)
+        for i in range(len(pose))
+        for j in range(i + 1, len(pose))
+        if BASE[0] < np.linalg.norm(position[i] - position[j]) / above < BASE[1]
+        # Of one heading: OpenCV's rectification does not turn photographs of strips flown to and fro.
+        and np.trace(pose[i, :, :3].T @ pose[j, :, :3]) > 2.5
+    ]
+    cells, heights = [], []
+    for _, i, j in sorted(pairs)[:PAIRS]:
+        points = _stereo_points(scene, i, j, ground)
+        column = np.floor((points[:, 0] - grid.west) / grid.cell).astype(int)
+        row = np.floor((grid.north - points[:, 1]) / grid.cell).astype(int)
+        inside = (column >= 0) & (row >= 0) & (column < grid.columns) & (row < grid.rows)
+        cells.append((row * grid.columns + column)[inside])
+        heights.append(points[inside, 2])
+    cell, height = np.concatenate(cells), np.concatenate(heights)
+    order = np.lexsort((height, cell))
+    cell, height = cell[order], height[order]
+    unique, first, count = np.unique(cell, return_index=True, return_counts=True)
+    result = np.full(grid.rows * grid.columns, np.nan)
+    result[unique] = height[first + count // 2]
+    result = result.reshape(grid.rows, grid.columns)
+    nearest = np.asarray(distance_transform_edt(np.isnan(result), return_distances=False, return_indices=True))
+    return result[nearest[0], nearest[1]]
+
+
+def _stereo_points(scene: Scene, i: int, j: int, ground: np.ndarray) -> np.ndarray:
+    """Points of two photographs in the map's frame, which in built-in flats is the world without its origin."""
+    cameras = scene.cameras
+    pose = cameras.T_world_camera.double().numpy()
+    size = cameras[i].width, cameras[i].height
+    k = np.array(
+        [
+            [float(cameras.focal_px[i, 0]), 0, float(cameras.principal_px[i, 0])],
+            [0, float(cameras.focal_px[i, 1]), float(cameras.principal_px[i, 1])],
+            [0, 0, 1],
+        ]
+    )
+    rotation = pose[j, :, :3].T @ pose[i, :, :3]
+    translation = pose[j, :, :3].T @ (pose[i, :, 3] - pose[j, :, 3])
+    # Pixel centres of OpenCV are at whole numbers, ours at halves.
+    k[:2, 2] -= 0.5
+    none = np.zeros(5)
+    r1, r2, p1, p2, _, _, _ = cv2.stereoRectify(k, none, k, none, size, rotation, translation[:, None], alpha=0)
+    vertical = abs(p2[1, 3]) > abs(p2[0, 3])
+    pictures = []
+    for index, r, p in ((i, r1, p1), (j, r2, p2)):
+        maps = cv2.initUndistortRectifyMap(k, none, r, p, size, cv2.CV_32FC1)
+        grey = cv2.cvtColor(scene.photographs[index].numpy(), cv2.COLOR_RGB2GRAY)
+        picture = cv2.remap(grey, maps[0], maps[1], cv2.INTER_LINEAR)
+        pictures.append(np.ascontiguousarray(picture.T) if vertical else picture)
+    shift = float(p2[1, 3] if vertical else p2[0, 3])
+    offset = float((p1 - p2)[1, 2] if vertical else (p1 - p2)[0, 2])
+    local = (ground - pose[i, :, 3]) @ pose[i, :, :3] @ r1.T
+    depth = local[:, 2][local[:, 2] > 0]
+    # Where the second camera lies on the other side, pictures are flipped so that disparities are positive.
+    expected = -shift / np.percentile(depth, [1, 99]) + offset
+    flipped = expected.mean() < 0
+    if flipped:
+        pictures = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures]
+        expected = -expected
+    low = int(np.floor(expected.min() - 0.02 * abs(expected).max())) - 4
+    count = -(-int(np.ceil(expected.max() * 1.06) - low + 8) // 16) * 16
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=low, numDisparities=count, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
+        uniquenessRatio=10, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    disparity = matcher.compute(*pictures).astype(np.float32) / 16
+    valid = disparity > low
+    if flipped:
+        disparity, valid = -disparity[:, ::-1], valid[:, ::-1]
+    if vertical:
+        disparity, valid = disparity.T, valid.T
+    rows, columns = np.nonzero(valid)
+    z = -shift / (disparity[rows, columns] - offset)
+    x = (columns - p1[0, 2]) / p1[0, 0] * z
+    y = (rows - p1[1, 2]) / p1[1, 1] * z
+    local = np.column_stack([x, y, z]) @ r1
+    return local @ pose[i, :, :3].T + pose[i, :, 3] + scene.origin_world.numpy()
+
+
+def tables(record: dict[str, Any]) -> list[Table]:
+    """The stored figures as tables: heights, and what else there is of each map."""
+    methods = ("map", "sparse points", "semi-global")
+    columns = ["flat", *(f"{name}: {measure}" for name in methods for measure in ("RMSE", "NMAD", "mean"))]
+    rows = [
+        (
+            name,
+            *(
+                f"{100 * found['heights'][method][measure]:.1f}"
+                for method in methods
+                for measure in ("rmse_m", "nmad_m", "mean_m")
+            ),
+        )
+        for name, found in record["figures"].items()
+    ]
+    others = [
+        "flat",
+        "cell, cm",
+        "within 1.96 standard errors",
+        "median standard error, cm",
+        "orthophoto PSNR, dB",
+        "s",
+    ]
+    more = [
+        (
+            name,
+            f"{100 * found['cell_m']:.1f}",
+            f"{100 * found['within']:.1f}%",
+            f"{100 * found['sigma_median_m']:.1f}",
+            f"{found['orthophoto_psnr']:.1f}",
+            f"{found['seconds']:.0f}",
+        )
+        for name, found in record["figures"].items()
+    ]
+    return [Table("Errors of heights, cm", columns, rows), Table("Maps", others, more)]

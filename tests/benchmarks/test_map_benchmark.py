@@ -1,0 +1,40 @@
+"""The benchmark of maps: its floors are fair, and its tables show what was stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.maps import _truth, errors, semi_global, tables
+from tidefield.data.load import load_scene
+from tidefield.maps.grid import Grid, map_frame
+from tidefield.synthetic import make_survey, write_survey
+
+
+def test_errors_are_those_of_known_numbers():
+    found = errors(np.array([-1.0, 0.0, 0.0, 1.0, 10.0]))
+    assert found["mean_m"] == pytest.approx(2.0)
+    assert found["rmse_m"] == pytest.approx(np.sqrt(102 / 5))
+    assert found["nmad_m"] == pytest.approx(1.4826)
+
+
+def test_semi_global_matching_finds_the_ground(tmp_path: Path):
+    write_survey(make_survey("ground_textures", seed=4, views=6, width=320), tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", hold_out=False, cache=tmp_path / "cache")
+    grid = Grid(map_frame(scene, None), -4.0, 4.0, 0.2, 40, 40, 0.0)
+    found = errors(semi_global(scene, grid) - _truth(tmp_path / "scene", grid)[0])
+    assert found["nmad_m"] < 0.1  # its pixels show 18 cm
+    assert abs(found["mean_m"]) < 0.18
+
+
+def test_tables_show_what_was_stored():
+    heights = {
+        name: {"rmse_m": 0.02, "nmad_m": 0.01, "mean_m": -0.005} for name in ("map", "sparse points", "semi-global")
+    }
+    figures = {"cells": 9, "cell_m": 0.05, "heights": heights, "within": 0.951, "sigma_median_m": 0.012}
+    first, second = tables({"figures": {"creek": {**figures, "orthophoto_psnr": 31.26, "seconds": 3.0}}})
+    assert "| creek | 2.0 | 1.0 | -0.5 |" in first.markdown()
+    assert "95.1%" in second.markdown()
+    assert "31.3" in second.markdown()

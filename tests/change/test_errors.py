@@ -1,0 +1,91 @@
+"""The error model against Anderson's printed figures, brute force over all pairs, and simulated fields."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tidefield.change.errors import (
+    UNCORRELATED,
+    Variogram,
+    anderson_terms,
+    deviation95,
+    fit_variogram,
+    nmad,
+    p_values,
+    region_error,
+)
+
+
+def test_andersons_terms_are_those_that_the_geological_survey_prints():
+    """Whiskeytown: jlogan-usgs/whiskeytown-dem-differencing."""
+    random, correlated, systematic = anderson_terms(
+        682_640, 0.25, 0.11584754, 2.3546, math.sqrt(0.0071469), 0.104254974
+    )
+    assert 1.96 * random == pytest.approx(11.725, abs=5e-4)
+    assert 1.96 * correlated == pytest.approx(63.664, abs=5e-3)
+    assert systematic == pytest.approx(4448.04, abs=5e-3)
+
+
+def correlated_field(rng: np.random.Generator, shape: tuple[int, int], radius: float) -> np.ndarray:
+    """White noise smoothed over a disc, of unit variance: its correlation is nearly spherical with range 2 radius."""
+    noise = rng.normal(size=shape)
+    r, c = (np.fft.fftfreq(n, 1 / n) for n in shape)
+    disc = (np.hypot(r[:, None], c[None]) <= radius).astype(float)
+    field = np.fft.irfft2(np.fft.rfft2(noise) * np.fft.rfft2(disc), shape)
+    return field / math.sqrt(disc.sum())
+
+
+def test_the_variogram_of_a_simulated_field_is_found():
+    rng = np.random.default_rng(0)
+    field = 0.6 * rng.normal(size=(600, 700)) + 0.8 * correlated_field(rng, (600, 700), 10)
+    found = fit_variogram((0.03 * field).astype(np.float32), 0.5)
+    assert found.nugget == pytest.approx(0.36, abs=0.06)
+    assert found.range_m == pytest.approx(10, rel=0.2)
+    assert found.reached
+
+
+def test_white_noise_is_called_uncorrelated():
+    noise = np.random.default_rng(1).normal(size=(300, 300)).astype(np.float32)
+    assert fit_variogram(noise, 1.0).nugget > 0.97
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_the_error_of_a_region_is_the_sum_over_all_pairs_of_its_cells(varying: bool):
+    rng = np.random.default_rng(2)
+    region = rng.random((20, 26)) < 0.6
+    sigma = rng.uniform(0.5, 2, region.shape).astype(np.float32) if varying else np.full(region.shape, 1, np.float32)
+    variogram = Variogram((0.5, 0.2), (6.0, 30.0))
+    at = np.argwhere(region) * 0.5
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    s = sigma[region].astype(float)
+    brute = math.sqrt((s[:, None] * s[None] * variogram.correlation(distance)).sum())
+    found = region_error(sigma if varying else 1.0, region, variogram, 0.5)
+    assert found.random == pytest.approx(math.sqrt(0.3 * (s**2).sum()), rel=1e-6)
+    assert found.correlated == pytest.approx(brute, rel=0.01)
+
+
+def test_the_error_of_a_region_that_is_reduced_to_blocks_is_andersons():
+    region = np.ones((1400, 1500), bool)
+    variogram = Variogram((0.7,), (4.0,))
+    found = region_error(0.02, region, variogram, 0.25)
+    random, correlated, _ = anderson_terms(
+        int(region.sum()), 0.25, 0.02 * math.sqrt(0.3), 4.0, 0.02 * math.sqrt(0.7), 0.0
+    )
+    assert found.random * 0.25**2 == pytest.approx(random, rel=1e-6)
+    # 0.79 is sqrt(pi / 5); and at the border a cell has fewer neighbours.
+    assert found.correlated * 0.25**2 == pytest.approx(correlated, rel=0.02)
+
+
+def test_nothing_summed_has_no_error():
+    assert region_error(1.0, np.zeros((4, 4), bool), UNCORRELATED, 1.0).total == 0
+
+
+def test_deviations_of_normal_values_are_their_standard_deviation():
+    values = np.random.default_rng(3).normal(0, 0.04, 200_000)
+    assert nmad(values) == pytest.approx(0.04, rel=0.01)
+    assert deviation95(values) == pytest.approx(0.04, rel=0.01)
+
+
+def test_p_values_are_two_sided():
+    assert p_values(np.array([0, 1.959964, -1.959964], np.float32)) == pytest.approx([1, 0.05, 0.05], rel=1e-5)

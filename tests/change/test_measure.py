@@ -1,0 +1,147 @@
+"""Difference, level of detection, outlines and volumes against known changes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from surveys_of_two_dates import NORTH, WEST, pair, write_surface
+
+from tidefield.change.inputs import open_survey
+from tidefield.change.measure import Change, Options, measure
+from tidefield.change.regions import Region
+from tidefield.change.surfaces import ChangeError, open_surface
+
+AREA = 0.25
+
+
+def measured(earlier: Path, later: Path, **options) -> Change:
+    return measure(open_surface(earlier), open_surface(later), **options)
+
+
+def east(grid) -> list[Region]:
+    """The eastern part, which the pit is not in."""
+    west, south, east, north = grid.bounds
+    return [
+        Region(
+            "east",
+            shapely.box(west + 0.75 * (east - west), south + 60, east, north).union(
+                shapely.box(west, south, east, south + 12)
+            ),
+        )
+    ]
+
+
+def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
+    earlier, later, truth = pair(tmp_path, 0, 0.10)
+    found = measured(earlier, later)
+    assert [volume.area_m2 > 50 for _, volume, _ in found.each].count(True) == 2
+    for volume, sign in ((found.cut, -1), (found.fill, 1)):
+        true = float((sign * truth).clip(min=0).sum()) * AREA
+        low, high = volume.interval_m3
+        assert low < true < high
+        assert volume.value_m3 == pytest.approx(true, rel=0.1)
+
+
+def test_a_shift_of_all_heights_is_taken_out_over_stable_ground(tmp_path: Path):
+    earlier, later, truth = pair(tmp_path, 1, 0.10, shift=0.3)
+    found = measured(earlier, later, stable=east)
+    assert found.errors.registration.vertical_m == pytest.approx(0.3, abs=3 * found.errors.registration.systematic_m)
+    assert found.errors.registration.systematic_m < 0.005
+    low, high = found.net.interval_m3
+    assert low < truth.sum() * AREA < high
+
+
+def test_a_known_datum_error_enters_every_volume(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 2, 0.0)
+    found = measured(earlier, later, options=Options(register="none", datum_error_m=0.05))
+    assert found.errors.registration.vertical_m == 0
+    assert found.net.systematic_m3 == pytest.approx(0.05 * found.net.area_m2, rel=1e-6)
+
+
+def test_heights_that_share_control_and_disagree_have_the_disagreement_as_error(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 3, 0.0, shift=0.08)
+    found = measured(earlier, later, stable=east, options=Options(register="none"))
+    assert found.errors.registration.systematic_m == pytest.approx(0.08, abs=0.01)
+    assert not found.net.significant
+
+
+def test_where_nothing_changed_nothing_is_outlined_and_the_net_contains_zero(tmp_path: Path):
+    alarms = []
+    for seed in range(4):
+        earlier, later, _ = pair(tmp_path, 10 + seed, 0.0)
+        found = measured(earlier, later)
+        assert found.cut.area_m2 + found.fill.area_m2 < 0.01 * found.net.area_m2
+        alarms.append(found.false_alarms)
+    assert np.mean(alarms) == pytest.approx(0.05, abs=0.015)
+
+
+def test_volumes_of_polygons_are_given_one_by_one(tmp_path: Path):
+    earlier, later, truth = pair(tmp_path, 4, 0.2)
+    pit = Region("pit", shapely.Point(WEST + 30, NORTH - 30).buffer(14))
+    found = measured(earlier, later, regions=lambda grid: [pit])
+    ((region, net, cut, fill),) = found.per_region
+    assert region.name == "pit"
+    assert net.value_m3 == pytest.approx(truth[:100, :110].sum() * AREA, rel=0.05)
+    assert cut.value_m3 == pytest.approx(-net.value_m3, rel=0.05)
+    assert fill.value_m3 == 0
+
+
+def test_standard_errors_of_the_cells_are_used_and_calibrated(tmp_path: Path):
+    rng, shape = np.random.default_rng(5), (200, 200)
+    sigma = np.where(np.arange(200)[None] < 100, 0.01, 0.04) * np.ones(shape)
+    for name in ("early", "late"):
+        write_surface(tmp_path / f"{name}.tif", (sigma * rng.normal(size=shape)).astype(np.float32))
+        # The surveys' own estimates are half of the truth.
+        write_surface(tmp_path / f"{name}_sigma.tif", (sigma / 2).astype(np.float32))
+    found = measured(tmp_path / "early.tif", tmp_path / "late.tif")
+    assert isinstance(found.errors.sigma, np.ndarray)
+    assert found.errors.sigma[50, 20] == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
+    assert found.errors.sigma[50, 180] == pytest.approx(0.04 * np.sqrt(2), rel=0.05)
+
+
+def test_the_comparison_is_limited_to_polygons(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 6, 0.1)
+    area = Region("area", shapely.box(WEST, NORTH - 50, WEST + 50, NORTH))
+    found = measured(earlier, later, within=lambda grid: [area], stable=east)
+    assert found.net.area_m2 == pytest.approx(2500, rel=0.01)
+    assert found.errors.registration.stable_cells > 1000
+
+
+def test_too_little_stable_ground_is_refused(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 7, 0.1)
+    spot = Region("spot", shapely.Point(WEST + 30, NORTH - 30).buffer(1))
+    with pytest.raises(ChangeError, match="stable ground"):
+        measured(earlier, later, stable=lambda grid: [spot])
+
+
+def test_a_tilt_needs_stable_ground_on_all_sides(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 8, 0.0)
+    corner = Region("corner", shapely.box(WEST, NORTH - 40, WEST + 40, NORTH))
+    with pytest.raises(ChangeError, match="all sides"):
+        measured(earlier, later, stable=lambda grid: [corner], options=Options(register="tilt"))
+
+
+def test_a_tilt_is_found(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 9, 0.0)
+    import rasterio
+
+    with rasterio.open(later, "r+") as file:
+        tilted = file.read(1) + (0.002 * 0.5 * np.arange(240)[None] - 0.001 * 0.5 * np.arange(200)[:, None])
+        file.write(tilted.astype(np.float32), 1)
+    found = measured(earlier, later, options=Options(register="tilt"))
+    _, gx, gy = found.errors.registration.coefficients
+    assert gx == pytest.approx(0.002, abs=2e-4)
+    assert gy == pytest.approx(0.001, abs=2e-4)
+    assert np.nanstd(found.dz) < 0.03
+
+
+def test_a_folder_of_maps_is_opened_by_its_names(tmp_path: Path):
+    write_surface(tmp_path / "odm_dem/dsm.tif", np.zeros((20, 20), np.float32))
+    write_surface(tmp_path / "odm_orthophoto/odm_orthophoto.tif", np.zeros((3, 20, 20), np.uint8))
+    found = open_survey(tmp_path, "2024-05-01")
+    assert found.path.name == "dsm.tif"
+    assert found.orthophoto is not None
+    assert found.name == "2024-05-01"
+    with pytest.raises(ChangeError, match="no surface"):
+        open_survey(tmp_path / "odm_orthophoto")

@@ -1,0 +1,88 @@
+"""The horizontal shift between surveys, from pictures with other light."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from surveys_of_two_dates import noise, pair, write_surface
+
+from tidefield.change.measure import Options, measure
+from tidefield.change.shift import correlate
+from tidefield.change.surfaces import ChangeError, open_surface
+
+
+def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A texture that can be sampled anywhere, in [0, 1]."""
+    rng = np.random.default_rng(0)
+    total = np.zeros(x.shape)
+    for _ in range(60):
+        kx, ky, phase = *rng.normal(0, 0.9, 2), rng.uniform(0, 2 * np.pi)
+        total += np.cos(kx * x + ky * y + phase)
+    return 0.5 + total / 40
+
+
+def pictures(east: float, north: float, cell: float = 0.25) -> tuple[np.ndarray, np.ndarray]:
+    """The same ground twice; in the second picture it lies further to the east and north, with another light."""
+    rows, columns = np.indices((400, 480))
+    x, y = columns * cell, -rows * cell
+    light = 0.6 + 0.3 * columns / 480
+    one = 200 * ground(x, y).clip(0, 1)
+    other = 30 + 140 * light * ground(x - east, y - north).clip(0, 1)
+    rng = np.random.default_rng(1)
+    return tuple((p + rng.normal(0, 4, p.shape)).clip(1, 254).astype(np.float32) for p in (one, other))  # type: ignore
+
+
+def test_a_shift_is_found_to_a_tenth_of_a_pixel_under_another_light():
+    one, other = pictures(0.40, -0.65)
+    found = correlate(one, other, np.ones(one.shape, bool), 0.25)
+    assert found.known
+    assert found.east_m == pytest.approx(-0.40, abs=0.025)
+    assert found.north_m == pytest.approx(0.65, abs=0.025)
+    assert found.error_m < 0.05
+    assert abs(found.east_m + 0.40) < 3 * found.error_m + 0.01
+
+
+def test_unrelated_pictures_do_not_tell_a_shift():
+    rng = np.random.default_rng(2)
+    one, other = (128 + 40 * noise(rng, (400, 480), 0.5, 1, 3) for _ in range(2))
+    found = correlate(one, other, np.ones(one.shape, bool), 0.25)
+    assert not found.known
+    assert "do not tell" in found.words()
+
+
+def test_bland_ground_does_not_tell_a_shift():
+    bland = np.full((400, 480), 120, np.float32)
+    assert correlate(bland, bland, np.ones(bland.shape, bool), 0.25).windows == 0
+
+
+def test_the_later_survey_is_moved_and_its_error_enters_on_slopes(tmp_path: Path):
+    east, north = 0.6, -0.45
+    rows, columns = np.indices((200, 240))
+    x, y = columns * 0.5, -rows * 0.5
+    rng = np.random.default_rng(3)
+
+    def heights(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        steep = (0.4 * np.sin(x / 4) * (x > 60) + 2 * ground(x / 6, y / 6)).astype(np.float32)
+        return steep + noise(rng, x.shape, 0.01, 0.005, 4)
+
+    write_surface(tmp_path / "early.tif", heights(x, y))
+    write_surface(tmp_path / "late.tif", heights(x - east, y - north))
+    for name, picture in zip(("early", "late"), pictures(east, north), strict=True):
+        write_surface(tmp_path / f"{name}_ortho.tif", np.stack([picture.astype(np.uint8)] * 3), 0.25)
+    from dataclasses import replace
+
+    surveys = [
+        replace(open_surface(tmp_path / f"{n}.tif"), orthophoto=tmp_path / f"{n}_ortho.tif") for n in ("early", "late")
+    ]
+    moved = measure(*surveys)
+    left = measure(*surveys, Options(shift="none"))
+    assert moved.errors.registration.shift_m == pytest.approx((-east, -north), abs=0.04)
+    assert np.nanstd(moved.dz) < 0.5 * np.nanstd(left.dz)
+    assert isinstance(moved.errors.sigma, np.ndarray)
+    assert moved.errors.sigma[:, 130:].mean() > moved.errors.sigma[:, :110].mean()
+
+
+def test_a_shift_that_must_be_known_is_refused_where_pictures_do_not_tell(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 0, 0.0)
+    with pytest.raises(ChangeError, match="no orthophoto"):
+        measure(open_surface(earlier), open_surface(later), Options(shift="images"))

@@ -1,0 +1,140 @@
+"""`tidefield change` from the command line, and the files it writes."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from surveys_of_two_dates import pair
+
+from tidefield import cli
+
+
+def call(*words: object) -> None:
+    cli._run([str(word) for word in words])
+
+
+def fails(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
+    monkeypatch.setattr("sys.argv", ["tidefield", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    return capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    folder = tmp_path_factory.mktemp("change")
+    earlier, later, truth = pair(folder, 0, 0.1)
+    call("change", earlier, later, folder / "out", "-q", "--dates", "2023-05-01", "2024-05-03")
+    return folder / "out", truth
+
+
+def test_the_rasters_are_cloud_optimized_and_have_what_their_bands_say(compared: tuple[Path, np.ndarray]):
+    import rasterio
+    from rio_cogeo.cogeo import cog_validate
+
+    out, truth = compared
+    for name in ("change.tif", "significant.tif"):
+        assert cog_validate(str(out / name))[0]
+    with rasterio.open(out / "change.tif") as file:
+        dz, sigma, p = file.read()
+        assert file.crs.to_epsg() == 32630
+        assert file.tags()["EARLIER"] == "2023-05-01"
+    with rasterio.open(out / "significant.tif") as file:
+        alone, outlined = file.read()
+    assert np.array_equal(alone != 0, p < 0.05)
+    assert np.abs((dz - truth)[truth == 0].mean()) < 0.002
+    assert (outlined[truth < 0] == -1).mean() > 0.95
+    assert (outlined[truth > 0] == 1).mean() > 0.95
+    assert sigma.mean() == pytest.approx(np.hypot(0.015, 0.01) * np.sqrt(2), rel=0.1)
+
+
+def test_tables_and_the_geopackage_have_the_same_outlines(compared: tuple[Path, np.ndarray]):
+    from pyogrio import raw
+
+    out, truth = compared
+    with (out / "outlines.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["change"] for row in rows} == {"lower", "higher"}
+    meta, _, shapes, columns = raw.read(out / "change.gpkg", layer="outlines")
+    import shapely
+
+    table = dict(zip(meta["fields"], columns, strict=True))
+    areas = [shape.area for shape in shapely.from_wkb(shapes)]
+    assert areas == pytest.approx(table["area_m2"])
+    assert [float(row["volume_m3"]) for row in rows] == pytest.approx(table["volume_m3"], abs=1e-3)
+    ground = raw.read(out / "change.gpkg", layer="stable_ground")[2]
+    assert sum(shape.area for shape in shapely.from_wkb(ground)) < truth.size * 0.25
+
+
+def test_the_numbers_tell_volumes_intervals_and_where_they_come_from(compared: tuple[Path, np.ndarray]):
+    out, _ = compared
+    numbers = json.loads((out / "change.json").read_text())
+    cut = numbers["volumes"]["cut"]
+    assert cut["low_m3"] < cut["value_m3"] < cut["high_m3"]
+    parts = [cut[f"{part}_m3"] for part in ("random", "correlated", "systematic", "choice")]
+    half = cut["high_m3"] - cut["value_m3"]
+    assert 1.95 * np.linalg.norm(parts) < half < 2.2 * np.linalg.norm(parts)
+    assert numbers["registration"]["stable_ground"] == "found"
+    with (out / "volumes.csv").open() as file:
+        assert [row["volume"] for row in csv.DictReader(file)][:3] == ["net", "cut", "fill"]
+
+
+def test_clouds_are_compared_as_surfaces_and_by_m3c2(tmp_path: Path):
+    import laspy
+    from pyproj import CRS
+
+    rng = np.random.default_rng(0)
+    for name, lower in (("early", 0.0), ("late", 0.3)):
+        xy = rng.uniform(0, 40, (30_000, 2))
+        pit = np.hypot(*(xy - 12).T) < 6
+        las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+        las.header.add_crs(CRS.from_epsg(32630))
+        las.header.scales, las.header.offsets = np.full(3, 0.001), np.array([400_000.0, 5_700_000.0, 0.0])
+        las.x, las.y = 400_000 + xy[:, 0], 5_700_000 + xy[:, 1]
+        las.z = 2 - lower * pit + rng.normal(0, 0.03, len(xy))
+        las.write(str(tmp_path / f"{name}.laz"))
+    call("change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "out", "-q")
+    numbers = json.loads((tmp_path / "out" / "change.json").read_text())
+    assert numbers["earlier"]["file"] == "early.laz"
+    cut = numbers["volumes"]["cut"]
+    assert cut["low_m3"] < 0.3 * np.pi * 36 < cut["high_m3"]
+    m3c2 = laspy.read(tmp_path / "out" / "m3c2.laz")
+    assert m3c2.header.parse_crs().to_epsg() == 32630
+    inside = np.hypot(np.asarray(m3c2.x) - 400_012, np.asarray(m3c2.y) - 5_700_012) < 5
+    assert np.median(np.asarray(m3c2["M3C2_distance"])[inside]) == pytest.approx(-0.3, abs=0.01)
+    assert np.asarray(m3c2["significant"])[inside].mean() > 0.95
+
+
+def test_a_cloud_and_a_surface_are_not_compared(
+    compared: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+):
+    early = compared[0].parent / "early_0.tif"
+    (tmp_path / "late.laz").write_bytes(b"LASF")
+    told = fails(capsys, monkeypatch, "change", early, tmp_path / "late.laz", tmp_path / "new")
+    assert "two surfaces or two clouds" in told
+    (tmp_path / "early.laz").write_bytes(b"LASF" + bytes(300))
+    told = fails(capsys, monkeypatch, "change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "new")
+    assert "cannot be read as a point cloud" in told
+
+
+def test_mistakes_are_told_in_one_message(
+    compared: tuple[Path, np.ndarray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    early, late = compared[0].parent / "early_0.tif", compared[0].parent / "late_0.tif"
+    new = tmp_path / "new"
+    assert "is there already" in fails(capsys, monkeypatch, "change", early, late, compared[0])
+    assert "cannot be read" in fails(capsys, monkeypatch, "change", early, tmp_path / "none.tif", new)
+    wrong = ("--dates", "2024-05-03", "2023-05-01")
+    assert "earlier survey first" in fails(capsys, monkeypatch, "change", early, late, new, *wrong)
+    assert "odd numbers" in fails(capsys, monkeypatch, "change", early, late, new, "--windows", 4)
+    assert "YYYY-MM-DD" in fails(capsys, monkeypatch, "change", early, late, new, "--dates", "May", "June")
+    polygons = tmp_path / "polygons.geojson"
+    polygons.write_text('{"type": "FeatureCollection", "features": [')
+    assert "polygons" in fails(capsys, monkeypatch, "change", early, late, new, "--stable", polygons)
+    assert not new.exists()

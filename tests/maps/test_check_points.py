@@ -1,0 +1,129 @@
+"""Check points: read, located by their marks, and compared with a surface whose error is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tidefield.data.georeference import Georeference, Residuals, read_georeference
+from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
+from tidefield.maps.check_points import check, read_check_points, remark, summary
+from tidefield.maps.grid import Grid, MapFrame, map_frame
+from tidefield.maps.rasters import Raster, raster_writer
+from tidefield.survey.io.gcp_file import write_check_points
+from tidefield.survey.survey import CHECK_FILE, Control, Mark
+from tidefield.synthetic import make_survey, write_survey
+
+FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
+WORLD = np.array([[1.0, 2.0, 0.3], [-2.0, 1.0, 0.1], [0.5, -2.5, -0.2]])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("flat")
+    write_survey(make_survey("ground_textures", seed=4, views=6, width=64), folder / "scene")
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    Georeference(FRAME, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(folder / "scene")
+    return load_scene(folder / "scene", hold_out=False, calibrate=False, cache=folder / "cache")
+
+
+@pytest.fixture
+def frame(scene: Scene) -> MapFrame:
+    return map_frame(scene, read_georeference(scene.root))
+
+
+def written(folder: Path, grid: Grid, height: np.ndarray) -> list[Path]:
+    """Rasters of heights, and of standard errors of 0.2."""
+    pytest.importorskip("rasterio")
+    paths = [folder / "dsm.tif", folder / "sigma.tif"]
+    for path, values in zip(paths, (height, np.full(height.shape, 0.2)), strict=True):
+        with raster_writer(Raster(path, ("values",)), grid) as writer:
+            writer.write(0, values[None])
+    return paths
+
+
+def control(scene: Scene, names: tuple[str, ...] = ("CHK1", "chk 2", "G3")) -> Control:
+    """Points at known places, marked where cameras show them."""
+    import torch
+
+    marks = []
+    for name, xyz in zip(names, WORLD, strict=True):
+        uv, _ = scene.cameras.project(torch.from_numpy(xyz[None]).float() - scene.origin_world.float())
+        for index, (u, v) in enumerate(uv[:, 0].tolist()):
+            if 0 < u < scene.cameras.width and 0 < v < scene.cameras.height:
+                marks.append(Mark(name, scene.names[index], (u, v)))
+    places = FRAME.to_crs(WORLD).tolist()
+    return Control("EPSG:27700", {n: tuple(p) for n, p in zip(names, places, strict=True)}, tuple(marks))
+
+
+def test_only_check_points_are_written_to_a_scene_and_all_of_them_are_read(
+    scene: Scene, frame: MapFrame, tmp_path: Path
+):
+    write_check_points(control(scene), tmp_path)
+    found = read_check_points(tmp_path / CHECK_FILE, scene, frame)
+    assert [point.name for point in found] == ["CHK1", "chk 2"]
+    np.testing.assert_allclose([point.surveyed for point in found], FRAME.to_crs(WORLD[:2]), atol=1e-6)
+    assert all(len(point.marks) >= 2 for point in found)
+    write_check_points(control(scene, ("G1", "G2", "G3")), tmp_path)
+    assert not (tmp_path / CHECK_FILE).exists()
+
+
+def test_a_model_is_fitted_to_the_others(scene: Scene):
+    fitted = control(scene).fitted()
+    assert fitted is not None
+    assert set(fitted.points) == {mark.point for mark in fitted.marks} == {"G3"}
+
+
+def test_errors_are_those_of_the_surface_and_of_the_marks(scene: Scene, frame: MapFrame, tmp_path: Path):
+    write_check_points(control(scene), tmp_path)
+    points = read_check_points(tmp_path / CHECK_FILE, scene, frame)
+    grid = Grid(frame, 351_190.0, 512_910.0, 0.5, 40, 40, 260.0)
+    # A plane of a known slope, 5 cm above the ground at its origin.
+    east, north = grid.west + (np.arange(40) + 0.5) * 0.5, grid.north - (np.arange(40) + 0.5) * 0.5
+    height = 260.05 + 0.1 * (east[None] - 351_200) - 0.2 * (north[:, None] - 512_900)
+    checked = check(points, scene, grid, *written(tmp_path, grid, height))
+    for one in checked:
+        x, y, z = one.point.surveyed
+        plane = 260.05 + 0.1 * (x - 351_200) - 0.2 * (y - 512_900)
+        assert one.error[2] == pytest.approx(plane - z, abs=1e-4)
+        assert np.abs(one.error[:2]).max() < 2e-3
+        assert one.sigma == pytest.approx(0.2, abs=1e-6)
+    found = summary(checked)
+    assert found["vertical"]["n"] == 2
+    assert found["vertical"]["mean"] == pytest.approx(np.mean([one.error[2] for one in checked]))
+    assert found["remark"] == "2 check points: indicative, under ASPRS' 30"
+    assert remark(30) == "30 check points"
+
+
+def test_points_without_marks_have_a_height_only_and_those_outside_have_none(
+    scene: Scene, frame: MapFrame, tmp_path: Path
+):
+    (tmp_path / "levelled.txt").write_text("EPSG:27700\n351200 512900 260.1 peg\n400000 512900 260 far\n")
+    points = read_check_points(tmp_path / "levelled.txt", scene, frame)
+    grid = Grid(frame, 351_190.0, 512_910.0, 0.5, 40, 40, 260.0)
+    found = summary(check(points, scene, grid, *written(tmp_path, grid, np.full((40, 40), 260.0))))
+    assert [found["vertical"][key] for key in ("n", "nmad", "within_1_96_sigma")] == [1, 0.0, 1.0]
+    assert found["vertical"]["mean"] == pytest.approx(-0.1, abs=1e-4)
+    assert found["horizontal_rmse"] is None
+    assert [one["up"] for one in found["each"]] == [pytest.approx(-0.1, abs=1e-4), None]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "EPSG:27700\n", "EPSG:27700\n1 2\n", "nowhere\n1 2 3 a\n", "EPSG:27700\nnan 1 2 a\n"]
+)
+def test_a_damaged_file_is_refused(scene: Scene, frame: MapFrame, tmp_path: Path, text: str):
+    (tmp_path / "check.txt").write_text(text)
+    with pytest.raises(RunError, match="cannot be read as check points"):
+        read_check_points(tmp_path / "check.txt", scene, frame)
+
+
+def test_a_scene_without_coordinates_has_no_check_points(scene: Scene, tmp_path: Path):
+    (tmp_path / "check.txt").write_text("EPSG:27700\n1 2 3 a\n")
+    with pytest.raises(RunError, match="not georeferenced"):
+        read_check_points(tmp_path / "check.txt", scene, map_frame(scene, None))

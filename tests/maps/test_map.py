@@ -1,0 +1,233 @@
+"""`tidefield map` on a built-in flat whose every height and colour is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tidefield.commands.common import ZeroShot
+from tidefield.commands.map_ import Map, map_
+from tidefield.data.georeference import Georeference, Residuals
+from tidefield.errors import RunError
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
+from tidefield.maps import make
+from tidefield.maps.make import CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
+from tidefield.synthetic import Flight, make_survey, write_survey
+
+rasterio = pytest.importorskip("rasterio")
+laspy = pytest.importorskip("laspy")
+QUIET = Console(quiet=True)
+FRAME = LocalFrame.at("EPSG:27700+5701", (351_200.0, 512_900.0, 260.0))
+AREA = 5.0
+"""Half the side of the square that is mapped, metres: a few tiles."""
+
+
+def polygon(folder: Path, half: float = AREA, east: float = 0.0) -> Path:
+    corners = [
+        [east - half, -half],
+        [east + half, -half],
+        [east + half, half],
+        [east - half, half],
+        [east - half, -half],
+    ]
+    path = folder / f"area_{half:g}_{east:g}.geojson"
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+    return path
+
+
+def mapped(scene: Path, out: Path, **options: Any) -> dict[str, Any]:
+    return map_(Map(scene, out, ZeroShot(zero_shot=True), device="cpu", **options), QUIET)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(make, "LARGEST_TILE", 32)
+        patch.setattr(make, "SMALLEST_TILE", 32)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine photographs of bare, textured ground, with uneven exposures."""
+    folder = tmp_path_factory.mktemp("flat") / "scene"
+    flight = Flight(exposure_spread=0.15)
+    write_survey(make_survey("ground_textures", seed=4, views=9, width=240, flight=flight), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("map")
+    mapped(scene, folder / "map", area=polygon(folder))
+    return folder / "map"
+
+
+def truth(scene: Path, dataset: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Heights and colours of the flat at the centres of a raster's cells."""
+    import cv2
+
+    about = json.loads((scene / "truth" / "truth.json").read_text())["map"]
+    west, north = about["first_pixel_centre_east_north_m"]
+    cell = about["pixel_step_east_north_m"][0]
+    columns, rows = np.meshgrid(np.arange(dataset.width), np.arange(dataset.height))
+    east, up = dataset.xy(rows.ravel(), columns.ravel())
+    u = ((np.array(east) - west) / cell).reshape(rows.shape).astype(np.float32)
+    v = ((north - np.array(up)) / cell).reshape(rows.shape).astype(np.float32)
+    height = cv2.remap(np.load(scene / "truth" / "surface.npy"), u, v, cv2.INTER_LINEAR)
+    colour = cv2.cvtColor(cv2.imread(str(scene / "truth" / "orthophoto.png")), cv2.COLOR_BGR2RGB)
+    return height, cv2.remap(colour, u, v, cv2.INTER_LINEAR)
+
+
+def test_heights_are_those_of_the_flat_and_their_errors_are_stated(scene: Path, out: Path):
+    with rasterio.open(out / DSM) as dsm, rasterio.open(out / SIGMA) as sigma:
+        error = dsm.read(1, masked=True) - truth(scene, dsm)[0]
+        stated = sigma.read(1, masked=True)
+        cell = dsm.transform.a
+    assert error.count() > 0.99 * error.size
+    nmad = 1.4826 * np.ma.median(abs(error - np.ma.median(error)))
+    assert nmad < 0.35 * cell
+    assert abs(np.ma.median(error)) < 0.2 * cell
+    assert 0.85 < (abs(error) < 1.96 * stated).mean() <= 1
+
+
+def test_the_orthophoto_shows_the_flat_in_its_place(scene: Path, out: Path):
+    with rasterio.open(out / ORTHOPHOTO) as ortho:
+        shown = ortho.read([1, 2, 3]).transpose(1, 2, 0).astype(float)
+        colour = truth(scene, ortho)[1].astype(float)
+    # The common exposure of photographs differs from the truth by one factor per channel.
+    shown *= colour.mean((0, 1)) / shown.mean((0, 1))
+    error = np.sqrt(((shown - colour) ** 2).mean())
+    shifted = np.sqrt(((shown[:, 2:] - colour[:, :-2]) ** 2).mean())
+    assert error < 0.7 * shifted
+    assert 20 * np.log10(255 / error) > 27
+
+
+def test_rasters_are_cloud_optimised_and_say_that_the_frame_is_local(out: Path):
+    from rio_cogeo import cog_validate
+
+    for name in (ORTHOPHOTO, DSM, SIGMA, VIEWS, MAIN):
+        valid, errors, _ = cog_validate(out / name)
+        assert valid, errors
+        with rasterio.open(out / name) as dataset:
+            assert "not georeferenced" in dataset.crs.to_wkt()
+            assert dataset.tags()["COORDINATES"].startswith("local frame")
+    with rasterio.open(out / VIEWS) as views, rasterio.open(out / MAIN) as main:
+        assert views.read(1).min() >= 2
+        assert main.read(1).min() >= 1
+        assert main.read(1).max() <= len(json.loads(main.tags()["PHOTOGRAPHS"]))
+
+
+def test_terrain_contours_and_hillshades_lie_on_the_same_cells(out: Path):
+    with rasterio.open(out / DSM) as dsm, rasterio.open(out / make.DTM) as dtm:
+        surface, ground = dsm.read(1, masked=True), dtm.read(1, masked=True)
+    assert (ground <= surface).all() or np.percentile(ground - surface, 99) < 0.1
+    with rasterio.open(out / make.DTM_HILLSHADE) as shade:
+        assert shade.read(1).min() >= 1
+    about = json.loads((out / MAP_FILE).read_text())["contours"]
+    assert len(json.loads((out / "contours" / "contours.geojson").read_text())["features"]) == about["lines"] > 0
+
+
+def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
+    cloud = laspy.read(out / CLOUD)
+    assert (cloud.header.version.major, cloud.header.version.minor, cloud.header.point_format.id) == (1, 4, 7)
+    with rasterio.open(out / DSM) as dsm, rasterio.open(out / SIGMA) as sigma:
+        rows, columns = rasterio.transform.rowcol(dsm.transform, np.array(cloud.x), np.array(cloud.y))
+        assert len(cloud.points) == dsm.read(1, masked=True).count()
+        np.testing.assert_allclose(dsm.read(1)[rows, columns], cloud.z, atol=1e-3)
+        np.testing.assert_allclose(sigma.read(1)[rows, columns], cloud.sigma_z)
+    assert np.array(cloud.views).min() >= 2
+    assert "not georeferenced" in cloud.header.parse_crs().name
+
+
+def test_a_map_that_was_killed_continues_and_is_the_same(scene: Path, out: Path, tmp_path: Path):
+    rendered, again = make.render_tile, []
+
+    def killed(*arguments: Any) -> Any:
+        again.append(1)
+        if len(again) == 3:
+            raise KeyboardInterrupt
+        return rendered(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make, "render_tile", killed)
+        with pytest.raises(KeyboardInterrupt):
+            mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+        assert len(list((tmp_path / "map" / make.TILES).glob("*.npz"))) == 2
+        mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+    assert len(again) == 1 + 4  # the one that was killed is rendered again, the two before it are not
+    with rasterio.open(out / DSM) as one, rasterio.open(tmp_path / "map" / DSM) as other:
+        np.testing.assert_array_equal(one.read(1), other.read(1))
+    assert not (tmp_path / "map" / make.TILES).exists()
+
+
+def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path, tmp_path: Path):
+    before = (out / MAP_FILE).read_bytes()
+    with pytest.raises(RunError, match="holds this map already"):
+        mapped(scene, out, area=polygon(tmp_path))
+    with pytest.raises(RunError, match="another scene or with other options"):
+        mapped(scene, out, area=polygon(tmp_path), gsd=0.5)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    with pytest.raises(RunError, match="holds something else"):
+        mapped(scene, tmp_path / "mine")
+    assert (out / MAP_FILE).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gsd": 0.001}, "finer cells would show no more"),
+        ({"gsd": float("nan")}, "expected at least"),
+        ({"heights": "EPSG:5701"}, "not georeferenced"),
+        ({"area": (10.0, 5000.0)}, "within the survey"),
+    ],
+)
+def test_what_cannot_be_mapped_is_refused_in_one_sentence(
+    scene: Path, tmp_path: Path, options: dict[str, Any], message: str
+):
+    if "area" in options:
+        options = {"area": polygon(tmp_path, *options["area"])}
+    with pytest.raises(RunError, match=message):
+        mapped(scene, tmp_path / "map", **options)
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_damaged_area_is_refused(scene: Path, tmp_path: Path):
+    for text, message in (("{", "no GeoJSON"), ('{"type": "Point", "coordinates": [0, 0]}', "has no Polygon")):
+        (tmp_path / "area.geojson").write_text(text)
+        with pytest.raises(RunError, match=message):
+            mapped(scene, tmp_path / "map", area=tmp_path / "area.geojson")
+
+
+def test_a_georeferenced_map_has_a_compound_system_and_its_coordinates(scene: Path, tmp_path: Path):
+    import shutil
+
+    shutil.copytree(scene, tmp_path / "scene")
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    Georeference(FRAME, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(tmp_path / "scene")
+    corners = FRAME.to_geographic(np.array([[x, y, 0.0] for x, y in ((-2, -2), (2, -2), (2, 2), (-2, 2), (-2, -2))]))
+    area = {
+        "type": "Feature",
+        "properties": {},
+        "geometry": {"type": "Polygon", "coordinates": [corners[:, :2].tolist()]},
+    }
+    (tmp_path / "area.geojson").write_text(json.dumps(area))
+    mapped(tmp_path / "scene", tmp_path / "map", area=tmp_path / "area.geojson")
+    with rasterio.open(tmp_path / "map" / DSM) as dsm:
+        assert dsm.crs.to_epsg() == 7405  # British National Grid and ODN height
+        values = dsm.read(1, masked=True)
+        rows, columns = np.nonzero(~np.ma.getmaskarray(values))
+        east, north = dsm.xy(rows, columns)
+        world = FRAME.from_crs(np.column_stack([east, north, values[rows, columns]]))
+        assert abs(world[:, :2]).max() < 2.2
+        assert dsm.transform.c % dsm.transform.a == pytest.approx(0, abs=1e-6)
+    cloud = laspy.read(tmp_path / "map" / CLOUD)
+    assert cloud.header.parse_crs().to_epsg() == 7405

@@ -1,0 +1,139 @@
+"""Terrain, hillshade, contours and sections of surfaces whose shapes are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import CRS
+from shapely.geometry import LineString
+
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
+from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
+from tidefield.maps.rasters import Raster, raster_writer, read_raster
+from tidefield.maps.sections import cut, write_sections
+from tidefield.maps.terrain import hillshade, write_hillshade, write_terrain
+
+pytest.importorskip("rasterio")
+LOCAL = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
+GRID = Grid(LOCAL, 10.0, 90.0, 0.1, 400, 300, 2.0)
+
+
+def written(path: Path, values: np.ndarray, grid: Grid = GRID, nodata: float = -9999.0) -> Path:
+    with raster_writer(Raster(path, ("values",)), grid) as writer:
+        writer.write(0, np.where(np.isfinite(values), values, nodata)[None])
+    return path
+
+
+def ground() -> np.ndarray:
+    """A slope with ripples."""
+    y, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    return (2 + 0.03 * x - 0.02 * y + 0.03 * np.sin(x * 6)).astype(np.float32)
+
+
+def test_plants_are_taken_off_and_ripples_stay(tmp_path: Path):
+    bare = ground()
+    surface = bare.copy()
+    random = np.random.default_rng(0)
+    rows, columns = np.ogrid[: GRID.rows, : GRID.columns]
+    plants = np.zeros(bare.shape, bool)
+    for _ in range(40):
+        row, column, radius = random.integers(20, 280), random.integers(20, 380), random.integers(2, 14)
+        inside = (rows - row) ** 2 + (columns - column) ** 2 < radius**2
+        surface[inside] = np.maximum(surface[inside], bare[inside] + 0.08 * radius + 0.2)
+        plants |= inside
+    surface[:10, :50] = np.nan
+    dsm = written(tmp_path / "dsm.tif", surface)
+    sigma = written(tmp_path / "sigma.tif", np.full(bare.shape, 0.02))
+    write_terrain(dsm, sigma, Raster(tmp_path / "dtm.tif", ("terrain",)), GRID)
+    terrain = read_raster(tmp_path / "dtm.tif")[0]
+    np.testing.assert_array_equal(np.isnan(terrain), np.isnan(surface))
+    known = ~np.isnan(surface)
+    # Ripples of 3 cm are a part of the ground, and lost below plants only.
+    assert np.abs(terrain - bare)[known & ~plants].max() < 1e-4
+    assert np.abs(terrain - bare)[known & plants].mean() < 0.04
+    assert np.percentile(np.abs(terrain - bare)[known & plants], 98) < 0.12
+
+
+def test_hillshade_is_that_of_a_plane():
+    y, x = np.mgrid[:20, :20].astype(float)
+    slope = hillshade(0.5 * x, 1.0)[5:15, 5:15]  # rises to the east
+    normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    sun = np.array([-0.5, 0.5, np.sqrt(0.5)])
+    np.testing.assert_allclose(slope, normal @ sun, atol=1e-6)
+    assert hillshade(0.0 * y, 1.0).mean() == pytest.approx(np.sqrt(0.5))
+
+
+def test_the_hillshade_s_strips_have_no_seams(tmp_path: Path):
+    tall = Grid(LOCAL, 0.0, 90.0, 0.1, 64, 1100, 2.0)
+    y, x = np.mgrid[:1100, :64] * 0.1
+    values = (np.sin(x) + np.cos(0.7 * y)).astype(np.float32)
+    dsm = written(tmp_path / "dsm.tif", values, tall)
+    write_hillshade(dsm, Raster(tmp_path / "shade.tif", ("shade",), "uint8", 0.0), tall)
+    shade = read_raster(tmp_path / "shade.tif")[0]
+    np.testing.assert_allclose(shade, np.round(1 + 254 * hillshade(values, 0.1)), atol=1)
+
+
+def test_contours_of_a_cone_are_circles_at_their_heights():
+    y, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    cone = np.hypot(x - 20, y - 15).astype(np.float32)
+    lines = contours(cone, GRID, 1.0, smooth_cells=0.5)
+    assert {height for height, _ in lines} >= {2.0, 5.0, 10.0}
+    middle = np.array([GRID.west + 20.05, GRID.north - 15.05])
+    for height, line in lines:
+        if 2 <= height <= 12:
+            radius = np.linalg.norm(np.asarray(line.coords) - middle, axis=1)
+            np.testing.assert_allclose(radius, height, atol=0.05)
+
+
+def test_the_interval_is_round_and_large_maps_are_reduced(tmp_path: Path):
+    assert interval_of(np.linspace(0, 10, 100, dtype=np.float32).reshape(10, 10)) == 0.5
+    large = Grid(LOCAL, 0.0, 0.0, 0.1, 2002, 2001, 0.0)
+    y, x = np.mgrid[: large.rows, : large.columns].astype(np.float32)
+    small, grid = read_reduced(written(tmp_path / "large.tif", x + 3 * y, large), large)
+    assert small.shape == (grid.rows, grid.columns) == (1000, 1001)
+    assert grid.cell == pytest.approx(0.2)
+    assert small[0, 0] == pytest.approx(0.5 + 1.5)
+    assert small[-1, -1] == pytest.approx(2000.5 + 3 * 1998.5)
+
+
+def test_contours_are_read_again_by_gdal_and_in_longitude_and_latitude(tmp_path: Path):
+    pyogrio = pytest.importorskip("pyogrio")
+    frame = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
+    wkt = CRS.from_epsg(27700).to_wkt()
+    there = MapFrame(frame, np.zeros(3), np.eye(3), wkt, wkt, "unknown")
+    line = LineString([(351_200, 512_900), (351_210, 512_905), (351_220, 512_900)])
+    paths = write_contours([(261.5, line)], there, tmp_path)
+    for path, epsg in zip(paths, (27700, 4326, None), strict=True):
+        about = pyogrio.read_info(path)
+        if epsg is not None:
+            assert about["features"] == 1
+            assert CRS.from_user_input(about["crs"]).to_epsg() == epsg
+    x, y = json.loads(paths[1].read_text())["features"][0]["geometry"]["coordinates"][0]
+    assert frame.from_geographic(np.array([[x, y, 260.0]]))[0, :2] == pytest.approx([0, 0], abs=1e-2)
+    _, _, shapes, _ = pyogrio.raw.read(paths[2])
+    import shapely
+
+    assert shapely.from_wkb(shapes[0]).coords[1] == pytest.approx((351_210, 512_905, 261.5))
+
+
+def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path):
+    y, x = np.mgrid[: GRID.rows, : GRID.columns] + 0.5
+    plane = (0.1 * (GRID.west + x * GRID.cell) - 0.2 * (GRID.north - y * GRID.cell)).astype(np.float32)
+    dsm, sigma = written(tmp_path / "dsm.tif", plane), written(tmp_path / "sigma.tif", np.full(plane.shape, 0.5))
+    line = LineString([(20.03, 70.01), (30.0, 80.0), (70.0, 80.0)])
+    [section] = cut([(line, {"name": "creek, mouth"})], dsm, sigma, GRID)
+    known = np.isfinite(section.height)
+    truth = 0.1 * section.place[:, 0] - 0.2 * section.place[:, 1]
+    np.testing.assert_allclose(section.height[known], truth[known], atol=1e-4)
+    assert known[section.place[:, 0] < 49.9].all()
+    assert not known[section.place[:, 0] > 50].any()
+    table, plot = write_sections([section], tmp_path, "m")
+    first = table.read_text().splitlines()[1]
+    assert first.startswith('"creek, mouth",0.000,20.030,70.010,')
+    low, height, high = (float(first.rsplit(",", 4)[k]) for k in (3, 1, 4))
+    assert (height - low, high - height) == (pytest.approx(0.98, abs=1e-3), pytest.approx(0.98, abs=1e-3))
+    assert plot.read_text().lstrip().startswith("<?xml")

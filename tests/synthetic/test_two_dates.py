@@ -1,0 +1,50 @@
+"""One flat at two dates: the change is what was asked for, and known exactly."""
+
+import numpy as np
+import torch
+
+from tidefield.synthetic.grids import Extent, Raster
+from tidefield.synthetic.two_dates import Difference, SurveyErrors, ground_pair, make_pair, surveyed
+
+
+def test_the_creek_cuts_and_fills_and_the_bar_grows_by_what_was_asked_for():
+    earlier, later = ground_pair("river_mouths", 1, 0.1, side_m=100.0, cell_m=0.4)
+    change = (later.values - earlier.values)[0]
+    assert float(change.max()) == float(-change.min()) or abs(float(change.max() + change.min())) < 1e-3
+    assert abs(float(change.max()) - 0.1) < 1e-3
+    assert 0.01 < float((change < -0.09).float().mean()) < 0.2
+    assert 0.01 < float((change > 0.09).float().mean()) < 0.3
+    assert float((change.abs() < 1e-6).float().mean()) > 0.5
+
+
+def test_no_change_is_no_change():
+    earlier, later = ground_pair("tidal_trees", 2, 0.0, side_m=60.0, cell_m=0.5)
+    assert torch.equal(earlier.values, later.values)
+
+
+def test_surveys_have_the_errors_that_were_asked_for():
+    extent = Extent(0.0, 0.0, 200, 220, 0.25)
+    flat = Raster(extent, torch.zeros(1, 220, 200))
+    quiet = SurveyErrors(white_m=0.02, smooth_m=0.0, long_m=0.0, datum_m=0.0, outliers=0.0)
+    found = surveyed(flat, extent, np.random.default_rng(0), quiet)
+    assert abs(found.std() - 0.02) < 0.001
+    smooth = SurveyErrors(white_m=0.0, smooth_m=0.02, long_m=0.0, datum_m=0.0, outliers=0.0)
+    found = surveyed(flat, extent, np.random.default_rng(0), smooth)
+    assert abs(found.std() - 0.02) < 0.005
+    # Five per cent of the correlation are left at the range of 3 m.
+    assert abs(np.corrcoef(found[:-12].ravel(), found[12:].ravel())[0, 1]) < 0.2
+    assert np.corrcoef(found[:-1].ravel(), found[1:].ravel())[0, 1] > 0.95
+
+
+def test_photographs_of_both_dates_show_the_flat_that_changed():
+    difference = Difference(change_m=0.3, tide_m=0.0)
+    pair = make_pair("river_mouths", 3, difference, views=2, width=48, supersample=1)
+    change = pair.ground_change.values
+    assert float(change.abs().max()) > 0.25
+    same = pair.earlier.flat.bed.values + change
+    assert torch.allclose(same, pair.later.flat.bed.values)
+    assert pair.plants[1].values.mean() > pair.plants[0].values.mean()
+    assert pair.earlier.photographs.shape == (2, 36, 48, 3)
+    assert float(pair.later.cameras.position_world[:, 2].mean()) > float(
+        pair.earlier.cameras.position_world[:, 2].mean()
+    )

@@ -1,0 +1,245 @@
+"""Point clouds (LAS, LAZ): read, made surfaces of, compared by M3C2, and written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
+from pyproj import CRS, Transformer
+
+from tidefield.change.m3c2 import Distances, fit_normals, m3c2
+from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.files import reading_from
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+_MOST_POINTS = 200_000_000
+_NOISE = (7, 18)
+"""Classes of noise (LAS 1.4)."""
+_WATER = 9
+_POINTS_PER_CELL = 10.0
+"""With fewer, cells without points are holes in the surface, and are missing in volumes."""
+_CHUNK = 2_000_000
+SIGMAS = ("sigma_z", "sigma")
+"""Names of a dimension with the points' standard errors."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in metres.
+
+    Attributes:
+        xyz: east, north, up.
+        sigma: standard errors of their heights, if the file has them.
+    """
+
+    path: Path
+    crs: CRS | None
+    xyz: Float64[np.ndarray, "N 3"]
+    sigma: Float64[np.ndarray, " N"] | None
+
+
+def require_laspy() -> ModuleType:
+    """Import laspy.
+
+    Raises:
+        ChangeError: it is not installed.
+    """
+    try:
+        import laspy
+    except ImportError as error:
+        raise ChangeError(
+            "laspy is not installed: point clouds are read with it; install it with `pip install 'tidefield[maps]'`"
+        ) from error
+    return laspy
+
+
+def read_cloud(path: Path) -> Cloud:
+    """Read the points of a LAS or LAZ file without those that are classified as noise or water.
+
+    Raises:
+        ChangeError: the file is damaged, empty or too large, or in degrees.
+    """
+    laspy = require_laspy()
+    expected = "expected a LAS or LAZ file with points; name another"
+    with reading_from(path):
+        size = path.stat().st_size
+        path.open("rb").close()
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+            if not 0 < header.point_count <= _MOST_POINTS or header.point_count > 100 * size:
+                raise ChangeError(f"{path} has {header.point_count} points: {expected}, or a part of it")
+            crs = header.parse_crs()
+            extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
+            parts, sigmas = [], []
+            for points in reader.chunk_iterator(_CHUNK):
+                kept = ~np.isin(np.asarray(points.classification), (*_NOISE, _WATER))
+                xyz = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
+                kept &= np.isfinite(xyz).all(axis=1)
+                parts.append(xyz[kept])
+                if extra is not None:
+                    sigmas.append(np.asarray(points[extra], np.float64)[kept])
+    except ChangeError:
+        raise
+    except Exception as error:  # laspy and lazrs raise whatever a damaged file makes them
+        raise ChangeError(f"{path} cannot be read as a point cloud ({error}): {expected}") from error
+    xyz = np.concatenate(parts)
+    if len(xyz) == 0:
+        raise ChangeError(f"{path} has no points but noise and water: {expected}")
+    if crs is not None and crs.is_geographic:
+        raise ChangeError(f"{path} is in degrees: expected a projected system in metres; convert it first")
+    return Cloud(path, crs, xyz * _metres(crs), np.concatenate(sigmas) if sigmas else None)
+
+
+def _metres(crs: CRS | None) -> np.ndarray:
+    """Length of one unit of each axis."""
+    factors = np.ones(3)
+    if crs is not None:
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        factors[:2] = horizontal.axis_info[0].unit_conversion_factor
+        up = [axis for axis in crs.axis_info if axis.direction == "up"]
+        factors[2] = up[0].unit_conversion_factor if up else 1.0
+    return factors
+
+
+def in_system(cloud: Cloud, other: Cloud) -> Cloud:
+    """Convert a cloud to another one's coordinate system.
+
+    Raises:
+        ChangeError: only one of them has a system, or there is no way between them.
+    """
+    if cloud.crs is None and other.crs is None:
+        return cloud
+    if cloud.crs is None or other.crs is None:
+        bare = cloud if cloud.crs is None else other
+        raise ChangeError(
+            f"{bare.path.name} has no coordinate system, the other cloud has one: expected it in both or in none; "
+            "assign it (pdal translate --writers.las.a_srs)"
+        )
+    if cloud.crs.equals(other.crs, ignore_axis_order=True):
+        return cloud
+    own, theirs = (c.sub_crs_list[0] if c.is_compound else c for c in (cloud.crs, other.crs))
+    scale = _metres(cloud.crs)[:2], _metres(other.crs)[:2]
+    x, y = Transformer.from_crs(own, theirs, always_xy=True).transform(*(cloud.xyz[:, :2] / scale[0]).T)
+    xy = np.stack([x, y], axis=1) * scale[1]
+    if not np.isfinite(xy).all():
+        raise ChangeError(f"{cloud.path} cannot be converted to {theirs.name}: expected a system that fits its place")
+    return Cloud(cloud.path, other.crs, np.column_stack([xy, cloud.xyz[:, 2]]), cloud.sigma)
+
+
+def default_cell(cloud: Cloud) -> float:
+    """Side of cells that have ten points on average where there are points, to one significant digit."""
+    low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
+    area = float(np.prod(np.maximum(high - low, 1e-3)))
+    side = math.sqrt(_POINTS_PER_CELL * area / len(cloud.xyz))
+    for _ in range(2):  # where there are points at all
+        cells = np.unique(np.floor((cloud.xyz[:, :2] - low) / side).astype(np.int64) @ np.array([1, 1 << 31]))
+        side = math.sqrt(_POINTS_PER_CELL * len(cells) * side**2 / len(cloud.xyz))
+    digit = 10.0 ** math.floor(math.log10(side))
+    return max(0.001, math.ceil(side / digit) * digit)
+
+
+def write_surface(cloud: Cloud, cell_m: float, path: Path) -> None:
+    """Write the mean height of the points of each cell as a GeoTIFF; cells without points have none."""
+    import rasterio
+
+    low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
+    # On whole multiples of the cell, so that clouds of one place share their cells.
+    west, north = math.floor(low[0] / cell_m) * cell_m, math.ceil(high[1] / cell_m) * cell_m
+    columns, rows = math.floor((high[0] - west) / cell_m) + 1, math.floor((north - low[1]) / cell_m) + 1
+    if columns * rows > _MOST_POINTS:
+        raise ChangeError(
+            f"{cloud.path} has {columns} x {rows} cells of {cell_m} m: expected fewer; give a larger --cell"
+        )
+    grid = Grid(None, west, north, cell_m, columns, rows)
+    at = np.floor((north - cloud.xyz[:, 1]) / cell_m).astype(np.int64).clip(0, rows - 1) * columns
+    at += np.floor((cloud.xyz[:, 0] - west) / cell_m).astype(np.int64).clip(0, columns - 1)
+    count = np.bincount(at, minlength=rows * columns)
+    total = np.bincount(at, cloud.xyz[:, 2], rows * columns)
+    heights = np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32).reshape(rows, columns)
+    crs = cloud.crs.sub_crs_list[0] if cloud.crs is not None and cloud.crs.is_compound else cloud.crs
+    metric = crs is None or abs(crs.axis_info[0].unit_conversion_factor - 1) < 1e-9
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        width=columns,
+        height=rows,
+        count=1,
+        dtype="float32",
+        nodata=math.nan,
+        crs=crs.to_wkt() if crs is not None and metric else None,
+        transform=grid.transform,
+    ) as file:
+        file.write(heights, 1)
+
+
+def compare_clouds(
+    earlier: Cloud,
+    later: Cloud,
+    spacing_m: float,
+    registration_m: float,
+    vertical_m: float,
+    tick: Callable[[int, int], Any] | None = None,
+) -> Distances:
+    """M3C2 at core points that are one point of the earlier cloud in each cell of a grid.
+
+    Normals are of points within 3 spacings, cylinders have a radius of 2 spacings and reach as far as heights differ.
+
+    Args:
+        registration_m: one sigma of the systematic error.
+        vertical_m: what is taken from the later heights.
+    """
+    cells = np.floor(earlier.xyz[:, :2] / spacing_m).astype(np.int64)
+    _, first = np.unique(cells - cells.min(axis=0), axis=0, return_index=True)
+    cores = earlier.xyz[np.sort(first)]
+    moved = later.xyz - np.array([0, 0, vertical_m])
+    # About the middle, so that large coordinates cost no digits.
+    middle = cores.mean(axis=0).round()
+    normals = fit_normals(earlier.xyz - middle, cores - middle, 3 * spacing_m)
+    reach = max(10 * spacing_m, 1.0)
+    found = m3c2(
+        earlier.xyz - middle,
+        moved - middle,
+        cores - middle,
+        normals,
+        2 * spacing_m,
+        reach,
+        registration_m,
+        (earlier.sigma, later.sigma),
+        tick,
+    )
+    return Distances(cores, normals, found.distance_m, found.detection_m, found.counts, found.deviations_m)
+
+
+def write_distances(found: Distances, crs: CRS | None, path: Path) -> None:
+    """Write distances as a LAZ file with the names that CloudCompare gives them."""
+    laspy = require_laspy()
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = found.cores.mean(axis=0).round(), np.full(3, 0.001)
+    if crs is not None:
+        header.add_crs(crs)
+    values = {
+        "M3C2_distance": found.distance_m,
+        "uncertainty": found.detection_m,
+        "significant": found.significant,
+        "Npoints_cloud1": found.counts[:, 0],
+        "Npoints_cloud2": found.counts[:, 1],
+        "NormalX": found.normals[:, 0],
+        "NormalY": found.normals[:, 1],
+        "NormalZ": found.normals[:, 2],
+    }
+    for name in values:
+        header.add_extra_dim(laspy.ExtraBytesParams(name, np.float32))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = found.cores.T / _metres(crs)[:, None]
+    for name, value in values.items():
+        las[name] = value.astype(np.float32)
+    las.write(str(path))

@@ -1,0 +1,450 @@
+"""Errors of a difference: their size, their correlation over distance, and what both do to a volume.
+
+The error of a cell is sigma times a field of unit variance whose correlation falls with distance h as
+
+    rho(h) = sum_k s_k (1 - 3/2 (h / a_k) + 1/2 (h / a_k)^3)   for h < a_k, h > 0;  rho(0) = 1,
+
+spherical structures with sills s_k and ranges a_k; what is left, 1 - sum_k s_k, is the nugget, independent from cell to
+cell. A volume's variance is the sum of the covariances of all pairs of its cells, which is computed here for the region
+as it is. For regions much larger than the range that sum is what Anderson gives in closed form (2019, Uncertainty in
+quantifying geomorphic change, doi 10.1002/esp.4551), which `anderson_terms` has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+from numpy.fft import irfft2, rfft2
+from scipy.fft import next_fast_len
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+Z95 = 1.959963984540054
+"""A normal error is larger than this many of its deviations in 5% of cases."""
+NMAD = 1.4826
+"""Deviation of a normal distribution over its median absolute deviation."""
+_WINDOW = 512
+"""Rows and columns of the pieces that the variogram is computed from."""
+_BLOCKS = 512
+"""Rows and columns to which a region is reduced before its covariances are summed."""
+_BINS_PER_OCTAVE = 4
+_LEAST_PAIRS = 200
+_LEAST_PATCHES = 12
+_WORTH = 6.0
+"""A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
+_CLIP = 4.0
+"""Residuals are limited to this many deviations before they are squared: moved objects are no part of the noise."""
+_NEAR = 4
+"""Blocks closer than this have their correlation integrated."""
+_QUADRATURE = 48
+"""Steps along each side of the integral of rho over a pair of blocks."""
+
+
+@dataclass(frozen=True)
+class Variogram:
+    """The correlation of errors over distance, as shares of their variance.
+
+    Attributes:
+        sills: of the spherical structures; their sum is at most 1.
+        ranges_m: of the structures.
+        lags_m, semivariances, pairs: what was measured, over the variance.
+        reached: whether the semivariance levels off within the distances that were measured.
+    """
+
+    sills: tuple[float, ...]
+    ranges_m: tuple[float, ...]
+    lags_m: tuple[float, ...] = ()
+    semivariances: tuple[float, ...] = ()
+    pairs: tuple[float, ...] = ()
+    reached: bool = True
+
+    @property
+    def nugget(self) -> float:
+        return max(0.0, 1.0 - sum(self.sills))
+
+    @property
+    def range_m(self) -> float:
+        """The longest range; 0 without correlation."""
+        return max(self.ranges_m, default=0.0)
+
+    def degrees_of_freedom(self, area_m2: float) -> float:
+        """Of the variance of a large region's sum, if sills and ranges were measured on ground of this area.
+
+        A structure of range a has as many independent samples there as patches of pi a^2 / 5 fit in, less one for the
+        mean; structures are weighted by what they add to the variance of a sum (Satterthwaite 1946).
+        """
+        if not self.sills:
+            return math.inf
+        parts = [(s * a**2, max(1.0, 5 * area_m2 / (math.pi * a**2) - 1)) for s, a in self._structures()]
+        return sum(c for c, _ in parts) ** 2 / sum(c**2 / n for c, n in parts)
+
+    def _structures(self) -> list[tuple[float, float]]:
+        return list(zip(self.sills, self.ranges_m, strict=True))
+
+    def correlation(self, distance_m: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+        """Correlation at distances above 0; at 0 that of neighbours infinitely close, without the nugget."""
+        total = np.zeros(np.shape(distance_m))
+        for sill, reach in self._structures():
+            h = np.minimum(distance_m / reach, 1)
+            total += sill * (1 - 1.5 * h + 0.5 * h**3)
+        return total
+
+
+UNCORRELATED = Variogram((), ())
+
+
+def anderson_terms(
+    cells: int, cell_m: float, random_m: float, range_m: float, sill_m: float, systematic_m: float
+) -> tuple[float, float, float]:
+    """Anderson's three errors of a volume, as the U.S. Geological Survey codes them (jlogan-usgs/dem-differencing).
+
+        random      sqrt(n) L^2 s
+        correlated  0.79 a sqrt(n) L s_c
+        systematic  n L^2 s_s
+
+    Args:
+        cells: their number n.
+        cell_m: their side L.
+        random_m: deviation s of the part that is independent from cell to cell.
+        range_m: range a of a spherical variogram.
+        sill_m: deviation s_c of the correlated part, the root of the sill.
+        systematic_m: deviation s_s of the part that all cells have in common.
+
+    Returns:
+        The three deviations in cubic metres, one sigma each.
+    """
+    root = math.sqrt(cells)
+    return root * cell_m**2 * random_m, 0.79 * range_m * root * cell_m * sill_m, cells * cell_m**2 * systematic_m
+
+
+def nmad(values: Float[np.ndarray, " N"]) -> float:
+    """Robust deviation: 1.4826 times the median absolute deviation from the median (Hoehle and Hoehle 2009)."""
+    return NMAD * float(np.median(np.abs(values - np.median(values))))
+
+
+def deviation95(values: Float[np.ndarray, " N"]) -> float:
+    """The deviation that makes 5% of values significant: the 95% quantile of their size over 1.96.
+
+    Equal to the standard deviation where errors are normal, larger where they have long tails.
+    """
+    return float(np.quantile(np.abs(values), 0.95)) / Z95
+
+
+def p_values(z: Float32[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Two-sided p-values of normal deviates."""
+    return (2 * ndtr(-np.abs(z))).astype(np.float32)
+
+
+def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float) -> Variogram:
+    """Measure the variogram of residuals and fit a nugget and one or two spherical structures to it.
+
+    All pairs of cells in a piece of 512 x 512 are used, by Fourier transforms (Marcotte 1996, doi
+    10.1016/S0098-3004(96)00026-X); longer distances come from every second, fourth, ... cell.
+
+    Args:
+        residuals: over stable ground, without their mean; NaN elsewhere.
+    """
+    finite = np.isfinite(residuals)
+    if finite.sum() < 100:
+        return UNCORRELATED
+    scale = nmad(residuals[finite]) or float(residuals[finite].std())
+    if scale == 0:
+        return UNCORRELATED
+    sums: dict[int, np.ndarray] = {}
+    longest = 0.0
+    step = 1
+    while True:
+        thin = residuals[step // 2 :: step, step // 2 :: step]
+        for piece in _pieces(thin):
+            known = np.isfinite(piece)
+            if known.sum() < 100:
+                continue
+            values = np.where(known, np.clip(piece, -_CLIP * scale, _CLIP * scale), 0).astype(np.float64)
+            distance, gamma, pairs = _semivariances(values, known.astype(np.float64), cell_m * step)
+            longest = max(longest, float(distance[pairs > 0].max(initial=0)))
+            # Distances of few steps are taken from the finer grids only, where there are more pairs.
+            usable = (pairs > 0) & (distance > 0) & ((step == 1) | (distance > 8 * cell_m * step))
+            bins = np.floor(_BINS_PER_OCTAVE * np.log2(distance[usable] / cell_m) + 1e-9).astype(int)
+            for number in np.unique(bins):
+                at = bins == number
+                n = pairs[usable][at]
+                add = np.array([n.sum(), (n * gamma[usable][at]).sum(), (n * distance[usable][at]).sum()])
+                sums[int(number)] = sums.get(int(number), np.zeros(3)) + add
+        if max(thin.shape) <= _WINDOW:
+            break
+        step *= 2
+    table = np.array([sums[key] for key in sorted(sums) if sums[key][0] >= _LEAST_PAIRS])
+    # Pairs further apart than half of the longest distance are few and all of the same places.
+    table = table[table[:, 2] / table[:, 0] <= longest / 2] if len(table) else table
+    if len(table) < 4:
+        return UNCORRELATED
+    lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
+    return _with_patches(_fitted(lags, gammas, pairs), residuals / np.float32(residuals[finite].std()), cell_m)
+
+
+def _padded(rows: int, columns: int) -> tuple[int, int]:
+    """Size of a Fourier transform in which no offset of a raster comes round to another."""
+    return next_fast_len(2 * rows) or 2 * rows, next_fast_len(2 * columns) or 2 * columns
+
+
+def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Variogram:
+    """Add what the means of large patches scatter beyond what a variogram says, as a structure of twice their side.
+
+    A variogram hardly shows what is correlated over a good part of the stable ground, because its mean is taken out; it
+    is what the errors of volumes hang on. Means of disjoint patches show it (Rolstad et al. 2009, doi
+    10.3189/002214309789470950).
+    """
+    side = min(residuals.shape) // 3
+    while side >= 8:
+        rows, columns = residuals.shape[0] // side, residuals.shape[1] // side
+        blocks = residuals[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        counts = np.isfinite(blocks).sum(axis=(1, 3))
+        sums = np.where(np.isfinite(blocks), blocks, 0).clip(-_CLIP, _CLIP).sum(axis=(1, 3), dtype=np.float64)
+        full = counts > side**2 / 2
+        if full.sum() >= _LEAST_PATCHES:
+            break
+        side = side * 3 // 4
+    else:
+        return fitted
+    means = sums[full] / counts[full]
+    predicted = fitted.nugget / side**2 + mean_correlation(fitted, side * cell_m)
+    reach = 2 * side * cell_m
+    share = mean_correlation(Variogram((1.0,), (reach,)), side * cell_m)
+    sill = (float(np.mean(means**2)) - predicted) / share
+    if sill <= 0:
+        return fitted
+    whole = 1 + sill
+    ordered = sorted(zip((*fitted.ranges_m, reach), (*fitted.sills, sill), strict=True))
+    return replace(fitted, sills=tuple(s / whole for _, s in ordered), ranges_m=tuple(a for a, _ in ordered))
+
+
+def _pieces(values: np.ndarray) -> list[np.ndarray]:
+    """At most nine pieces of 512 x 512, spread over a raster."""
+
+    def starts(length: int) -> list[int]:
+        if length <= _WINDOW:
+            return [0]
+        return np.unique(np.linspace(0, length - _WINDOW, min(3, -(-length // _WINDOW))).astype(int)).tolist()
+
+    return [values[r : r + _WINDOW, c : c + _WINDOW] for r in starts(values.shape[0]) for c in starts(values.shape[1])]
+
+
+def _semivariances(values: np.ndarray, known: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, semivariance and number of pairs of every offset, half of the plane."""
+    rows, columns = values.shape
+    size = _padded(rows, columns)
+    z, m, z2 = (rfft2(x, size) for x in (values, known, values**2))
+    pairs = irfft2(np.abs(m) ** 2, size)
+    square = irfft2(z2 * np.conj(m) + m * np.conj(z2) - 2 * np.abs(z) ** 2, size)
+    r = np.fft.fftfreq(size[0], 1 / size[0])[:, None]
+    c = np.fft.fftfreq(size[1], 1 / size[1])[None]
+    half = (c > 0) | ((c == 0) & (r > 0))
+    count = np.rint(pairs[half])
+    gamma = np.divide(square[half], 2 * count, out=np.zeros(count.shape), where=count > 0)
+    return (cell_m * np.hypot(r, c))[half], np.maximum(gamma, 0), count
+
+
+def _fitted(lags: np.ndarray, gammas: np.ndarray, pairs: np.ndarray) -> Variogram:
+    """Fit one and two structures, and keep the second where it explains more."""
+    # Bins at long distances have most pairs, but those at short ones decide: every bin counts alike once it has many.
+    weight = np.sqrt(pairs / (pairs + pairs.max() * 1e-3))
+    variance = float(np.median(gammas[len(gammas) // 2 :]))
+    best: tuple[float, np.ndarray] | None = None
+    for structures in (1, 2):
+        found = _least_squares(lags, gammas, weight, variance, structures)
+        cost = float((weight**2 * (_model(found, lags) - gammas) ** 2).sum())
+        criterion = len(lags) * math.log(cost + 1e-12 * variance**2) + 2 * len(found)  # Akaike
+        if best is None or criterion < best[0] + _WORTH:
+            best = criterion, found
+    assert best is not None
+    nugget, *rest = best[1]
+    sills, ranges = np.array(rest[::2]), np.array(rest[1::2])
+    total = float(nugget + sills.sum())
+    order = [k for k in np.argsort(ranges) if sills[k] > 1e-3 * total]
+    return Variogram(
+        tuple(float(sills[k] / total) for k in order),
+        tuple(float(ranges[k]) for k in order),
+        tuple(lags.tolist()),
+        tuple((gammas / total).tolist()),
+        tuple(pairs.tolist()),
+        reached=bool(not order or ranges[order[-1]] < 0.9 * lags[-1]),
+    )
+
+
+def _model(parameters: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    nugget, *rest = parameters
+    gamma = np.full(lags.shape, nugget)
+    for sill, reach in zip(rest[::2], rest[1::2], strict=True):
+        h = np.minimum(lags / reach, 1)
+        gamma += sill * (1.5 * h - 0.5 * h**3)
+    return gamma
+
+
+def _least_squares(
+    lags: np.ndarray, gammas: np.ndarray, weight: np.ndarray, variance: float, structures: int
+) -> np.ndarray:
+    """Nugget, then sill and range of each structure."""
+    best = None
+    spread = np.geomspace(lags[0] * 1.5, lags[-1], 5)
+    starts = [(one,) for one in spread] if structures == 1 else [(a, b) for a in spread for b in spread if a < b]
+    low = [0.0] + [0.0, lags[0]] * structures
+    high = [np.inf] + [np.inf, 2 * lags[-1]] * structures
+    for ranges in starts:
+        start = [0.3 * variance]
+        for reach in ranges:
+            start += [0.7 * variance / structures, reach]
+        found = least_squares(
+            lambda x: weight * (_model(x, lags) - gammas) / variance,
+            start,
+            bounds=(low, high),
+            x_scale=[variance] + [variance, lags[-1] / 4] * structures,
+        )
+        if best is None or found.cost < best.cost:
+            best = found
+    assert best is not None
+    return best.x
+
+
+def mean_correlation(variogram: Variogram, side_m: float) -> float:
+    """Mean correlation of all pairs of points in a square, without the nugget."""
+    return float(_block_correlation(variogram, side_m, np.zeros(1), np.zeros(1))[0])
+
+
+def _block_correlation(variogram: Variogram, side_m: float, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """Mean correlation between the points of two squares, whose centres are dx and dy apart."""
+    # The difference of two uniform positions has a triangular density.
+    u = (np.arange(2 * _QUADRATURE) + 0.5) / _QUADRATURE - 1
+    tent = (1 - np.abs(u)) / _QUADRATURE
+    total = np.zeros(np.shape(dx))
+    for uy, wy in zip(u, tent, strict=True):
+        far = np.hypot(dx[..., None] + side_m * u, dy[..., None] + side_m * uy)
+        total += wy * (variogram.correlation(far) @ tent)
+    return total
+
+
+@dataclass(frozen=True)
+class RegionError:
+    """Deviations of a sum over cells, one sigma.
+
+    Attributes:
+        random: of the part that is independent from cell to cell.
+        correlated: of the part that neighbours share.
+    """
+
+    random: float
+    correlated: float
+
+    @property
+    def total(self) -> float:
+        return math.hypot(self.random, self.correlated)
+
+
+def region_error(
+    sigma: Float32[np.ndarray, "rows columns"] | float,
+    region: Bool[np.ndarray, "rows columns"],
+    variogram: Variogram,
+    cell_m: float,
+) -> RegionError:
+    """Deviation of the sum of errors over a region, from the covariances of all its pairs of cells.
+
+    Args:
+        sigma: deviation of each cell, or of all.
+        region: the cells that are summed.
+    """
+    rows = np.flatnonzero(region.any(axis=1))
+    if len(rows) == 0:
+        return RegionError(0.0, 0.0)
+    columns = np.flatnonzero(region.any(axis=0))
+    box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    region = region[box]
+    step = -(-max(region.shape) // _BLOCKS)
+    if not isinstance(sigma, np.ndarray):
+        blocks = _block_sums(region, step) * sigma
+        squares = float(region.sum()) * sigma**2
+    else:
+        inside = sigma[box]
+        blocks, squares = np.zeros((-(-region.shape[0] // step), -(-region.shape[1] // step))), 0.0
+        for k in range(blocks.shape[0]):
+            part = np.where(region[k * step : (k + 1) * step], inside[k * step : (k + 1) * step], np.float32(0))
+            blocks[k] = _block_sums(part, step)[0]
+            squares += float(np.square(part, dtype=np.float64).sum())
+    random = math.sqrt(variogram.nugget * squares)
+    return RegionError(random, math.sqrt(max(0.0, _pair_sum(blocks, variogram, step * cell_m))))
+
+
+def pair_covariance(
+    region: Bool[np.ndarray, "rows columns"],
+    terms: Sequence[tuple[np.ndarray, np.ndarray]],
+    sigma: Float32[np.ndarray, "rows columns"] | float,
+    variogram: Variogram,
+    cell_m: float,
+) -> tuple[Float64[np.ndarray, "terms terms"], Float64[np.ndarray, "terms terms"]]:
+    """X^T X and X^T C X over a region, for C the covariance of the errors and X columns that are a product each.
+
+    (X^T X)^-1 X^T C X (X^T X)^-1 is the covariance of a least-squares fit of the columns.
+
+    Args:
+        terms: of each column of X, its factor of the rows and of the columns of the raster.
+    """
+    step = -(-max(region.shape) // _BLOCKS)
+    starts = np.arange(0, region.shape[0], step)
+    squares = np.zeros((len(terms), len(terms)))
+    normal = np.zeros_like(squares)
+    wide = -(-region.shape[1] // step)
+    blocks = np.zeros((len(terms), len(starts), wide))
+    for k, first in enumerate(starts):
+        rows = slice(first, first + step)
+        inside = region[rows]
+        if not inside.any():
+            continue
+        s = sigma[rows] if isinstance(sigma, np.ndarray) else sigma
+        columns = [down[rows, None] * across[None] * inside for down, across in terms]
+        scaled = [np.where(inside, column * s, 0) for column in columns]
+        for i, column in enumerate(columns):
+            blocks[i, k] = _block_sums(scaled[i], step)[0]
+            for j, other in enumerate(columns):
+                normal[i, j] += float((column * other).sum())
+                squares[i, j] += float((scaled[i] * scaled[j]).sum())
+    middle = variogram.nugget * squares
+    for i in range(len(terms)):
+        for j in range(len(terms)):
+            middle[i, j] += _pair_sum(blocks[i], variogram, step * cell_m, blocks[j])
+    return normal, middle
+
+
+def _block_sums(values: np.ndarray, step: int) -> Float64[np.ndarray, "rows columns"]:
+    """Sums over blocks of step x step cells."""
+    if step == 1:
+        return values.astype(np.float64)
+    down = np.add.reduceat(values, np.arange(0, values.shape[0], step), axis=0, dtype=np.float64)
+    return np.add.reduceat(down, np.arange(0, values.shape[1], step), axis=1)
+
+
+def _pair_sum(blocks: np.ndarray, variogram: Variogram, side_m: float, others: np.ndarray | None = None) -> float:
+    """Sum over all pairs of a block and one of the others, of their product times their mean correlation."""
+    if not variogram.sills:
+        return 0.0
+    rows, columns = blocks.shape
+    size = _padded(rows, columns)
+    spectrum = rfft2(blocks, size)
+    products = irfft2(np.conj(spectrum) * (spectrum if others is None else rfft2(others, size)), size)
+    r = np.abs(np.fft.fftfreq(size[0], 1 / size[0]))[:, None] * side_m
+    c = np.abs(np.fft.fftfreq(size[1], 1 / size[1]))[None] * side_m
+    correlation = variogram.correlation(np.hypot(r, c))
+    near = _near_correlation(variogram, side_m)
+    for i in range(min(_NEAR, rows)):
+        for j in range(min(_NEAR, columns)):
+            correlation[[i, i, -i, -i], [j, -j, j, -j]] = near[i, j]
+    return float((products * correlation).sum())
+
+
+@lru_cache(maxsize=64)
+def _near_correlation(variogram: Variogram, side_m: float) -> np.ndarray:
+    """Mean correlation between near blocks, in which it bends, by their offset in rows and columns."""
+    rows, columns = np.indices((_NEAR, _NEAR))
+    return _block_correlation(variogram, side_m, columns * side_m, rows * side_m)

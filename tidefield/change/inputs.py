@@ -1,0 +1,109 @@
+"""Find what a survey has: a surface, its standard errors, an orthophoto and a cloud, in a folder or as a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, write_surface
+from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface
+
+SURFACES = ("odm_dem/dsm.tif", "odm_dem/dtm.tif", "dsm.tif", "dtm.tif")
+ORTHOPHOTOS = ("odm_orthophoto/odm_orthophoto.tif", "orthophoto.tif", "ortho.tif")
+CLOUDS = tuple(
+    f"{folder}{name}.{ending}"
+    for folder, name in (("odm_georeferencing/", "odm_georeferenced_model"), ("", "cloud"))
+    for ending in ("laz", "las")
+)
+
+
+def open_survey(path: Path, date: str | None = None) -> Surface:
+    """Open a survey: a GeoTIFF of heights, or a folder of `tidefield map` or ODM.
+
+    Args:
+        date: of the survey, YYYY-MM-DD; None takes it from its files or their names.
+
+    Raises:
+        ChangeError: there is no surface.
+    """
+    if is_cloud(path):
+        raise ChangeError(f"{path} is a point cloud: expected a surface; compare it with another cloud")
+    if not path.is_dir():
+        return open_surface(path, date)
+    surface = first_of(path, SURFACES)
+    if surface is None:
+        raise ChangeError(
+            f"{path} has no surface: expected one of {', '.join(SURFACES)}, as `tidefield map` and ODM write them; "
+            "name a GeoTIFF of heights"
+        )
+    found = open_surface(surface, date)
+    return replace(found, orthophoto=first_of(path, ORTHOPHOTOS), cloud=first_of(path, CLOUDS))
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file is named as a point cloud."""
+    return path.suffix.lower() in (".las", ".laz") and not path.is_dir()
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two surveys, opened.
+
+    Attributes:
+        clouds: of both, in the earlier one's system; None where they are not compared as clouds.
+    """
+
+    earlier: Surface
+    later: Surface
+    clouds: tuple[Cloud, Cloud] | None
+
+
+def open_pair(
+    earlier: Path,
+    later: Path,
+    work: Path,
+    dates: tuple[str | None, str | None] = (None, None),
+    cell_m: float | None = None,
+    with_clouds: bool = False,
+) -> Pair:
+    """Open two surveys; of point clouds surfaces are made, the mean height of the points in each cell.
+
+    Args:
+        work: folder for the surfaces of clouds.
+        cell_m: of these; ten points to a cell if None.
+        with_clouds: read the clouds of folders, too.
+
+    Raises:
+        ChangeError: one has no surface, only one is a cloud, or folders have no clouds.
+    """
+    if is_cloud(earlier) != is_cloud(later):
+        cloud = earlier if is_cloud(earlier) else later
+        raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
+    if not is_cloud(earlier):
+        surveys = [open_survey(path, date) for path, date in zip((earlier, later), dates, strict=True)]
+        clouds = None
+        if with_clouds:
+            paths = [survey.cloud for survey in surveys]
+            if paths[0] is None or paths[1] is None:
+                raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
+            clouds = _both(paths[0], paths[1])
+        return Pair(surveys[0], surveys[1], clouds)
+    clouds = _both(earlier, later)
+    cell = cell_m or max(default_cell(cloud) for cloud in clouds)
+    surfaces = []
+    for name, cloud, date in zip(("earlier", "later"), clouds, dates, strict=True):
+        path = work / f"{name}.tif"
+        write_surface(cloud, cell, path)
+        opened = open_surface(path, date or date_in(cloud.path.stem))
+        surfaces.append(replace(opened, source=cloud.path.name, remarks=[]))
+    return Pair(surfaces[0], surfaces[1], clouds)
+
+
+def _both(earlier: Path, later: Path) -> tuple[Cloud, Cloud]:
+    first = read_cloud(earlier)
+    return first, in_system(read_cloud(later), first)
+
+
+def first_of(folder: Path, names: tuple[str, ...]) -> Path | None:
+    """The first of some files that a folder has."""
+    return next((folder / name for name in names if (folder / name).is_file()), None)

@@ -1,0 +1,438 @@
+"""Measure the change between two surveys: difference, errors, outlines and volumes.
+
+The error of a cell's dz has a part of its own, whose size and correlation are measured over stable ground, and a part
+that all cells share, which is what co-registration leaves. Stable ground is given as polygons; else it is what is left
+when all that changed is outlined, in turns, until both agree.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from tidefield.change.choice import repeat_choice
+from tidefield.change.errors import Z95, Variogram, deviation95, fit_variogram, nmad
+from tidefield.change.outlines import WINDOWS, Outlines, find_outlines
+from tidefield.change.regions import Region, rasterised
+from tidefield.change.registration import (
+    LEAST_STABLE,
+    Model,
+    Registration,
+    centre,
+    covariance,
+    fit,
+    statistics,
+)
+from tidefield.change.shift import Shift, find_shift
+from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid
+from tidefield.change.volumes import ErrorModel, Volume
+
+log = logging.getLogger(__name__)
+
+Register = Literal["auto", "none", "vertical", "tilt"]
+_TURNS = 4
+_STANDS_OUT = 3.0
+"""Deviations of a window's mean."""
+_MOST_SAMPLED = 2_000_000
+"""Cells that quantiles are computed from."""
+_NMAD_CELLS = 1000
+"""With fewer cells of stable ground their 95% quantile is uncertain, and the NMAD is used if it is larger."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How two surveys are compared.
+
+    Attributes:
+        cell_m: side of the cells; the coarsest of the surveys' pixels if None.
+        register: what is subtracted from the later survey; auto is vertical.
+        shift: horizontally, from the orthophotos: where they tell it; not at all; or refused where they do not.
+        datum_error_m: one sigma of the error that all cells share, as the user knows it.
+        windows: cells along each side of the windows in which change is tested.
+    """
+
+    cell_m: float | None = None
+    register: Register = "auto"
+    shift: Literal["auto", "none", "images"] = "auto"
+    datum_error_m: float | None = None
+    windows: tuple[int, ...] = WINDOWS
+
+
+@dataclass(frozen=True)
+class Change:
+    """What changed between two surveys.
+
+    Attributes:
+        dz: later minus earlier height after co-registration, metres; NaN where one of them is unknown.
+        errors: of dz.
+        stable: cells that co-registration and errors were measured on.
+        stable_given: whether the user named them.
+        false_alarms: share of stable cells that are significant by themselves: the null test.
+        net: of all cells, without a threshold.
+        cut, fill: in the outlines; both positive.
+        per_region: net, cut and fill in each of the user's polygons.
+    """
+
+    earlier: Surface
+    later: Surface
+    grid: Grid
+    dz: Float32[np.ndarray, "rows columns"]
+    errors: ErrorModel
+    stable: Bool[np.ndarray, "rows columns"]
+    stable_given: bool
+    outlines: Outlines
+    false_alarms: float
+    net: Volume
+    cut: Volume
+    fill: Volume
+    outside: Volume
+    each: list[tuple[int, Volume, float]]
+    per_region: list[tuple[Region, Volume, Volume, Volume]]
+    threshold_cut_m3: float
+    threshold_fill_m3: float
+    detection_m: tuple[float, float, float]
+    remarks: list[str] = field(default_factory=list)
+
+
+def read_difference(
+    earlier: Surface,
+    later: Surface,
+    grid: Grid,
+    shift_m: tuple[float, float] = (0.0, 0.0),
+    tick: Callable[[int, int], Any] | None = None,
+) -> tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"] | None]:
+    """Later minus earlier heights on a grid, and one sigma of it where both surveys have one of theirs."""
+    dz = np.empty(grid.shape, np.float32)
+    sigma = np.empty(grid.shape, np.float32) if earlier.sigma is not None and later.sigma is not None else None
+    for surface, sign in ((earlier, -1), (later, 1)):
+        moved = shift_m if sign > 0 else (0.0, 0.0)
+        with surface.on_grid(grid, moved) as read:
+            for rows in grid.strips():
+                heights = read(rows.start, rows.stop)
+                dz[rows] = -heights if sign < 0 else dz[rows] + heights
+                if tick is not None:
+                    tick(rows.stop + (grid.rows if sign > 0 else 0), 2 * grid.rows)
+        if sigma is not None:
+            assert surface.sigma is not None
+            from tidefield.change.surfaces import open_surface
+
+            raster = open_surface(surface.sigma)
+            with raster.on_grid(grid, moved) as read:
+                for rows in grid.strips():
+                    own = read(rows.start, rows.stop) * np.float32(surface.metres)
+                    own[~(own > 0)] = np.nan
+                    sigma[rows] = own if sign < 0 else np.hypot(sigma[rows], own)
+    if sigma is not None:
+        dz[~np.isfinite(sigma)] = np.nan
+        sigma[~np.isfinite(dz)] = np.nan
+    return dz, sigma
+
+
+def measure(
+    earlier: Surface,
+    later: Surface,
+    options: Options | None = None,
+    *,
+    stable: Callable[[Grid], list[Region]] | None = None,
+    within: Callable[[Grid], list[Region]] | None = None,
+    regions: Callable[[Grid], list[Region]] | None = None,
+    tick: Callable[[int, int], Any] | None = None,
+) -> Change:
+    """Measure the change between two surveys.
+
+    Args:
+        stable: reads the polygons of stable ground; if None, stable ground is found.
+        within: reads the polygons that the comparison is limited to.
+        regions: reads polygons whose volumes are given one by one.
+
+    Raises:
+        ChangeError: the surveys do not overlap, or have too little stable ground.
+    """
+    options = options or Options()
+    grid = common_grid([earlier, later], options.cell_m)
+    remarks = [*earlier.remarks, *later.remarks]
+    shift = _shift(earlier, later, grid, options, remarks)
+    moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
+    dz, own = read_difference(earlier, later, grid, moved, tick=tick)
+    if (earlier.sigma is None) != (later.sigma is None):
+        remarks.append("only one survey has standard errors of its cells; they are not used")
+    given = rasterised(stable(grid), grid) if stable is not None else None
+    if given is not None:
+        given &= np.isfinite(dz)
+    if within is not None:
+        # Stable ground may lie outside of what is asked about.
+        area = rasterised(within(grid), grid)
+        dz[~(area | given) if given is not None else ~area] = np.nan
+    else:
+        area = None
+    known = int(np.isfinite(dz).sum())
+    if known < LEAST_STABLE:
+        raise ChangeError(
+            f"{earlier.path.name} and {later.path.name} both have heights in {known} cells: expected at least "
+            f"{LEAST_STABLE}; check their nodata and their places"
+        )
+    model: Model = "vertical" if options.register == "auto" else options.register
+    settled = _settle(dz, own, grid, given, model, options)
+    registration, variogram, sigma, ground = settled
+    if shift is not None and shift.known:
+        registration = replace(registration, shift_m=moved, shift_error_m=shift.error_m, words=[shift.words()])
+        sigma = _with_slopes(sigma, earlier, grid, shift.error_m)
+    for rows in grid.strips():
+        dz[rows] -= registration.plane(grid, rows)
+    degrees = variogram.degrees_of_freedom(float(ground.sum()) * grid.cell_area_m2)
+    errors = ErrorModel(sigma, variogram, registration, grid, degrees)
+    alarms = _false_alarms(dz, errors, ground)
+    if area is not None:
+        dz[~area] = np.nan
+    if not variogram.reached:
+        remarks.append(
+            "errors are correlated over longer distances than stable ground can show: intervals may be too narrow"
+        )
+    if given is None:
+        remarks.append(
+            f"stable ground was found, not given: {100 * ground.sum() / max(known, 1):.0f}% of the cells, where no "
+            "change stands out; a shift of all ground cannot be told from a change of all ground"
+        )
+    outlines = find_outlines(dz, sigma, registration.systematic_m, variogram, grid.cell_m, options.windows)
+    return _summed(earlier, later, dz, errors, ground, given is not None, outlines, alarms, regions, remarks)
+
+
+def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remarks: list[str]) -> Shift | None:
+    """The horizontal shift that the orthophotos tell, if it is asked for and there are any.
+
+    Raises:
+        ChangeError: it must be known, and is not.
+    """
+    if options.shift == "none" or (options.shift == "auto" and options.register == "none"):
+        return None
+    if earlier.orthophoto is None or later.orthophoto is None:
+        if options.shift == "images":
+            raise ChangeError(
+                "--shift images was given, but one survey has no orthophoto: expected two; name them (--orthophotos)"
+            )
+        return None
+    shift = find_shift(earlier.orthophoto, later.orthophoto, grid)
+    if not shift.known:
+        if options.shift == "images":
+            raise ChangeError(f"{shift.words()}: expected at least a quarter; give control, or leave --shift out")
+        remarks.append(shift.words())
+    return shift
+
+
+def _with_slopes(
+    sigma: Float32[np.ndarray, "rows columns"] | float, earlier: Surface, grid: Grid, error_m: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Standard errors with what an error of the horizontal shift does to heights on slopes."""
+    out = np.empty(grid.shape, np.float32)
+    with earlier.on_grid(grid) as read:
+        for rows in grid.strips():
+            heights = read(max(0, rows.start - 1), min(grid.rows, rows.stop + 1))
+            north, east = np.gradient(heights, grid.cell_m)
+            inner = slice(rows.start - max(0, rows.start - 1), None)
+            slope = np.nan_to_num(np.hypot(north, east)[inner][: rows.stop - rows.start])
+            own = sigma[rows] if isinstance(sigma, np.ndarray) else np.float32(sigma)
+            out[rows] = np.hypot(own, slope * np.float32(error_m))
+    return out
+
+
+def _settle(
+    dz: Float32[np.ndarray, "rows columns"],
+    own: Float32[np.ndarray, "rows columns"] | None,
+    grid: Grid,
+    given: Bool[np.ndarray, "rows columns"] | None,
+    model: Model,
+    options: Options,
+) -> tuple[Registration, Variogram, Float32[np.ndarray, "rows columns"] | float, Bool[np.ndarray, "rows columns"]]:
+    """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given."""
+    ground = guess = _unchanged(dz, own) if given is None else given
+    turns = _TURNS if given is None else 1
+    found = None
+    for turn in range(turns):
+        cells = int(ground.sum())
+        if cells < LEAST_STABLE:
+            raise ChangeError(
+                f"the surveys have {cells} cells of stable ground: expected at least {LEAST_STABLE} to measure shift "
+                "and errors on; give polygons of ground that did not change (--stable)"
+            )
+        coefficients = fit(dz, ground, grid, model)
+        before = statistics(_sampled(dz, ground))
+        bare = Registration(model, coefficients, np.zeros((3, 3)), centre(grid), cells, before, before)
+        # Residuals over stable ground only: everything else is NaN.
+        residual = np.full(grid.shape, np.nan, np.float32)
+        for rows in grid.strips():
+            inside = ground[rows]
+            residual[rows][inside] = (dz[rows] - bare.plane(grid, rows))[inside]
+        left = float(np.nanmedian(_sampled(residual, ground)))
+        after = statistics(_sampled(residual, ground))
+        scaled = residual if own is None else residual / own
+        values = _sampled(scaled, ground)
+        values = values - np.median(values)
+        size = deviation95(values)
+        if len(values) < _NMAD_CELLS:
+            size = max(size, nmad(values))
+        if size == 0:
+            size = 1e-6
+        sigma = size if own is None else own * np.float32(size)
+        normal = (scaled - np.float32(np.median(_sampled(scaled, ground)))) / np.float32(size)
+        variogram = fit_variogram(normal, grid.cell_m)
+        found = Registration(
+            model,
+            coefficients,
+            covariance(model, ground, sigma, variogram, grid, left, options.datum_error_m),
+            centre(grid),
+            cells,
+            before,
+            after,
+        )
+        if given is not None or turn == turns - 1:
+            return found, variogram, sigma, ground
+        moved = np.empty_like(dz)
+        for rows in grid.strips():
+            moved[rows] = dz[rows] - found.plane(grid, rows)
+        outlines = find_outlines(moved, sigma, found.systematic_m, variogram, grid.cell_m, options.windows)
+        ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
+    raise AssertionError("the last turn returns")
+
+
+def _unchanged(
+    dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None
+) -> Bool[np.ndarray, "rows columns"]:
+    """Ground where no window's mean stands out from what most windows have in common, as a first guess."""
+    known = np.isfinite(dz)
+    ground = known
+    for window in (5, 11):
+        share = uniform_filter(known.astype(np.float32), window, mode="constant")
+        scaled = np.where(known, dz if own is None else dz / own, np.float32(0))
+        mean = uniform_filter(scaled, window, mode="constant") / np.maximum(share, np.float32(1e-6))
+        middle, spread = 0.0, math.inf
+        for _ in range(_TURNS):
+            some = _sampled(mean, ground)
+            middle, spread = float(np.median(some)), nmad(some)
+            ground = known & (np.abs(mean - middle) <= _STANDS_OUT * spread)
+    return ground
+
+
+def dilated(region: Bool[np.ndarray, "rows columns"], cells: int) -> Bool[np.ndarray, "rows columns"]:
+    """A region with a margin of this many cells, a square around each."""
+    if cells == 0:
+        return region
+    return np.asarray(maximum_filter(region.view(np.uint8), 2 * cells + 1, mode="constant"), np.uint8).view(bool)
+
+
+def _false_alarms(
+    dz: Float32[np.ndarray, "rows columns"], errors: ErrorModel, ground: Bool[np.ndarray, "rows columns"]
+) -> float:
+    """Share of stable cells that are significant by themselves."""
+    alarms = 0
+    for rows in errors.grid.strips():
+        alarms += int((np.abs(dz[rows]) > Z95 * errors.cell_sigma(rows)).sum(where=ground[rows]))
+    return alarms / int(ground.sum())
+
+
+def _sampled(values: Float32[np.ndarray, "rows columns"], region: Bool[np.ndarray, "rows columns"]) -> np.ndarray:
+    """Values in a region; of a large one every second, third, ... in both directions."""
+    step = 1 + math.isqrt(max(0, int(region.sum()) - 1) // _MOST_SAMPLED)
+    return values[::step, ::step][region[::step, ::step]]
+
+
+def _summed(
+    earlier: Surface,
+    later: Surface,
+    dz: Float32[np.ndarray, "rows columns"],
+    errors: ErrorModel,
+    ground: Bool[np.ndarray, "rows columns"],
+    stable_given: bool,
+    outlines: Outlines,
+    alarms: float,
+    regions: Callable[[Grid], list[Region]] | None,
+    remarks: list[str],
+) -> Change:
+    """The volumes of a difference."""
+    grid, known = errors.grid, np.isfinite(dz)
+    beyond, detection = np.zeros(2), []
+    for rows in grid.strips():
+        sigma = errors.cell_sigma(rows)
+        significant = np.abs(dz[rows]) > Z95 * sigma
+        beyond[0] -= float(dz[rows].sum(where=significant & (dz[rows] < 0), dtype=np.float64))
+        beyond[1] += float(dz[rows].sum(where=significant & (dz[rows] > 0), dtype=np.float64))
+        detection.append(sigma[known[rows]][:: max(1, grid.columns * grid.rows // _MOST_SAMPLED)])
+    low, middle, high = (Z95 * np.quantile(np.concatenate(detection), (0.05, 0.5, 0.95))).tolist()
+    lower, higher = outlines.cells(-1), outlines.cells(1)
+    cut, fill = errors.volume(dz, lower, -1.0), errors.volume(dz, higher)
+    if len(outlines.signs):
+        systematic = errors.registration.systematic_m
+        of_lower, of_higher = repeat_choice(dz, errors.sigma, systematic, errors.variogram, grid.cell_m, outlines)
+        area = grid.cell_area_m2
+        cut = cut.chosen(-of_lower.bias * area, of_lower.deviation * area)
+        fill = fill.chosen(of_higher.bias * area, of_higher.deviation * area)
+    each = []
+    for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
+        each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
+    per_region = []
+    for region in regions(grid) if regions is not None else []:
+        inside = region.cells(grid) & known
+        if not inside.any():
+            remarks.append(f"polygon {region.name}: no cell of both surveys is in it")
+            continue
+        per_region.append(
+            (
+                region,
+                errors.volume(dz, inside),
+                errors.volume(dz, inside & lower, -1.0),
+                errors.volume(dz, inside & higher),
+            )
+        )
+    return Change(
+        earlier,
+        later,
+        grid,
+        dz,
+        errors,
+        ground,
+        stable_given,
+        outlines,
+        alarms,
+        errors.volume(dz, known),
+        cut,
+        fill,
+        errors.volume(dz, known & ~lower & ~higher),
+        each,
+        per_region,
+        float(beyond[0]) * grid.cell_area_m2,
+        float(beyond[1]) * grid.cell_area_m2,
+        (low, middle, high),
+        remarks,
+    )
+
+
+def _in_box(
+    dz: np.ndarray, errors: ErrorModel, labels: np.ndarray, number: int, box: tuple[slice, slice], sign: int
+) -> tuple[Volume, float]:
+    """Volume of one outline as a positive number, and its largest |dz|."""
+    from tidefield.change.errors import region_error
+
+    inside = labels[box] == number
+    values = dz[box][inside].astype(np.float64)
+    sigma = errors.sigma[box] if isinstance(errors.sigma, np.ndarray) else errors.sigma
+    own = region_error(sigma, inside, errors.variogram, errors.grid.cell_m)
+    area = errors.grid.cell_area_m2
+    x, y = (axis.start for axis in box[::-1])
+    middle = errors.registration.deviation(errors.grid, slice(y, y + 1))[0, min(x, errors.grid.columns - 1)]
+    return (
+        Volume(
+            sign * float(values.sum()) * area,
+            own.random * area,
+            own.correlated * area,
+            float(middle) * len(values) * area,
+            len(values) * area,
+            degrees_of_freedom=errors.degrees_of_freedom,
+        ),
+        float(np.abs(values).max()),
+    )

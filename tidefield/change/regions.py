@@ -1,0 +1,102 @@
+"""Regions of a user: polygons and lines of GeoJSON, GeoPackage or shapefiles, on a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import shapely
+from jaxtyping import Bool
+from pyproj import CRS, Transformer
+from shapely.geometry.base import BaseGeometry
+
+from tidefield.change.surfaces import ChangeError, Grid, require_rasterio
+
+_MOST_REGIONS = 10_000
+_LARGEST_FILE = 1 << 28
+_NAMES = ("name", "id", "label", "title", "location", "tr_id")
+
+
+@dataclass(frozen=True)
+class Region:
+    """A named geometry in a grid's system."""
+
+    name: str
+    geometry: BaseGeometry
+
+    def cells(self, grid: Grid) -> Bool[np.ndarray, "rows columns"]:
+        """Cells whose centres are in a polygon, or that a line touches."""
+        return rasterised([self], grid)
+
+
+def rasterised(regions: list[Region], grid: Grid) -> Bool[np.ndarray, "rows columns"]:
+    """Cells that are in any of the regions."""
+    require_rasterio()
+    from rasterio.features import rasterize
+
+    shapes = [region.geometry for region in regions]
+    lines = [shape for shape in shapes if shape.geom_type.endswith(("LineString", "Point"))]
+    areas = [shape for shape in shapes if not shape.geom_type.endswith(("LineString", "Point"))]
+    cells = np.zeros(grid.shape, np.uint8)
+    for some, touched in ((areas, False), (lines, True)):
+        if some:
+            rasterize(some, out=cells, transform=grid.transform, default_value=1, all_touched=touched)
+    return cells.view(bool)
+
+
+def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
+    return np.stack(to.transform(points[:, 0], points[:, 1]), axis=1)
+
+
+def read_regions(path: Path, grid: Grid) -> list[Region]:
+    """Read all geometries of a file's first layer, in the grid's system.
+
+    Raises:
+        ChangeError: it cannot be read, is empty or too large, or has no geometry on the grid.
+    """
+    try:
+        from pyogrio import raw, read_info
+        from pyogrio.errors import DataLayerError, DataSourceError
+    except ImportError as error:
+        raise ChangeError(
+            "pyogrio is not installed: polygons are read with it; install it with `pip install 'tidefield[maps]'`"
+        ) from error
+    expected = "expected polygons as GeoJSON, GeoPackage or shapefile; name another file"
+    if not path.is_file():
+        raise ChangeError(f"{path} is not a file: {expected}")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise ChangeError(
+            f"{path} has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}: {expected}"
+        )
+    try:
+        about = read_info(path)
+        meta, _, shapes, columns = raw.read(path, max_features=_MOST_REGIONS + 1, force_2d=True)
+        geometries = shapely.from_wkb(shapes)
+    except (DataSourceError, DataLayerError, ValueError, shapely.errors.ShapelyError) as error:
+        raise ChangeError(f"{path} cannot be read as polygons ({error}): {expected}") from error
+    if len(geometries) > _MOST_REGIONS:
+        raise ChangeError(f"{path} has more than {_MOST_REGIONS} features: {expected}")
+    fields = [str(name) for name in meta["fields"]]
+    chosen = next((k for name in _NAMES for k, f in enumerate(fields) if f.lower() == name), None)
+    crs = CRS(about["crs"]) if about["crs"] else None
+    to = None
+    if crs is not None and grid.crs is not None:
+        to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
+    frame = shapely.box(*grid.bounds)
+    found = []
+    for k, geometry in enumerate(geometries):
+        if geometry is None or geometry.is_empty:
+            continue
+        if to is not None:
+            geometry = shapely.transform(geometry, partial(_converted, to))
+        if not np.isfinite(geometry.bounds).all():
+            raise ChangeError(f"{path} has a geometry at no place of the surveys' system: {expected}")
+        name = str(columns[chosen][k]) if chosen is not None else str(k + 1)
+        found.append(Region(name, shapely.make_valid(geometry)))
+    if not any(region.geometry.intersects(frame) for region in found):
+        raise ChangeError(
+            f"nothing in {path} is where both surveys are: expected polygons there; check its coordinates"
+        )
+    return found

@@ -1,0 +1,463 @@
+"""Read surfaces: GeoTIFFs with whatever grid, extent, nodata and coordinate system they have, on one common grid."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float32
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from tidefield.errors import TidefieldError
+from tidefield.files import reading_from
+from tidefield.geometry.geodesy import utm_zone
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from affine import Affine
+
+STRIP_CELLS = 1 << 22
+"""Cells read at once."""
+MOST_CELLS = 400_000_000
+"""Of a common grid: what fits into 16 GB."""
+_SAMPLE = 1000
+"""Rows and columns that are read of a large surface to see what its values are."""
+_SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
+"""Values that programs write where they know no height; some do not declare them."""
+_IMPOSSIBLE_M = 20_000.0
+"""No height on Earth is further from zero."""
+_ZERO_SHARE = 0.01
+"""Exact zeros in more cells than this are no heights if the others are all far from zero."""
+Read = Callable[[int, int], Float32[np.ndarray, "rows columns"]]
+
+
+class ChangeError(TidefieldError):
+    """Surveys cannot be compared, or not as asked."""
+
+
+def require_rasterio() -> ModuleType:
+    """Import rasterio.
+
+    Raises:
+        ChangeError: it is not installed.
+    """
+    try:
+        import rasterio
+    except ImportError as error:
+        raise ChangeError(
+            "rasterio is not installed: surfaces are read with it; install it with `pip install 'tidefield[maps]'`"
+        ) from error
+    return rasterio
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square cells of a map, row 0 in the north.
+
+    Attributes:
+        crs: as WKT; None where surfaces have none and lengths are taken as metres.
+        west_m, north_m: the outer corner of the first cell.
+    """
+
+    crs: str | None
+    west_m: float
+    north_m: float
+    cell_m: float
+    columns: int
+    rows: int
+
+    @property
+    def transform(self) -> Affine:
+        from affine import Affine
+
+        return Affine(self.cell_m, 0, self.west_m, 0, -self.cell_m, self.north_m)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north."""
+        east, south = self.west_m + self.columns * self.cell_m, self.north_m - self.rows * self.cell_m
+        return self.west_m, south, east, self.north_m
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows, self.columns
+
+    @property
+    def cell_area_m2(self) -> float:
+        return self.cell_m**2
+
+    def strips(self) -> Iterator[slice]:
+        """The rows, a few megabytes at a time."""
+        step = max(1, STRIP_CELLS // self.columns)
+        return (slice(first, min(first + step, self.rows)) for first in range(0, self.rows, step))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A raster of heights on disk.
+
+    Attributes:
+        crs: None where the file states none.
+        transform: from column and row to the file's own coordinates; whole numbers are corners of pixels.
+        nodata: value of pixels without a height, declared or found; None if there is none.
+        metres: length of one unit of the heights.
+        sigma: raster of their standard errors, if there is one.
+        orthophoto, cloud: of the same survey, if there are any.
+        source: name of the cloud that the surface was made of.
+        date: YYYY-MM-DD of the photographs, if the file or its name tells.
+        remarks: what a user should know of how it was read.
+    """
+
+    path: Path
+    crs: CRS | None
+    transform: Affine
+    columns: int
+    rows: int
+    nodata: float | None
+    metres: float = 1.0
+    sigma: Path | None = None
+    orthophoto: Path | None = None
+    cloud: Path | None = None
+    source: str | None = None
+    date: str | None = None
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Date, or the file's name."""
+        return self.date or self.source or self.path.stem
+
+    @contextmanager
+    def on_grid(self, grid: Grid, shift_m: tuple[float, float] = (0.0, 0.0)) -> Iterator[Read]:
+        """Read strips of rows of a grid, bilinearly between the centres of the file's pixels.
+
+        Args:
+            shift_m: the surface is moved by this to the east and north first.
+
+        Yields:
+            a function of first and last row that returns heights in metres, NaN where there are none.
+        """
+        with warped(self.path, self.crs, grid, shift_m, nodata=self.nodata) as read:
+
+            def heights(first: int, last: int) -> Float32[np.ndarray, "rows columns"]:
+                values = read(first, last)[0]
+                values[np.abs(values) > _IMPOSSIBLE_M] = np.nan
+                return values * np.float32(self.metres) if self.metres != 1 else values
+
+            yield heights
+
+
+@contextmanager
+def warped(
+    path: Path,
+    crs: CRS | None,
+    grid: Grid,
+    shift_m: tuple[float, float] = (0.0, 0.0),
+    *,
+    nodata: float | None = None,
+    bands: tuple[int, ...] = (1,),
+) -> Iterator[Callable[[int, int], Float32[np.ndarray, "bands rows columns"]]]:
+    """Read rows of any raster on a grid as float32, NaN where it has no value.
+
+    Raises:
+        ChangeError: the file cannot be read to its end.
+    """
+    rasterio = require_rasterio()
+    from rasterio.enums import MaskFlags, Resampling
+    from rasterio.vrt import WarpedVRT
+    from rasterio.windows import Window
+
+    # Without a system on either side GDAL needs one all the same: any that is the same on both sides changes nothing.
+    plain = 'LOCAL_CS["metres",UNIT["metre",1]]'
+    source = plain if crs is None or grid.crs is None else crs.to_wkt()
+    target = plain if crs is None or grid.crs is None else grid.crs
+    moved = replace(grid, west_m=grid.west_m - shift_m[0], north_m=grid.north_m - shift_m[1]).transform
+    with opened(path) as dataset:
+        own = dataset.transform
+        # Cells on the file's own pixels are copied, not interpolated.
+        offset = (moved.c - own.c) / own.a, (moved.f - own.f) / own.e
+        same = (
+            source == target or (crs is not None and grid.crs is not None and _same_system(crs, CRS.from_wkt(grid.crs)))
+        ) and own.b == own.d == 0
+        size = max(dataset.width, dataset.height)
+        same = same and max(abs(own.a / moved.a - 1), abs(own.e / moved.e - 1)) * size < 0.01
+        aligned = same and max(abs(o - round(o)) for o in offset) < 0.01
+        resampling = Resampling.nearest if aligned else Resampling.bilinear
+        alpha = MaskFlags.alpha in dataset.mask_flag_enums[0]
+        options: dict[str, Any] = {} if alpha else {"nodata": math.nan}
+        if nodata is not None and not alpha:
+            options["src_nodata"] = nodata
+        if crs is not None or grid.crs is None:
+            options["src_crs"] = source
+        with WarpedVRT(
+            dataset,
+            crs=target,
+            transform=moved,
+            width=grid.columns,
+            height=grid.rows,
+            resampling=resampling,
+            dtype="float32",
+            warp_mem_limit=64,
+            **options,
+        ) as vrt:
+
+            def read(first: int, last: int) -> Float32[np.ndarray, "bands rows columns"]:
+                window = Window(0, first, grid.columns, last - first)  # type: ignore[call-arg]
+                try:
+                    values = vrt.read(list(bands), window=window).astype(np.float32, copy=False)
+                    if alpha:
+                        values[:, vrt.dataset_mask(window=window) == 0] = np.nan
+                except rasterio.errors.RasterioError as error:
+                    raise ChangeError(
+                        f"{path} cannot be read to its end ({error}): expected a whole GeoTIFF; copy or make it again"
+                    ) from error
+                return values
+
+            yield read
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """A raster file, opened."""
+    rasterio = require_rasterio()
+    with reading_from(path):
+        path.open("rb").close()
+    try:
+        with rasterio.Env(GDAL_CACHEMAX=128), rasterio.open(path) as dataset:
+            yield dataset
+    except rasterio.errors.RasterioIOError as error:
+        raise ChangeError(
+            f"{path} is not a raster that can be read ({error}): expected a GeoTIFF of heights; name another"
+        ) from error
+
+
+def open_surface(path: Path, date: str | None = None) -> Surface:
+    """Look at a raster of heights: its place, its nodata and its units; what is odd is told in the remarks.
+
+    Args:
+        path: a GeoTIFF.
+        date: of the survey; None takes it from the file or its name.
+
+    Raises:
+        ChangeError: it is no raster of heights on a north-up grid.
+    """
+    remarks: list[str] = []
+    with opened(path) as dataset:
+        if dataset.count > 2 and dataset.dtypes[0] == "uint8":
+            raise ChangeError(
+                f"{path} has {dataset.count} bands of bytes, which is a picture: expected one band of heights; name "
+                "the surface model (dsm.tif)"
+            )
+        transform = dataset.transform
+        if tuple(transform)[:6] == (1, 0, 0, 0, 1, 0) or abs(transform.b) + abs(transform.d) > 1e-9 * abs(transform.a):
+            raise ChangeError(
+                f"{path} has no place on a map, or a turned one: expected a georeferenced GeoTIFF with north up; "
+                "warp it first (gdalwarp)"
+            )
+        crs, metres = None, 1.0
+        if dataset.crs is not None:
+            try:
+                crs = CRS.from_wkt(dataset.crs.to_wkt())
+            except CRSError as error:
+                raise ChangeError(
+                    f"the coordinate system of {path} is not known ({error}): expected one with an EPSG code; assign "
+                    "it with gdal_edit.py -a_srs"
+                ) from error
+            metres = _metres_per_height(crs)
+        else:
+            remarks.append(f"{path.name} states no coordinate system; its lengths are taken as metres")
+        nodata = dataset.nodata
+        if nodata is None:
+            nodata = _undeclared(dataset)
+            if nodata is not None:
+                remarks.append(
+                    f"{path.name} declares no nodata, but has {nodata:g} where no height can be: read as such"
+                )
+        date = date or date_in(dataset.tags().get("TIFFTAG_DATETIME", "")) or date_in(path.stem)
+        return Surface(
+            path,
+            crs,
+            transform,
+            dataset.width,
+            dataset.height,
+            nodata,
+            metres,
+            sigma_of(path),
+            date=date,
+            remarks=remarks,
+        )
+
+
+def sigma_of(path: Path) -> Path | None:
+    """The raster of standard errors next to a surface, by its name."""
+    names = [path.with_name(f"{path.stem}_{ending}{path.suffix}") for ending in ("sigma", "standard_error", "error")]
+    return next((name for name in names if name.is_file()), None)
+
+
+def _undeclared(dataset: Any) -> float | None:
+    """The value that stands for no height in a file that declares none, or None."""
+    height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
+    values = dataset.read(1, out_shape=(height, width)).astype(np.float64)
+    counts = {value: float((values == value).mean()) for value in (*_SENTINELS, float(np.finfo(np.float32).min))}
+    value, share = max(counts.items(), key=lambda item: item[1])
+    if share > 0:
+        return value
+    zero, rest = float((values == 0).mean()), values[(values != 0) & np.isfinite(values)]
+    if zero > _ZERO_SHARE and len(rest) and np.quantile(np.abs(rest), 0.01) > 1.0:
+        return 0.0
+    return None
+
+
+def date_in(text: str) -> str | None:
+    """A date in a text, as YYYY-MM-DD, or None."""
+    found = re.search(r"(?<!\d)(19|20)(\d\d)[-_:.]?(0[1-9]|1[0-2])[-_:.]?(0[1-9]|[12]\d|3[01])(?!\d)", text)
+    return "{}{}-{}-{}".format(*found.groups()) if found else None
+
+
+def _metres_per_height(crs: CRS) -> float:
+    """Metres in one unit of the heights; 1 if the system does not tell."""
+    vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None)
+    axes = vertical.axis_info if vertical is not None else [a for a in crs.axis_info if a.direction == "up"]
+    return float(axes[0].unit_conversion_factor) if axes else 1.0
+
+
+def _vertical(crs: CRS) -> CRS | None:
+    return next((part for part in crs.sub_crs_list if part.is_vertical), None)
+
+
+def _horizontal(crs: CRS) -> CRS:
+    return crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
+
+
+def _same_system(one: CRS, other: CRS) -> bool:
+    return _horizontal(one).equals(_horizontal(other), ignore_axis_order=True)
+
+
+def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
+    """The grid that surfaces are compared on: where all of them are, at the coarsest of their pixels.
+
+    It lies on the first surface's pixels where these are square, have the grid's size and a projected system in metres.
+
+    Args:
+        cell_m: another size of cells, in metres.
+
+    Raises:
+        ChangeError: the surfaces do not overlap, their systems do not fit together, or the grid would be too large.
+    """
+    first = surfaces[0]
+    _require_same_heights(surfaces)
+    crs = _metric(first)
+    boxes, pixels = [], []
+    for surface in surfaces:
+        box, pixel = _box(surface, crs)
+        boxes.append(box)
+        pixels.append(pixel)
+    west, south = (max(box[k] for box in boxes) for k in (0, 1))
+    east, north = (min(box[k] for box in boxes) for k in (2, 3))
+    if west >= east or south >= north:
+        places = "; ".join(f"{s.path.name}: {_place(box)}" for s, box in zip(surfaces, boxes, strict=True))
+        raise ChangeError(
+            f"the surveys do not overlap ({places}): expected the same ground; check the files and their coordinate "
+            "systems"
+        )
+    cell = cell_m or max(pixels)
+    if cell_m is not None and not 0 < cell_m < min(east - west, north - south):
+        shared = min(east - west, north - south)
+        raise ChangeError(
+            f"--cell {cell_m} was asked for: expected more than 0 and less than the {shared:.1f} m that both surveys "
+            "share; choose another"
+        )
+    own = first.transform
+    on_first = crs is not None and first.crs is not None and _same_system(crs, first.crs)
+    exact = abs(own.a + own.e) * max(first.columns, first.rows) < 0.01 * own.a
+    if (on_first or crs is None) and exact and abs(cell / own.a - 1) * max(first.columns, first.rows) < 0.01:
+        cell = own.a
+        west = own.c + math.ceil((west - own.c) / cell - 1e-3) * cell
+        north = own.f - math.ceil((own.f - north) / cell - 1e-3) * cell
+    columns, rows = math.floor((east - west) / cell + 1e-3), math.floor((north - south) / cell + 1e-3)
+    if columns < 2 or rows < 2:
+        raise ChangeError(
+            f"the surveys share {columns} x {rows} cells of {cell:g} m: expected at least 2 x 2; give a smaller --cell"
+        )
+    if columns * rows > MOST_CELLS:
+        raise ChangeError(
+            f"the surveys share {columns * rows / 1e6:.0f} million cells of {cell:g} m: expected at most "
+            f"{MOST_CELLS / 1e6:.0f} million; give a larger --cell"
+        )
+    return Grid(crs.to_wkt() if crs is not None else None, west, north, cell, columns, rows)
+
+
+def _metric(surface: Surface) -> CRS | None:
+    """The surface's own horizontal system where it is projected in metres, else the UTM zone of its middle."""
+    if surface.crs is None:
+        return None
+    own = _horizontal(surface.crs)
+    if own.is_projected and abs(own.axis_info[0].unit_conversion_factor - 1) < 1e-9:
+        return own
+    x, y = _at(surface.transform, surface.columns / 2, surface.rows / 2)
+    longitude, latitude = Transformer.from_crs(own, "EPSG:4326", always_xy=True).transform(x, y)
+    return CRS(utm_zone(longitude, latitude))
+
+
+def _box(surface: Surface, crs: CRS | None) -> tuple[tuple[float, float, float, float], float]:
+    """West, south, east and north of a surface in a system, and the side of its pixels there."""
+    corners = [_at(surface.transform, c, r) for c in (0.0, float(surface.columns)) for r in (0.0, float(surface.rows))]
+    xs, ys = zip(*corners, strict=True)
+    box = (min(xs), min(ys), max(xs), max(ys))
+    pixel = max(abs(surface.transform.a), abs(surface.transform.e))
+    if surface.crs is None or crs is None or _same_system(surface.crs, crs):
+        return box, pixel
+    try:
+        to = Transformer.from_crs(_horizontal(surface.crs), crs, always_xy=True)
+        middle = _at(surface.transform, surface.columns / 2, surface.rows / 2)
+        beside = _at(surface.transform, surface.columns / 2 + 1, surface.rows / 2)
+        x0, y0 = to.transform(*middle, errcheck=True)
+        x1, y1 = to.transform(*beside, errcheck=True)
+        return to.transform_bounds(*box, errcheck=True), math.hypot(x1 - x0, y1 - y0)
+    except Exception as error:
+        if type(error).__module__.split(".")[0] != "pyproj":
+            raise
+        raise ChangeError(
+            f"{surface.path} cannot be converted from {surface.crs.name} to {crs.name} ({error}): expected a system "
+            "that both can be converted to; warp one of them first (gdalwarp)"
+        ) from error
+
+
+def _at(transform: Affine, column: float, row: float) -> tuple[float, float]:
+    """Coordinates of a position in a raster."""
+    return transform.c + transform.a * column, transform.f + transform.e * row
+
+
+def _place(box: tuple[float, float, float, float]) -> str:
+    return f"{box[0]:.0f} to {box[2]:.0f} east, {box[1]:.0f} to {box[3]:.0f} north"
+
+
+def _require_same_heights(surfaces: list[Surface]) -> None:
+    """Raises: ChangeError when some have a coordinate system and some not, or heights over different zeros."""
+    named = [surface for surface in surfaces if surface.crs is not None]
+    if named and len(named) < len(surfaces):
+        bare = next(surface for surface in surfaces if surface.crs is None)
+        raise ChangeError(
+            f"{named[0].path.name} has a coordinate system, {bare.path.name} has none: expected it in all files or in "
+            "none; assign it with gdal_edit.py -a_srs"
+        )
+    heights = {}
+    for surface in named:
+        assert surface.crs is not None
+        vertical = _vertical(surface.crs)
+        if vertical is not None:
+            heights[vertical.datum.name if vertical.datum is not None else vertical.name] = surface
+    if len(heights) > 1:
+        (one, first), (other, second), *_ = heights.items()
+        raise ChangeError(
+            f"heights of {first.path.name} are over {one}, those of {second.path.name} over {other}: expected one zero "
+            "for both; convert one of them first (gdalwarp -t_srs with a compound system)"
+        )

@@ -1,0 +1,135 @@
+"""Volumes of change with 95% intervals: from the random, the correlated and the systematic part of the error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from scipy.special import stdtrit
+
+from tidefield.change.errors import Z95, Variogram, region_error
+from tidefield.change.registration import Registration
+from tidefield.change.surfaces import Grid
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A volume and one sigma of the parts of its error, cubic metres.
+
+    Attributes:
+        value_m3: positive where ground was gained; cut and fill are both given as positive numbers.
+        random_m3: of the part of the error that is independent from cell to cell.
+        correlated_m3: of the part that neighbours share.
+        systematic_m3: of the part that all cells share.
+        choice_m3: of the choice of the outlines; 0 for regions that were not chosen by the heights.
+        area_m2: of the cells that were summed.
+        bias_m3: of the choice of the outlines, which was subtracted.
+        degrees_of_freedom: of the errors but the random one: how many independent pieces of stable ground they were
+            measured on.
+    """
+
+    value_m3: float
+    random_m3: float
+    correlated_m3: float
+    systematic_m3: float
+    area_m2: float
+    choice_m3: float = 0.0
+    bias_m3: float = 0.0
+    degrees_of_freedom: float = math.inf
+
+    @property
+    def sigma_m3(self) -> float:
+        return math.sqrt(self.random_m3**2 + self.correlated_m3**2 + self.systematic_m3**2 + self.choice_m3**2)
+
+    @property
+    def interval_m3(self) -> tuple[float, float]:
+        """Ends of the 95% interval."""
+        half = self.factor * self.sigma_m3
+        return self.value_m3 - half, self.value_m3 + half
+
+    @property
+    def factor(self) -> float:
+        """Half of the interval over one sigma: 1.96 where errors are well known, more where stable ground is small."""
+        measured = self.sigma_m3**2 - self.random_m3**2
+        if measured <= 0 or math.isinf(self.degrees_of_freedom):
+            return Z95
+        # Satterthwaite: only a part of the variance is uncertain.
+        return float(stdtrit(self.degrees_of_freedom * (self.sigma_m3**2 / measured) ** 2, 0.975))
+
+    def chosen(self, bias_m3: float, deviation_m3: float) -> Volume:
+        """The volume of outlines that were chosen by the heights themselves (`tidefield.change.choice`).
+
+        Args:
+            bias_m3: what the choice adds.
+            deviation_m3: one sigma with outlines chosen anew, without the systematic part.
+        """
+        own = math.hypot(self.random_m3, self.correlated_m3)
+        choice = math.sqrt(max(0.0, deviation_m3**2 - own**2))
+        return replace(self, value_m3=self.value_m3 - bias_m3, choice_m3=choice, bias_m3=bias_m3)
+
+    @property
+    def significant(self) -> bool:
+        low, high = self.interval_m3
+        return low > 0 or high < 0
+
+    def to_json(self) -> dict[str, Any]:
+        low, high = self.interval_m3
+        known = asdict(self)
+        if math.isinf(self.degrees_of_freedom):
+            known["degrees_of_freedom"] = None
+        return {**known, "low_m3": low, "high_m3": high, "significant": self.significant}
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """All that is known of the error of a difference.
+
+    Attributes:
+        sigma: one sigma of each cell's own error (random and correlated), metres.
+        variogram: how that is correlated.
+        registration: the systematic error.
+        degrees_of_freedom: of the correlated and the systematic part.
+    """
+
+    sigma: Float32[np.ndarray, "rows columns"] | float
+    variogram: Variogram
+    registration: Registration
+    grid: Grid
+    degrees_of_freedom: float = math.inf
+
+    def cell_sigma(self, rows: slice) -> Float32[np.ndarray, "rows columns"]:
+        """One sigma of a cell's whole error, for some rows."""
+        own = self.sigma[rows] if isinstance(self.sigma, np.ndarray) else np.float32(self.sigma)
+        return np.hypot(own, self.registration.deviation(self.grid, rows)).astype(np.float32)
+
+    def volume(
+        self,
+        dz: Float32[np.ndarray, "rows columns"],
+        region: Bool[np.ndarray, "rows columns"],
+        scale: float = 1.0,
+    ) -> Volume:
+        """Sum dz over a region.
+
+        Args:
+            region: cells that are summed; dz is known in all of them.
+            scale: -1 for cut, which is given as a positive number.
+        """
+        area = self.grid.cell_area_m2
+        cells, total = 0, 0.0
+        for rows in self.grid.strips():
+            inside = region[rows]
+            cells += int(inside.sum())
+            total += float(dz[rows].sum(where=inside, dtype=np.float64))
+        own = region_error(self.sigma, region, self.variogram, self.grid.cell_m)
+        systematic = self.registration.deviation_of_sum(self.grid, region)
+        return Volume(
+            scale * total * area,
+            own.random * area,
+            own.correlated * area,
+            systematic * area,
+            cells * area,
+            degrees_of_freedom=self.degrees_of_freedom,
+        )

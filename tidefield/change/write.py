@@ -1,0 +1,335 @@
+"""Write what changed: Cloud-Optimized GeoTIFFs, a GeoPackage, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Bool
+from shapely.geometry.base import BaseGeometry
+
+from tidefield import __version__
+from tidefield.change.errors import Z95, p_values
+from tidefield.change.measure import Change
+from tidefield.change.surfaces import ChangeError, Grid, require_rasterio
+from tidefield.change.volumes import Volume
+from tidefield.files import write_json, write_text
+
+BLOCK = 512
+MOST_OUTLINES = 5000
+"""Polygons that are written, the largest volumes first."""
+_MOST_POLYGONS_OF_GROUND = 2000
+UNKNOWN = -128.0
+"""In significant.tif."""
+CHANGE_BANDS = (
+    "dz: later minus earlier height (m)",
+    "sigma: one standard error of dz (m)",
+    "p: two-sided p-value of dz",
+)
+SIGNIFICANT_BANDS = (
+    "cell by cell: -1 lower, 1 higher, 0 neither, at 95%",
+    "outlined: -1 lower, 1 higher, 0 neither; by windows of cells",
+)
+
+
+@contextmanager
+def cog(
+    path: Path, grid: Grid, bands: Sequence[str], dtype: str, nodata: float, tags: Mapping[str, str] | None = None
+) -> Iterator[Callable[[slice, np.ndarray], None]]:
+    """A function that writes rows of a raster, which becomes a Cloud-Optimized GeoTIFF when the block ends.
+
+    The function takes rows and an array of bands, rows and columns.
+    """
+    rasterio = require_rasterio()
+    from rasterio.shutil import copy
+    from rasterio.windows import Window
+
+    plain = path.with_suffix(".plain.tif")
+    profile = {
+        "driver": "GTiff",
+        "width": grid.columns,
+        "height": grid.rows,
+        "count": len(bands),
+        "dtype": dtype,
+        "nodata": nodata,
+        "crs": grid.crs,
+        "transform": grid.transform,
+        "tiled": True,
+        "blockxsize": BLOCK,
+        "blockysize": BLOCK,
+        "interleave": "band",
+        "bigtiff": "if_safer",
+    }
+    try:
+        with rasterio.Env(GDAL_CACHEMAX=256):
+            with rasterio.open(plain, "w", **profile) as file:
+                file.update_tags(TIFFTAG_SOFTWARE=f"tidefield {__version__}", **(tags or {}))
+                for k, text in enumerate(bands, start=1):
+                    file.set_band_description(k, text)
+
+                def write(rows: slice, values: np.ndarray) -> None:
+                    window = Window(0, rows.start, grid.columns, rows.stop - rows.start)  # type: ignore[call-arg]
+                    file.write(values.astype(dtype, copy=False), window=window)
+
+                yield write
+            copy(
+                plain,
+                path,
+                driver="COG",
+                COMPRESS="DEFLATE",
+                PREDICTOR="YES",
+                LEVEL=6,
+                BLOCKSIZE=BLOCK,
+                OVERVIEW_RESAMPLING="AVERAGE" if dtype == "float32" else "NEAREST",
+                BIGTIFF="IF_SAFER",
+                NUM_THREADS="ALL_CPUS",
+            )
+    except rasterio.errors.RasterioError as error:
+        raise ChangeError(f"{path} cannot be written ({error}): expected free space; make room") from error
+    finally:
+        plain.unlink(missing_ok=True)
+
+
+def write_rasters(change: Change, folder: Path) -> None:
+    """Write change.tif (dz, sigma, p) and significant.tif."""
+    tags = {"EARLIER": change.earlier.name, "LATER": change.later.name}
+    lookup = np.concatenate([[0], change.outlines.signs]).astype(np.int8)
+    with (
+        cog(folder / "change.tif", change.grid, CHANGE_BANDS, "float32", math.nan, tags) as write,
+        cog(folder / "significant.tif", change.grid, SIGNIFICANT_BANDS, "int8", UNKNOWN, tags) as write_signs,
+    ):
+        for rows in change.grid.strips():
+            dz = change.dz[rows]
+            known = np.isfinite(dz)
+            sigma = np.where(known, change.errors.cell_sigma(rows), np.float32(np.nan))
+            write(rows, np.stack([dz, sigma, p_values(dz / sigma)]))
+            alone = np.where(np.abs(dz) > Z95 * sigma, np.sign(np.where(known, dz, 0)), 0).astype(np.int8)
+            outlined = lookup[change.outlines.labels[rows]]
+            write_signs(rows, np.where(known, np.stack([alone, outlined]), np.int8(UNKNOWN)))
+
+
+def polygons_of(
+    labels: np.ndarray, grid: Grid, mask: Bool[np.ndarray, "rows columns"]
+) -> Iterator[tuple[int, BaseGeometry]]:
+    """Outlines of equal labels along the edges of cells."""
+    require_rasterio()
+    from rasterio.features import shapes
+
+    for shape, value in shapes(labels, mask=mask, connectivity=8, transform=grid.transform):
+        rings = shape["coordinates"]
+        yield int(value), shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
+
+
+def outline_rows(change: Change) -> list[dict[str, Any]]:
+    """One row for each outline, the largest volume first."""
+    signs = change.outlines.signs
+    rows = [
+        {
+            "id": number,
+            "change": "lower" if signs[number - 1] < 0 else "higher",
+            "area_m2": volume.area_m2,
+            "volume_m3": volume.value_m3,
+            "low_m3": volume.interval_m3[0],
+            "high_m3": volume.interval_m3[1],
+            "mean_dz_m": float(signs[number - 1]) * volume.value_m3 / volume.area_m2,
+            "largest_dz_m": float(signs[number - 1]) * largest,
+        }
+        for number, volume, largest in change.each
+    ]
+    return sorted(rows, key=lambda row: -row["volume_m3"])
+
+
+def volume_rows(change: Change) -> list[dict[str, Any]]:
+    """One row for each volume: of the whole, and of the user's polygons."""
+    named: list[tuple[str, str, Volume]] = [
+        ("all", "net", change.net),
+        ("all", "cut", change.cut),
+        ("all", "fill", change.fill),
+        ("all", "net outside of the outlines", change.outside),
+    ]
+    for region, net, cut, fill in change.per_region:
+        named += [(region.name, "net", net), (region.name, "cut", cut), (region.name, "fill", fill)]
+    return [{"region": region, "volume": what, **volume.to_json()} for region, what, volume in named]
+
+
+def write_tables(change: Change, folder: Path) -> None:
+    """Write volumes.csv and outlines.csv."""
+    _write_csv(folder / "volumes.csv", volume_rows(change))
+    _write_csv(folder / "outlines.csv", outline_rows(change))
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: round(v, 4) if isinstance(v, float) else _plain(v) for k, v in row.items()})
+    write_text(path, text.getvalue())
+
+
+def _plain(value: Any) -> Any:
+    """A text that no spreadsheet takes for a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+
+
+def write_geopackage(change: Change, folder: Path) -> None:
+    """Write change.gpkg with the outlines, stable ground and the user's polygons."""
+    from pyogrio import raw
+
+    path = folder / "change.gpkg"
+    rows = {row["id"]: row for row in outline_rows(change)[:MOST_OUTLINES]}
+    shapes: dict[int, list[BaseGeometry]] = {}
+    for number, polygon in polygons_of(change.outlines.labels, change.grid, change.outlines.labels > 0):
+        if number in rows:
+            shapes.setdefault(number, []).append(polygon)
+    layers: list[tuple[str, list[BaseGeometry], list[dict[str, Any]]]] = [
+        ("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))
+    ]
+    step = 1 + math.isqrt(change.stable.size // 4_000_000)
+    thin = change.stable[::step, ::step]
+    coarse = Grid(
+        change.grid.crs,
+        change.grid.west_m,
+        change.grid.north_m,
+        change.grid.cell_m * step,
+        thin.shape[1],
+        thin.shape[0],
+    )
+    ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), coarse, thin)]
+    ground = sorted(ground, key=lambda shape: -shape.area)[:_MOST_POLYGONS_OF_GROUND]
+    layers.append(("stable ground", ground, [{"area_m2": shape.area} for shape in ground]))
+    layers.append(
+        (
+            "polygons",
+            [region.geometry for region, *_ in change.per_region],
+            [
+                {
+                    "name": region.name,
+                    **{
+                        f"{what}_{key}": value
+                        for what, volume in (("net", net), ("cut", cut), ("fill", fill))
+                        for key, value in (
+                            ("m3", volume.value_m3),
+                            ("low_m3", volume.interval_m3[0]),
+                            ("high_m3", volume.interval_m3[1]),
+                        )
+                    },
+                }
+                for region, net, cut, fill in change.per_region
+            ],
+        )
+    )
+    for name, geometries, table in layers:
+        if not geometries:
+            continue
+        raw.write(
+            path,
+            geometry=shapely.to_wkb(np.array([_multi(shape) for shape in geometries], dtype=object)),
+            field_data=[np.array([row[key] for row in table]) for key in table[0]],
+            fields=list(table[0]),
+            layer=name.replace(" ", "_"),
+            driver="GPKG",
+            geometry_type="MultiPolygon",
+            crs=change.grid.crs,
+            append=path.exists(),
+        )
+
+
+def _multi(shape: BaseGeometry) -> BaseGeometry:
+    """The polygons of a geometry."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    if shape.geom_type == "GeometryCollection":
+        parts += [p for m in shapely.get_parts(shape) if m.geom_type == "MultiPolygon" for p in shapely.get_parts(m)]
+    return shapely.MultiPolygon(parts)
+
+
+def summary(change: Change, command: str) -> dict[str, Any]:
+    """All numbers of a change, for change.json."""
+    registration, variogram = change.errors.registration, change.errors.variogram
+    low, middle, high = change.detection_m
+    return {
+        "tidefield": __version__,
+        "command": command,
+        "earlier": _survey(change.earlier),
+        "later": _survey(change.later),
+        "grid": {
+            "crs": change.grid.crs,
+            "bounds_m": list(change.grid.bounds),
+            "cell_m": change.grid.cell_m,
+            "columns": change.grid.columns,
+            "rows": change.grid.rows,
+        },
+        "cells": round(change.net.area_m2 / change.grid.cell_area_m2),
+        "area_m2": change.net.area_m2,
+        "registration": {
+            "model": registration.model,
+            "vertical_m": registration.vertical_m,
+            "tilt_m_per_m": list(registration.coefficients[1:]),
+            "shift_m": list(registration.shift_m),
+            "shift_error_m": registration.shift_error_m,
+            "systematic_m": registration.systematic_m,
+            "stable_ground": "given" if change.stable_given else "found",
+            "stable_cells": registration.stable_cells,
+            "before": dict(zip(("median_m", "nmad_m", "deviation95_m"), registration.before, strict=True)),
+            "after": dict(zip(("median_m", "nmad_m", "deviation95_m"), registration.after, strict=True)),
+            "words": registration.words,
+        },
+        "variogram": {
+            "nugget_share": variogram.nugget,
+            "sill_shares": list(variogram.sills),
+            "ranges_m": list(variogram.ranges_m),
+            "reached": variogram.reached,
+            "lags_m": list(variogram.lags_m),
+            "semivariance_shares": list(variogram.semivariances),
+            "pairs": list(variogram.pairs),
+        },
+        "level_of_detection_m": {"q05": low, "median": middle, "q95": high},
+        "null_test": {"significant_share_of_stable_cells": change.false_alarms, "expected": 0.05},
+        "outlines": {
+            "windows_cells": list(change.outlines.windows),
+            "margin_cells": change.outlines.margin,
+            "threshold_z": change.outlines.threshold if math.isfinite(change.outlines.threshold) else None,
+            "number": len(change.each),
+        },
+        "volumes": {
+            "net": change.net.to_json(),
+            "cut": change.cut.to_json(),
+            "fill": change.fill.to_json(),
+            "net_outside_of_outlines": change.outside.to_json(),
+            "cells_beyond_level_of_detection": {"cut_m3": change.threshold_cut_m3, "fill_m3": change.threshold_fill_m3},
+        },
+        "regions": [
+            {"name": region.name, "net": net.to_json(), "cut": cut.to_json(), "fill": fill.to_json()}
+            for region, net, cut, fill in change.per_region
+        ],
+        "remarks": change.remarks,
+    }
+
+
+def _survey(surface: Any) -> dict[str, Any]:
+    return {
+        "file": surface.source or surface.path.name,
+        "date": surface.date,
+        "crs": surface.crs.name if surface.crs is not None else None,
+        "pixel": [abs(surface.transform.a), abs(surface.transform.e)],
+        "nodata": surface.nodata if surface.nodata is None or math.isfinite(surface.nodata) else str(surface.nodata),
+        "sigma": surface.sigma.name if surface.sigma is not None else None,
+    }
+
+
+def write_all(change: Change, folder: Path, command: str) -> dict[str, Any]:
+    """Write all files of a change but its page; returns the numbers."""
+    write_rasters(change, folder)
+    write_tables(change, folder)
+    write_geopackage(change, folder)
+    numbers = summary(change, command)
+    write_json(folder / "change.json", numbers)
+    return numbers

@@ -1,0 +1,142 @@
+"""`tidefield change`: what changed between surveys."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import Verbosity
+from tidefield.errors import RunError
+from tidefield.files import completed_folder, refuse_existing
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Change:
+    """Measure what changed between two surveys: what was eroded, what grew, and how sure that is.
+
+    OUT is a new folder: change.tif (difference, its standard error and p-value), significant.tif, change.gpkg
+    (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have 95% intervals from the
+    random, the spatially correlated and the systematic part of the error, which are measured over stable ground.
+    """
+
+    earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
+    """The earlier survey: a surface (GeoTIFF of heights), a point cloud (LAS, LAZ), or a folder of `tidefield map` or
+    ODM."""
+    later: Annotated[Positional[Path], arg(metavar="LATER")]
+    """The later survey, likewise."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """A new folder for the results."""
+    stable: Path | None = None
+    """Ground that did not change: polygons or lines (GeoJSON, GeoPackage, shapefile). If not given, it is what is left
+    when everything that stands out is outlined, and is shown."""
+    within: Path | None = None
+    """Polygons to which the comparison is limited."""
+    polygons: Path | None = None
+    """Polygons whose volumes are given one by one."""
+    register: Literal["auto", "none", "vertical", "tilt"] = "auto"
+    """What is taken from the later survey over stable ground: nothing, which is right for surveys with the same ground
+    control; a vertical shift; or a shift and a tilt, with stable ground on all sides. auto is vertical."""
+    shift: Literal["auto", "none", "images"] = "auto"
+    """Move the later survey horizontally by what the orthophotos tell: where they tell it; not at all; or refuse where
+    they do not. Heights of flats do not tell it."""
+    orthophotos: tuple[Path, Path] | None = None
+    """Orthophotos of both surveys (GeoTIFF), if they are not in the folders."""
+    datum_error: float | None = None
+    """Standard error in metres that all heights of the difference share, as control gives it; added to what stable
+    ground shows, or with --register none used instead."""
+    cell: float | None = None
+    """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
+    windows: tuple[int, ...] = (5, 11, 21)
+    """Cells along each side of the windows in which change is tested, odd numbers."""
+    m3c2: bool = False
+    """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
+    dates: tuple[str, str] | None = None
+    """Dates of the surveys, if files and names do not tell: YYYY-MM-DD YYYY-MM-DD."""
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def change(options: Change, console: Console) -> None:
+    """Run `tidefield change`."""
+    refuse_existing(options.out, replaceable=False)
+    _check(options)
+    with TemporaryDirectory() as work:
+        _compare(options, console, Path(work))
+
+
+def _compare(options: Change, console: Console, work: Path) -> None:
+    from tidefield.change.clouds import compare_clouds, write_distances
+    from tidefield.change.inputs import open_pair
+    from tidefield.change.measure import Options, measure
+    from tidefield.change.regions import read_regions
+    from tidefield.change.write import write_all
+    from tidefield.progress import ProgressBar
+
+    dates = options.dates or (None, None)
+    pair = open_pair(options.earlier, options.later, work, dates, options.cell, options.m3c2)
+    earlier, later = pair.earlier, pair.later
+    if options.orthophotos is not None:
+        earlier, later = (
+            replace(surface, orthophoto=path)
+            for surface, path in zip((earlier, later), options.orthophotos, strict=True)
+        )
+    if earlier.date and later.date and earlier.date > later.date:
+        raise RunError(
+            f"{options.earlier} is of {earlier.date}, {options.later} of {later.date}: expected the earlier survey "
+            "first; exchange them, or state their --dates"
+        )
+    asked = Options(options.cell, options.register, options.shift, options.datum_error, options.windows)
+    reads = [
+        None if path is None else (lambda grid, path=path: read_regions(path, grid))
+        for path in (options.stable, options.within, options.polygons)
+    ]
+    with ProgressBar(console, "Reading surfaces") as bar:
+        found = measure(earlier, later, asked, stable=reads[0], within=reads[1], regions=reads[2], tick=bar)
+    for remark in found.remarks:
+        log.warning(remark)
+    with completed_folder(options.out) as folder:
+        write_all(found, folder, shlex.join(["tidefield", *sys.argv[1:]]))
+        if pair.clouds is not None:
+            registration = found.errors.registration
+            with ProgressBar(console, "Measuring M3C2 distances") as bar:
+                distances = compare_clouds(
+                    *pair.clouds, found.grid.cell_m, registration.systematic_m, registration.vertical_m, bar
+                )
+            write_distances(distances, pair.clouds[0].crs, folder / "m3c2.laz")
+    for name, volume in (("net", found.net), ("cut", found.cut), ("fill", found.fill)):
+        low, high = volume.interval_m3
+        console.print(
+            f"{name}: {volume.value_m3:+,.1f} m3 (95%: {low:+,.1f} to {high:+,.1f}) on {volume.area_m2:,.0f} m2; "
+            f"sigma: random {volume.random_m3:,.1f}, correlated {volume.correlated_m3:,.1f}, systematic "
+            f"{volume.systematic_m3:,.1f}",
+            soft_wrap=True,
+        )
+    console.print(
+        f"a cell is significant beyond {found.detection_m[1]:.3f} m; {100 * found.false_alarms:.1f}% of stable cells "
+        "are (5% expected)",
+        soft_wrap=True,
+    )
+    console.print(str(options.out), soft_wrap=True)
+
+
+def _check(options: Change) -> None:
+    """Raises: RunError when an option has no meaning."""
+    if options.datum_error is not None and not 0 <= options.datum_error < 100:
+        raise RunError(f"--datum-error {options.datum_error} was asked for: expected 0 to 100 metres; choose another")
+    if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
+        given = " ".join(map(str, options.windows))
+        raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
+    for date in options.dates or ():
+        if len(date) != 10 or date[4] != "-" or date[7] != "-" or not date.replace("-", "").isdigit():
+            raise RunError(f"--dates {date} was given: expected YYYY-MM-DD; write it so")

@@ -1,0 +1,121 @@
+"""`tidefield map`: orthophoto, surface model and point cloud."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.errors import RunError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Map:
+    """Map a survey: true orthophoto, surface model with its standard error, and point cloud, in ODM's folders.
+
+    All photographs of the scene are sources, held-out ones too. The orthophoto is rendered straight down by parallel
+    rays; heights are matched at the photographs' own resolution. Cells that fewer than two photographs see are empty.
+    Ctrl-C loses at most the running tiles; the same command continues.
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
+    """A trained run, or with --zero-shot a scene."""
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder for the map: a new one, or one to continue."""
+    zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
+    gsd: float | None = None
+    """Ground sampling distance, the side of a cell, in metres; that of the photographs if not given."""
+    area: Path | None = None
+    """Map only this polygon of a GeoJSON file."""
+    heights: str | None = None
+    """Vertical system of the scene's heights, such as EPSG:5701, where the scene does not state it."""
+    check: Path | None = None
+    """Check points, besides those of the scene: a file like gcp_list.txt, or with lines `x y z name`."""
+    contours: float | None = None
+    """Interval of the contours, in metres; a round one for about 20 contours if not given."""
+    sections: Path | None = None
+    """Cut cross-sections along the lines of this GeoJSON file."""
+    fill: bool = False
+    """Fill cells that fewer than two photographs see, and mark them in odm_dem/filled.tif."""
+    device: Device = "auto"
+    overwrite: bool = False
+    """Replace an existing map."""
+    allow_missing: AllowMissing = False
+    verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
+
+
+def map_(options: Map, console: Console) -> dict[str, Any]:
+    """Run `tidefield map`."""
+    from shapely import union_all
+
+    from tidefield.data.georeference import read_georeference
+    from tidefield.data.load import at_width
+    from tidefield.device import choose_device
+    from tidefield.files import only_writer
+    from tidefield.maps.area import bounds_of, read_shapes
+    from tidefield.maps.check_points import check_files, read_check_points
+    from tidefield.maps.grid import make_grid, map_frame
+    from tidefield.maps.make import Job, delete_tiles, make_map
+    from tidefield.maps.rasters import need
+    from tidefield.progress import ProgressBar
+
+    for library in ("rasterio", "laspy", "pyogrio"):
+        need(library)
+    if options.contours is not None and not 0.001 <= options.contours < math.inf:
+        raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
+    device = choose_device(options.device)
+    with ExitStack() as stack:
+        stack.enter_context(only_writer(options.out))
+        if options.zero.zero_shot:
+            scene = load(options.source, None, options.allow_missing, console, hold_out=False)
+            render, record = open_zero_shot(options.zero, scene, device)
+        else:
+            opened = open_trained(options.source, device, options.allow_missing, console, hold_out=False)
+            scene, render, record = stack.enter_context(opened)
+        frame = map_frame(scene, read_georeference(scene.root), options.heights)
+        area, interval = None, options.contours and options.contours * frame.metre_up
+        if options.area is not None:
+            area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
+        widest = max(file.lens.width for file in scene.photographs.files)
+        full = scene if scene.cameras.width >= widest else at_width(scene, widest)
+        grid = make_grid(frame, full, options.gsd, bounds_of(area))
+        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
+        points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
+        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points), interval, lines)
+        console.print(
+            f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
+            f"heights: {frame.heights}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        result = make_map(
+            job, options.out, options.overwrite, {"scene": scene.root.resolve().name, "method": record},
+            lambda name: ProgressBar(console, name),
+        )  # fmt: skip
+        delete_tiles(options.out)
+    console.print(
+        f"{options.out}: {result['area']:,.0f} square {frame.unit}, {result['points']:,} points",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if "check_points" in result:
+        found = result["check_points"]
+        console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit)}", soft_wrap=True)
+    return result
+
+
+def _describe(found: dict[str, Any], unit: str) -> str:
+    """The statistics of heights at check points, in one line."""
+    if not found["n"]:
+        return "none of them is on the map"
+    return (
+        f"heights: RMSE {found['rmse']:.3f}, mean {found['mean']:+.3f}, NMAD {found['nmad']:.3f} {unit}, n {found['n']}"
+    )

@@ -1,0 +1,105 @@
+"""Read polygons and lines of GeoJSON files in a map's coordinates."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Bool
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+from shapely.geometry.base import BaseGeometry
+
+from tidefield.errors import RunError
+from tidefield.files import reading_from
+from tidefield.geometry.geodesy import WGS84
+from tidefield.maps.grid import Grid, MapFrame, Tile
+
+LARGEST = 1 << 25
+
+
+def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tuple[BaseGeometry, dict[str, Any]]]:
+    """Read the geometries of a GeoJSON file and their properties, in map coordinates.
+
+    Coordinates are longitude and latitude (RFC 7946), or those of the file's member `crs`, as GDAL writes it; with a
+    local frame, local ones.
+
+    Args:
+        path: the file.
+        frame: map coordinates.
+        kinds: of geometries that are wanted, such as "Polygon".
+
+    Raises:
+        RunError: the file is missing, too large, no GeoJSON, or has none of these geometries.
+    """
+    wanted = " or ".join(kinds)
+    with reading_from(path):
+        if not path.is_file() or path.stat().st_size > LARGEST:
+            raise RunError(f"{path} is no file of at most {LARGEST >> 20} MB: expected a GeoJSON file with a {wanted}")
+        text = path.read_bytes()
+    try:
+        data = json.loads(text)
+        features = data["features"] if data.get("type") == "FeatureCollection" else [data]
+        shapes = [(shapely.geometry.shape(f.get("geometry", f)), dict(f.get("properties") or {})) for f in features]
+        named = data.get("crs", {}).get("properties", {}).get("name")
+        crs = CRS.from_user_input(named) if named else CRS.from_user_input(WGS84)
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        CRSError,
+        shapely.errors.ShapelyError,
+    ) as error:
+        raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
+    shapes = [
+        (part, about)
+        for shape, about in shapes
+        for part in getattr(shape, "geoms", [shape])
+        if part.geom_type in kinds and not part.is_empty
+    ]
+    if not shapes:
+        raise RunError(f"{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON")
+    if frame.frame is None:
+        return shapes
+    to_map = Transformer.from_crs(crs, CRS.from_wkt(frame.horizontal_wkt), always_xy=True)
+
+    def converted(xy: np.ndarray) -> np.ndarray:
+        return np.column_stack(to_map.transform(*xy.T))
+
+    moved = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
+    if not all(np.isfinite(shape.bounds).all() for shape, _ in moved):
+        raise RunError(f"{path} has coordinates outside of {frame.name}: expected longitude and latitude of the survey")
+    return moved
+
+
+def inside(area: BaseGeometry | None, tile: Tile) -> Bool[np.ndarray, "H W"]:
+    """Which centres of a tile's cells lie in an area; all without one."""
+    if area is None:
+        return np.ones((tile.side, tile.side), dtype=bool)
+    east, north = tile.offsets()
+    middle = tile.centre
+    x, y = np.broadcast_arrays(middle[0] + east.astype(np.float64), middle[1] + north.astype(np.float64))
+    return np.asarray(shapely.contains_xy(area, x, y))
+
+
+def touches(area: BaseGeometry | None, tile: Tile) -> bool:
+    """Whether an area has something of a tile."""
+    if area is None:
+        return True
+    half = tile.side * tile.grid.cell / 2
+    east, north = tile.centre
+    return bool(area.intersects(shapely.box(east - half, north - half, east + half, north + half)))
+
+
+def bounds_of(area: BaseGeometry | None) -> tuple[float, float, float, float] | None:
+    return None if area is None else tuple(area.bounds)  # type: ignore[return-value]
+
+
+def whole(grid: Grid) -> BaseGeometry:
+    """The rectangle of a grid."""
+    return shapely.box(*grid.bounds)

@@ -1,0 +1,383 @@
+"""Make a map: measure and render its tiles one after the other, each kept on disk, then join them to files.
+
+A map that was interrupted continues with the tiles that are missing. Memory is bounded by a row of tiles.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from shapely.geometry.base import BaseGeometry
+
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError
+from tidefield.files import completed_file, delete_partials, read_json, write_json
+from tidefield.machine import cores
+from tidefield.maps.area import inside, touches
+from tidefield.maps.check_points import CheckPoint, check, summary
+from tidefield.maps.cloud import UNCLASSIFIED, cloud_writer
+from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
+from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
+from tidefield.maps.orthophoto import render_tile
+from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
+from tidefield.maps.sections import cut, write_sections
+from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
+from tidefield.maps.terrain import write_hillshade, write_terrain
+from tidefield.model.rendering import Render
+from tidefield.parallel import in_parallel
+
+log = logging.getLogger(__name__)
+
+MAP_FILE = "map.json"
+TILES = "tiles"
+ORTHOPHOTO = "odm_orthophoto/odm_orthophoto.tif"
+VIEWS = "odm_orthophoto/views.tif"
+MAIN = "odm_orthophoto/photograph.tif"
+DSM, SIGMA, FILLED = "odm_dem/dsm.tif", "odm_dem/dsm_sigma.tif", "odm_dem/filled.tif"
+DTM = "odm_dem/dtm.tif"
+DSM_HILLSHADE, DTM_HILLSHADE = "odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif"
+CONTOURS, SECTIONS = "contours", "sections"
+"""Folders."""
+CLOUD = "odm_georeferencing/odm_georeferenced_model.laz"
+MARGIN = 16
+"""Cells that a tile shares with each of its neighbours' margins, across which both fade."""
+LARGEST_TILE, SMALLEST_TILE = 480, 96
+FEWEST_VIEWS = 2
+"""Photographs that must see a cell: what one alone shows has no height."""
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a map is made of.
+
+    Attributes:
+        scene: all of its photographs are sources; opened at the size to match at.
+        grid: the cells.
+        render: the method that renders the orthophoto.
+        area: outside of which nothing is mapped; None for no limit.
+        fill: fill cells that fewer than two photographs see, and mark them.
+        settings: what else the tiles depend on, for resuming.
+        check_points: surveyed points that the map is compared with.
+        interval: between contours, vertical units; a round one if None.
+        sections: lines to cut the surface along, and their properties.
+    """
+
+    scene: Scene
+    grid: Grid
+    render: Render
+    area: BaseGeometry | None
+    fill: bool
+    settings: dict[str, Any]
+    check_points: tuple[CheckPoint, ...] = ()
+    interval: float | None = None
+    sections: tuple[tuple[BaseGeometry, dict[str, Any]], ...] = ()
+
+    @property
+    def tile_side(self) -> int:
+        """Cells along the side of a tile: photographs that see one of its corners should see most of it."""
+        width = int(self.scene.cameras.size_px[:, 0].median())
+        return int(np.clip(width // 4 // 32 * 32, SMALLEST_TILE, LARGEST_TILE))
+
+    def tiles(self) -> list[Tile]:
+        side = -(-(self.tile_side + 2 * MARGIN) // 32) * 32 - 2 * MARGIN
+        return self.grid.tiles(side, MARGIN)
+
+    @property
+    def key(self) -> str:
+        """Identifies everything that the tiles depend on."""
+        grid = self.grid
+        about = [VERSION, grid.west, grid.north, grid.cell, grid.columns, grid.rows, grid.frame.wkt, self.settings]
+        about += [str(self.area), self.fill, list(self.scene.names), self.scene.cameras.T_world_camera.tolist()]
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
+def make_tiles(job: Job, out: Path, progress: Callable[[int, int], None]) -> None:
+    """Measure and render all tiles that are not on disk yet."""
+    folder = out / TILES
+    tiles = [tile for tile in job.tiles() if touches(job.area, tile)]
+    missing = [tile for tile in tiles if not _file(folder, tile).exists()]
+    done = len(tiles) - len(missing)
+    if done:
+        log.info(f"{done} of {len(tiles)} tiles are there already")
+    if not missing:
+        return
+    delete_partials(*(_file(folder, tile) for tile in missing))
+    start = sparse_surface(job.scene, job.grid.coarser(COARSEST))
+    grey = GreyPhotographs(job.scene)
+    gsd = ground_sampling_distance(job.scene) * job.grid.frame.metre
+    together = cores()
+    for first in range(0, len(missing), together):
+        part = missing[first : first + together]
+        found = in_parallel([lambda tile=tile: match(tile, start, job.scene, grey, gsd) for tile in part], "cpu")
+        for tile, matched in zip(part, found, strict=True):
+            values: dict[str, np.ndarray] = {}
+            if matched is not None:
+                wanted = inside(job.area, tile)
+                seen = (matched.count >= FEWEST_VIEWS) & wanted
+                shown = wanted if job.fill else seen
+                if shown.any():
+                    above = matched.height - np.float32(job.grid.height)
+                    colour = render_tile(job.render, tile, above, matched.sigma)
+                    values = {
+                        "height": matched.height,
+                        "sigma": matched.sigma,
+                        "score": matched.score.astype(np.float16),
+                        "count": np.minimum(matched.count, 65535).astype(np.uint16),
+                        "main": matched.main.astype(np.uint16),
+                        "seen": seen,
+                        "shown": shown,
+                        "colour": colour,
+                    }
+            with completed_file(_file(folder, tile), overwrite=True) as partial, partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, **values)
+            done += 1
+            progress(done, len(tiles))
+
+
+def _file(folder: Path, tile: Tile) -> Path:
+    return folder / f"{tile.name}.npz"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Some whole rows of a map, joined from tiles; NaN where nothing is shown.
+
+    Attributes:
+        row: the first one.
+        height, sigma, score: of each cell.
+        colour: 3 bands in [0, 1].
+        count: photographs that see each cell.
+        main: the photograph that contributes most, 0 for none, else its index plus 1.
+        seen: at least two photographs see it.
+        shown: it is part of the map.
+    """
+
+    row: int
+    height: Float[np.ndarray, "h w"]
+    sigma: Float[np.ndarray, "h w"]
+    score: Float[np.ndarray, "h w"]
+    colour: Float[np.ndarray, "3 h w"]
+    count: np.ndarray
+    main: np.ndarray
+    seen: np.ndarray
+    shown: np.ndarray
+
+
+def strips(job: Job, out: Path) -> Iterator[Strip]:
+    """Join tiles to strips of whole rows, from north to south; where tiles overlap they fade into each other."""
+    tiles = job.tiles()
+    grid, side = job.grid, tiles[0].side - 2 * MARGIN
+    weight_of = feather(tiles[0].side, MARGIN)
+    rows = sorted({tile.row for tile in tiles})
+    high = tiles[0].side
+    # Of 0 to 5: height, sigma, score and the colours, each times the weight; 6 is the weight.
+    sums = np.zeros((7, high, grid.columns), np.float32)
+    single = np.zeros((4, high, grid.columns), np.uint16)
+    for row in rows:
+        for tile in (t for t in tiles if t.row == row):
+            path = _file(out / TILES, tile)
+            if not path.exists():
+                continue  # outside of the area
+            with np.load(path, allow_pickle=False) as values:
+                if not values.files:
+                    continue
+                _, columns_in, own_rows, own_columns = tile.window()
+                at = (slice(own_rows.start, own_rows.stop), columns_in)
+                weight = (weight_of * values["shown"])[own_rows, own_columns]
+                # A tile at the map's edge has no neighbour to fade into.
+                for k, name in enumerate(("height", "sigma", "score")):
+                    sums[k][at] += (
+                        np.nan_to_num(
+                            values[name][own_rows, own_columns].astype(np.float32) - (grid.height if k == 0 else 0)
+                        )
+                        * weight
+                    )
+                sums[(slice(3, 6), *at)] += values["colour"][own_rows, own_columns].transpose(2, 0, 1) * weight
+                sums[6][at] += weight
+                core = slice(MARGIN, tile.side - MARGIN)
+                mine = np.zeros((tile.side, tile.side), bool)
+                mine[core, core] = True
+                mine = mine[own_rows, own_columns]
+                for k, name in enumerate(("count", "main", "seen", "shown")):
+                    single[k][at][mine] = values[name][own_rows, own_columns][mine]
+        first = max(row, 0)
+        last = min(row + side, grid.rows) if row != rows[-1] else grid.rows
+        own = slice(first - row, last - row)
+        yield _strip(first, sums[:, own], single[:, own], grid)
+        sums[:, : high - side], single[:, : high - side] = sums[:, side:].copy(), single[:, side:].copy()
+        sums[:, high - side :], single[:, high - side :] = 0, 0
+
+
+def _strip(row: int, sums: np.ndarray, single: np.ndarray, grid: Grid) -> Strip:
+    weight = sums[6]
+    shown = (single[3] > 0) & (weight > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(shown, sums[:6] / weight, np.nan)
+    mean[0] += grid.height
+    return Strip(
+        row, mean[0], mean[1], mean[2], mean[3:6], single[0].copy(), single[1] * shown, (single[2] > 0) & shown, shown
+    )
+
+
+def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Write the files of a map from its tiles; returns what they hold, in numbers."""
+    grid, unit = job.grid, job.grid.frame.unit
+    names = json.dumps([*job.scene.names])
+    rasters = {
+        "orthophoto": Raster(out / ORTHOPHOTO, ("red", "green", "blue", "alpha"), "uint8", None),
+        "views": Raster(out / VIEWS, ("photographs that see the cell",), "uint16", 0.0, average=False),
+        "main": Raster(
+            out / MAIN, ("photograph that contributes most",), "uint16", 0.0,
+            tags={"PHOTOGRAPHS": names, "VALUES": "1 is the first of PHOTOGRAPHS"}, average=False,
+        ),
+        "dsm": Raster(out / DSM, ("height of the surface",), unit=unit),
+        "sigma": Raster(out / SIGMA, ("standard error of the height",), unit=unit),
+    }  # fmt: skip
+    if job.fill:
+        rasters["filled"] = Raster(out / FILLED, ("1 where the map is filled",), "uint8", 255.0, average=False)
+    totals = {"cells": 0, "seen": 0, "sigma": [], "views": []}
+    with ExitStack() as stack:
+        writers: dict[str, RasterWriter] = {
+            name: stack.enter_context(raster_writer(raster, grid)) for name, raster in rasters.items()
+        }
+        cloud = stack.enter_context(cloud_writer(out / CLOUD, grid))
+        for strip in strips(job, out):
+            bytes_ = np.round(np.nan_to_num(strip.colour).clip(0, 1) * 255).astype(np.uint8)
+            alpha = (strip.shown * np.uint8(255))[None]
+            bands = {
+                "orthophoto": np.concatenate([bytes_ * strip.shown, alpha]),
+                "views": (strip.count * strip.shown)[None],
+                "main": strip.main[None],
+                "dsm": np.where(strip.shown, strip.height, NODATA)[None],
+                "sigma": np.where(strip.shown, strip.sigma, NODATA)[None],
+                "filled": np.where(strip.shown, ~strip.seen, 255)[None],
+            }
+            for name, writer in writers.items():
+                writer.write(strip.row, bands[name])
+            height = np.where(strip.seen, strip.height, np.nan)
+            classes = np.full(height.shape, UNCLASSIFIED)
+            cloud.write(strip.row, height, strip.sigma, bytes_, strip.count, classes)
+            totals["cells"] += int(strip.shown.sum())
+            totals["seen"] += int(strip.seen.sum())
+            some = strip.sigma[strip.seen][::97]
+            totals["sigma"].append(some)
+            totals["views"].append(strip.count[strip.seen][::97])
+            progress(strip.row + height.shape[0], grid.rows)
+        points = cloud.count
+    sigma, views = (np.concatenate(totals[name]) for name in ("sigma", "views"))
+    return {
+        "cells": totals["cells"],
+        "cells_seen": totals["seen"],
+        "area": totals["seen"] * grid.cell**2,
+        "points": points,
+        "sigma_median": float(np.median(sigma)) if len(sigma) else None,
+        "sigma_95": float(np.percentile(sigma, 95)) if len(sigma) else None,
+        "views_median": float(np.median(views)) if len(views) else None,
+    }
+
+
+def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Write what follows from the surface: terrain, hillshades, contours and sections; returns figures of them."""
+    grid, unit = job.grid, job.grid.frame.unit
+    write_terrain(out / DSM, out / SIGMA, Raster(out / DTM, ("height of the ground",), unit=unit), grid)
+    progress(1, 4)
+    for heights, shaded in ((DSM, DSM_HILLSHADE), (DTM, DTM_HILLSHADE)):
+        write_hillshade(out / heights, Raster(out / shaded, ("hillshade",), "uint8", 0.0), grid)
+    progress(2, 4)
+    height, coarse = read_reduced(out / DTM, grid)
+    interval = job.interval or interval_of(height)
+    lines = contours(height, coarse, interval)
+    write_contours(lines, grid.frame, out / CONTOURS)
+    progress(3, 4)
+    if job.sections:
+        write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, unit)
+    progress(4, 4)
+    return {"contours": {"interval": interval, "lines": len(lines)}, "sections": len(job.sections)}
+
+
+def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
+    """Make a map in a folder: a new one, or one that was interrupted.
+
+    Args:
+        job: what to make.
+        out: the folder.
+        overwrite: begin again where the folder holds another map.
+        record: stored in map.json.
+        bar: returns a progress bar of a name, a context manager.
+
+    Raises:
+        RunError: the folder holds something else, cannot be written to, or no two photographs see any of the area.
+    """
+    begin(out, job.key, overwrite)
+    started = time.monotonic()
+    before = (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
+    with bar("Mapping") as meter:
+        make_tiles(job, out, meter)
+    with bar("Writing") as meter:
+        found = join(job, out, meter)
+    if not found["cells"]:
+        raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
+    grid = job.grid
+    with bar("Terrain") as meter:
+        found |= derive(job, out, meter)
+    if job.check_points:
+        found["check_points"] = summary(check(job.check_points, job.scene, grid, out / DSM, out / SIGMA))
+    result = {
+        **record,
+        "key": job.key,
+        "complete": True,
+        "seconds": before + time.monotonic() - started,
+        "coordinates": {
+            "name": grid.frame.name, "wkt": grid.frame.wkt, "heights": grid.frame.heights, "unit": grid.frame.unit,
+        },
+        "grid": {
+            "west": grid.west, "north": grid.north, "cell": grid.cell, "columns": grid.columns, "rows": grid.rows,
+        },
+        **found,
+    }  # fmt: skip
+    write_json(out / MAP_FILE, result)
+    return result
+
+
+def begin(out: Path, key: str, overwrite: bool) -> None:
+    """Begin or continue a map in a folder.
+
+    Raises:
+        RunError: the folder holds a finished map, another one, or something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise RunError(f"{out} is a file: expected a folder for the map; choose another name")
+    there = read_json(out / MAP_FILE) if out.is_dir() else None
+    if there is None and out.is_dir() and any(path.name != ".lock" for path in out.iterdir()):
+        raise RunError(f"{out} holds something else: expected a new folder, or one of `tidefield map`; choose another")
+    if there is not None and not overwrite:
+        if there.get("key") != key:
+            raise RunError(
+                f"{out} holds a map of another scene or with other options: expected a new folder; choose one, or pass "
+                "--overwrite"
+            )
+        if there.get("complete"):
+            raise RunError(f"{out} holds this map already: expected a new folder; choose one, or pass --overwrite")
+    if there is not None and overwrite and (there.get("key") != key or there.get("complete")):
+        delete_tiles(out)
+    if there is None or overwrite:
+        write_json(out / MAP_FILE, {"key": key, "complete": False})
+
+
+def delete_tiles(out: Path) -> None:
+    """Delete the tiles of a map, which only an interrupted map needs."""
+    for path in (out / TILES).glob("*.npz"):
+        path.unlink()
+    if (out / TILES).is_dir():
+        (out / TILES).rmdir()

@@ -1,0 +1,522 @@
+"""Measure the height of every cell of a map by matching the photographs that see it, and its standard error.
+
+Heights are searched from coarse cells to fine ones, from the surface of the sparse points. At every height that is
+tried the photographs are projected onto the surface at that height, and each is compared with the mean of the others by
+windowed normalised cross-correlation, and on fine cells with their median by colour. Where the photographs agree best
+is the surface (the vertical line locus of photogrammetry; Collins, A space-sweep approach to true multi-image matching,
+1996, with windows that follow the surface found so far). A parabola through the best score and its neighbours places it
+between the heights that were tried.
+
+The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
+score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
+
+Alphabet: V photographs, K heights, H W cells of a tile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.spatial import KDTree
+
+from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER
+from tidefield.data.scene import Scene
+from tidefield.data.surface import interpolate_on_pixels
+from tidefield.geometry.cameras import Cameras
+from tidefield.maps.grid import Grid, Tile
+
+COARSEST = 8
+"""Cells, along a side, of the coarsest cells."""
+PAD = 64
+"""Cells around a tile in which coarser surfaces are searched: windows of coarse cells reach beyond the tile."""
+VIEWS = 8
+"""Photographs that are compared with each other; more add little and take as long each."""
+STEEPEST_DEG = 55.0
+"""Largest angle from the vertical at which a photograph sees a cell."""
+BORDER_PX = 4.0
+"""Pixels along a photograph's border that are not used."""
+STEP_PX = 0.7
+"""Parallax between heights that are tried, of the photographs farthest apart, in cells."""
+HALF_STEPS = {8: (7, 7), 4: (5,), 2: (6,), 1: (7, 3)}
+"""Heights that are tried above and below the surface found so far, in each sweep, by the size of the cells; the second
+sweep has half the step."""
+SIGMA_CELLS = {8: 1.5, 4: 1.6, 2: 1.4, 1: 1.4}
+"""Standard deviation of the windows in which photographs are normalised, in cells."""
+SHARP, WIDE = 1.0, 2.5
+"""Standard deviations of the two windows, in cells, over whose mean fine scores are summed: one peak keeps the edges of
+plants, the other bridges bare ground."""
+FINE = 2
+"""Largest cells, in the map's, that differences of colours are compared on, too."""
+DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
+"""Grey values of 255 beyond which a photograph's difference from the median of all is an occlusion, and the weight of
+the mean difference, as a share of that, against the correlation."""
+SHARE_MATCHING, SHARES_ROUGHNESS = 0.1, ((1.2, 3.0), (0.2, 6.0))
+"""Shares of the standard error: of that of single cells' matching, which the windows and the filter reduce, and of the
+roughness within windows of so many cells."""
+BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
+"""Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
+FLOOR = 3.0
+"""Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
+PULL = 0.02
+"""Score that is lost at the ends of the search range: blank and moving surfaces stay where they are expected."""
+KEPT_BYTES = 600_000_000
+"""Memory for grey photographs."""
+
+Height = Float32[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The surface of a tile.
+
+    Attributes:
+        height: map units.
+        sigma: standard error of the height, map units.
+        score: mean normalised cross-correlation of the photographs there, -1 to 1.
+        count: photographs that see each cell.
+        main: the one that sees it best, 0 for none, else its index plus 1.
+    """
+
+    height: Height
+    sigma: Height
+    score: Height
+    count: Int[np.ndarray, "H W"]
+    main: Int[np.ndarray, "H W"]
+
+
+class GreyPhotographs:
+    """The photographs of a scene in grey, reduced to the size of coarse cells; those not read for long go first.
+
+    Args:
+        scene: at the size to match at.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._kept: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def read(self, index: int, factor: int) -> UInt8[np.ndarray, "h w"]:
+        """Read a photograph at a `factor`-th of its size."""
+        with self._lock:
+            return self._read((index, factor))
+
+    def _read(self, key: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+        index, factor = key
+        if key not in self._kept:
+            grey = cv2.cvtColor(self.scene.photographs[index].numpy(), cv2.COLOR_RGB2GRAY)
+            if factor > 1:
+                size = max(1, round(grey.shape[1] / factor)), max(1, round(grey.shape[0] / factor))
+                grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+            self._kept[key] = grey
+            self._bytes += grey.nbytes
+            while self._bytes > KEPT_BYTES and len(self._kept) > 1:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The surface of the sparse points, from which heights are searched.
+
+    Attributes:
+        grid: of coarse cells.
+        height: of the points, interpolated linearly.
+        reach: how far the points around differ in height.
+        gap: distance to the nearest point, horizontal units.
+    """
+
+    grid: Grid
+    height: Height
+    reach: Height
+    gap: Height
+
+    def on(self, tile: Tile, pad: int, step: int) -> tuple[Height, Height]:
+        """Height and reach at the centres of a tile's cells, which are `step` times as large."""
+        east, north = tile.offsets(pad, step)
+        middle = tile.centre
+        u = (middle[0] + east.astype(np.float64) - self.grid.west) / self.grid.cell - 0.5
+        v = (self.grid.north - middle[1] - north.astype(np.float64)) / self.grid.cell - 0.5
+        u, v = np.broadcast_arrays(u.astype(np.float32), v.astype(np.float32))
+        height, reach = (
+            cv2.remap(part, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for part in (self.height, self.reach)
+        )
+        return height, reach
+
+
+def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:
+    """Interpolate the sparse points on a grid of coarse cells.
+
+    Points that differ from their 16 nearest neighbours by more than 12 times their spread are left out, as in
+    `data.surface`. Outside of the points the surface is that of the nearest ones.
+    """
+    assert scene.points is not None, "make_grid refuses scenes without points"
+    xyz = grid.frame.to_map(scene.points.xyz_world.double().numpy())
+    xyz = xyz[_agree(xyz)]
+    uv = np.column_stack([(xyz[:, 0] - grid.west) / grid.cell, (grid.north - xyz[:, 1]) / grid.cell])
+    inside = ((uv > -50) & (uv < [grid.columns + 50, grid.rows + 50])).all(1)
+    if inside.sum() >= 3:
+        uv, xyz = uv[inside], xyz[inside]
+    tree = KDTree(uv)
+    low = np.minimum(uv.min(0), 0) - 1.0
+    high = np.maximum(uv.max(0), [grid.columns, grid.rows]) + 1.0
+    along = np.linspace(0, 1, 9)
+    frame = np.array([(a, b) for a in along for b in along if a in (0, 1) or b in (0, 1)]) * (high - low) + low
+    count = min(around, len(uv))
+    near = np.asarray(tree.query(frame, k=count)[1]).reshape(len(frame), -1)
+    heights = np.concatenate([xyz[:, 2], np.median(xyz[near, 2], axis=1)])
+    # Rounded positions may coincide, which Delaunay's triangles leave out.
+    height = interpolate_on_pixels(np.concatenate([uv, frame]), heights - grid.height, grid.columns, grid.rows)
+    cells = np.stack(np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5), -1).reshape(-1, 2)
+    distance, near = (np.asarray(x).reshape(len(cells), -1) for x in tree.query(cells, k=count))
+    reach = np.ptp(xyz[near, 2], axis=1).reshape(grid.rows, grid.columns)
+    gap = distance[:, 0].reshape(grid.rows, grid.columns) * grid.cell
+    return Start(grid, (height + grid.height).astype(np.float32), reach.astype(np.float32), gap.astype(np.float32))
+
+
+def _agree(xyz: Float[np.ndarray, "N 3"], neighbours: int = 16, spreads: float = 12.0) -> Bool[np.ndarray, " N"]:
+    if len(xyz) <= neighbours:
+        return np.ones(len(xyz), dtype=bool)
+    near = np.asarray(KDTree(xyz[:, :2]).query(xyz[:, :2], k=neighbours + 1)[1])[:, 1:]
+    median = np.median(xyz[near, 2], axis=1)
+    spread = np.median(np.abs(xyz[near, 2] - median[:, None]), axis=1)
+    return np.abs(xyz[:, 2] - median) <= spreads * np.maximum(spread, np.median(spread))
+
+
+class View:
+    """One photograph's projection of a tile's cells.
+
+    Args:
+        camera: of the photograph.
+        tile: the cells.
+    """
+
+    def __init__(self, camera: Cameras, tile: Tile) -> None:
+        matrix = camera.projection[0].double().numpy()
+        affine = tile.affine()
+        self.matrix = matrix[:, :3] @ affine
+        self.matrix[:, 3] += matrix[:, 3]
+        # Exact positions in double precision: single precision would cost a hundredth of a pixel.
+        pose = camera.T_world_camera[0].double().numpy()
+        rotation = pose[:, :3].T
+        focal, principal = camera.focal_px[0].double().numpy(), camera.principal_px[0].double().numpy()
+        k = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]])
+        there = affine.copy()
+        there[:, 3] -= pose[:, 3]
+        self.matrix = (k @ rotation @ there).astype(np.float64)
+        self.size = camera.width, camera.height
+        self.camera = camera
+        uv = torch.tensor([[[*(self.matrix[:2, 3] / self.matrix[2, 3])]]]).float()
+        self.gain = float(camera.gain_at(uv).mean())
+        """Of the photograph where it shows the middle of the tile."""
+        inverse = np.linalg.inv(affine[:, :3])
+        self.position = inverse @ (pose[:, 3] - affine[:, 3])
+        """East, north and height above `Grid.height` of the photograph, from the middle of the tile."""
+
+    def base(self, east: np.ndarray, north: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """Homogeneous pixels (3 x H x W) of cells at heights above `Grid.height`."""
+        m = self.matrix.astype(np.float32)
+        return np.stack([m[i, 2] * height + (m[i, 0] * east + (m[i, 1] * north + m[i, 3])) for i in range(3)])
+
+    def displacement(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """How far the lens' residual moves pixels; None without a residual."""
+        if self.camera.residual is None:
+            return None
+        uv = torch.from_numpy(np.stack([u, v], -1).reshape(1, -1, 2))
+        moved = (self.camera.displaced(uv) - uv)[0].numpy().reshape(*u.shape, 2)
+        return np.ascontiguousarray(moved[..., 0]), np.ascontiguousarray(moved[..., 1])
+
+    def pixels(
+        self, east: np.ndarray, north: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixels u and v of cells, and their z-depth."""
+        q = self.base(east, north, height)
+        z = np.where(np.abs(q[2]) < 1e-6, 1e-6, q[2])
+        u, v = q[0] / z, q[1] / z
+        moved = self.displacement(u, v)
+        return (u, v, q[2]) if moved is None else (u + moved[0], v + moved[1], q[2])
+
+    def sees(
+        self, u: np.ndarray, v: np.ndarray, z: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray
+    ) -> np.ndarray:
+        """Whether cells lie in the photograph, seen at no more than `STEEPEST_DEG` from the vertical."""
+        width, tall = self.size
+        b = BORDER_PX
+        inside = (z > 0) & (u > b) & (v > b) & (u < width - b) & (v < tall - b)
+        above = self.position[2] - height
+        across = (self.position[0] - east) ** 2 + (self.position[1] - north) ** 2
+        return inside & (above > 0) & (across <= (math.tan(math.radians(STEEPEST_DEG)) * above) ** 2)
+
+    def rank(self, u: np.ndarray, v: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        """How well cells are seen, as a network's neighbours of a view straight down are ranked (`data.neighbours`)."""
+        across = np.hypot(self.position[0] - east, self.position[1] - north)
+        angle = np.arctan2(across, self.position[2] - height)
+        inner = np.minimum(np.minimum(u, self.size[0] - u), np.minimum(v, self.size[1] - v))
+        return np.exp(-angle / ANGLE_SCALE_RAD) * np.clip(inner / (BORDER * self.size[0]), 0, 1)
+
+
+def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> tuple[list[View], list[int], list[int]]:
+    """Choose photographs to compare on a tile.
+
+    Each time the photograph that adds most at a few places of the tile: where few photographs were chosen, not too far
+    from the vertical, and from another direction than those chosen.
+
+    Returns:
+        The projections of all photographs that see some of the tile, their indices, and which of them were chosen.
+    """
+    cells = np.linspace(0.5, tile.side - 0.5, 7).astype(np.float32) - tile.side / 2
+    east, north = np.meshgrid(cells * tile.grid.cell, -cells * tile.grid.cell)
+    rows, columns = start.on(tile, 0, 1)[0].shape
+    at = np.linspace(0, rows - 1, 7).round().astype(int)
+    height = start.on(tile, 0, 1)[0][np.ix_(at, np.linspace(0, columns - 1, 7).round().astype(int))] - tile.grid.height
+    views, indices, seen, direction = [], [], [], []
+    for index in range(len(scene.names)):
+        view = View(scene.cameras[index], tile)
+        u, v, z = view.pixels(east, north, height)
+        sees = view.sees(u, v, z, height, east, north)
+        if sees.any():
+            views.append(view)
+            indices.append(index)
+            seen.append(sees)
+            to = view.position[:, None, None] - np.stack([east, north, height])
+            direction.append(to / np.linalg.norm(to, axis=0))
+    if not views:
+        return [], [], []
+    sees, to = np.stack(seen), np.stack(direction)
+    angle = np.degrees(np.arccos(np.clip(to[:, 2], -1, 1)))
+    quality = sees * np.exp(-((angle / 35.0) ** 2))
+    chosen: list[int] = []
+    covered = np.zeros(sees.shape[1:])
+    nearest = np.full(sees.shape, 1.0)
+    most = count
+    while len(chosen) < min(most, len(views)):
+        gain = (quality * nearest / (1 + covered) ** 1.5).sum((1, 2))
+        gain[chosen] = -1
+        best = int(gain.argmax())
+        if gain[best] <= 0:
+            break
+        chosen.append(best)
+        covered += sees[best]
+        between = np.degrees(np.arccos(np.clip((to * to[best]).sum(1), -1, 1)))
+        apart = 1 - np.exp(-((between / 8.0) ** 2))
+        nearest = np.where(sees[best], np.minimum(nearest, apart), nearest)
+        if len(chosen) == most and most < 2 * count and (covered[sees.sum(0) >= 4] < 4).any():
+            most += 1
+    return views, indices, chosen
+
+
+def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: float) -> Matched | None:
+    """Measure the heights of a tile's cells, margin included.
+
+    Args:
+        tile: the cells.
+        start: the sparse points' surface.
+        scene: all photographs, at the size to match at.
+        grey: the same photographs in grey.
+        gsd: the photographs' median ground sampling distance, horizontal units.
+
+    Returns:
+        None where no two photographs see any of the tile.
+    """
+    views, indices, chosen = choose_views(tile, scene, start)
+    if len(views) < 2:
+        return None
+    used = [(views[k], indices[k]) for k in chosen]
+    ratio = _parallax(views, chosen)
+    height = sigma = score = None
+    step = 0.0
+    for level in (8, 4, 2, 1):
+        cell = tile.grid.cell * level
+        east, north = tile.offsets(PAD, level)
+        if height is None:
+            height, reach = start.on(tile, PAD, level)
+            height = height - tile.grid.height
+            step = max(STEP_PX * cell / ratio, 0.6 * float(np.percentile(reach, 75)) / HALF_STEPS[level][0])
+        else:
+            size = (height.shape[1] * 2, height.shape[0] * 2)
+            height = cv2.resize(height, size, interpolation=cv2.INTER_LINEAR)
+            step = STEP_PX * cell / ratio
+        factor = max(1, round(level * tile.grid.cell / gsd))
+        for sweep, half in enumerate(HALF_STEPS[level]):
+            offsets = step / (1 + sweep) * np.arange(-half, half + 1, dtype=np.float32)
+            found = _sweep(used, grey, factor, east, north, height, offsets, level)
+            height, sigma, score = _cleaned(*found, height, level, step)
+    assert height is not None
+    assert sigma is not None
+    assert score is not None
+    sigma = standard_error(height, sigma)
+    inner = slice(PAD, PAD + tile.side)
+    height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
+    east, north = tile.offsets()
+    count, main = np.zeros(height.shape, np.int64), np.zeros(height.shape, np.int64)
+    best = np.zeros(height.shape, np.float32)
+    for view, index in zip(views, indices, strict=True):
+        u, v, z = view.pixels(east, north, height)
+        sees = view.sees(u, v, z, height, east, north)
+        count += sees
+        rank = np.where(sees, view.rank(u, v, height, east, north), 0)
+        main[rank > best] = index + 1
+        best = np.maximum(rank, best)
+    return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, count, main)
+
+
+def standard_error(height: Height, matching: Height) -> Height:
+    """Estimate the standard error of heights from that of their matching and from the roughness around them.
+
+    Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. Its
+    standard deviation there is that of the heights within a window. The shares are such that on built-in flats 95% of
+    the cells lie within 1.96 standard errors (`python -m benchmarks maps`).
+    """
+    parts = [SHARE_MATCHING * _blur(matching, 2.0)]
+    for share, cells in SHARES_ROUGHNESS:
+        mean = _blur(height, cells)
+        parts.append(share * np.sqrt(np.maximum(_blur((height - mean) ** 2, cells), 0)))
+    return np.sqrt(sum(part**2 for part in parts)).astype(np.float32)
+
+
+def _parallax(views: list[View], chosen: Sequence[int]) -> float:
+    """Shift of the photographs farthest apart per height, in the middle of the tile."""
+    slope = np.array([views[k].position[:2] / max(views[k].position[2], 1e-6) for k in chosen])
+    apart = np.linalg.norm(slope[:, None] - slope[None], axis=-1)
+    return float(np.clip(np.percentile(apart[np.triu_indices(len(slope), 1)], 90), 0.1, 2.0))
+
+
+def _sweep(
+    used: list[tuple[View, int]],
+    grey: GreyPhotographs,
+    factor: int,
+    east: np.ndarray,
+    north: np.ndarray,
+    height: np.ndarray,
+    offsets: np.ndarray,
+    level: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Try heights; returns the best one, its standard error and its score, NaN where fewer than two photographs see."""
+    views = []
+    for view, index in used:
+        picture = grey.read(index, factor)
+        base = view.base(east, north, height)
+        u0, v0 = base[0] / base[2], base[1] / base[2]
+        sees = view.sees(u0, v0, base[2], height, east, north)
+        moved = view.displacement(u0, v0)
+        scale = picture.shape[1] / view.size[0], picture.shape[0] / view.size[1]
+        views.append((view, picture, base, sees.astype(np.float32), moved, scale))
+    sees = np.stack([v[3] for v in views])
+    number = sees.sum(0)
+    gains = [view.gain for view, *_ in views]
+    sigma_cells = SIGMA_CELLS[level]
+    each = np.empty((len(offsets), len(views), *height.shape), np.float32)
+    joint = np.empty((len(offsets), *height.shape), np.float32)
+    for k, offset in enumerate(offsets):
+        raw, normal = [], []
+        for view, picture, base, mask, moved, scale in views:
+            m = view.matrix[:, 2].astype(np.float32) * offset
+            inverse = 1 / (base[2] + m[2])
+            u, v = (base[0] + m[0]) * inverse, (base[1] + m[1]) * inverse
+            if moved is not None:
+                u, v = u + moved[0], v + moved[1]
+            shown = cv2.remap(
+                picture, u * scale[0] - 0.5, v * scale[1] - 0.5, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            ).astype(np.float32)
+            raw.append(shown)
+            shown = shown - _blur(shown, sigma_cells)
+            shown /= np.sqrt(_blur(shown * shown, sigma_cells) + FLOOR**2)
+            normal.append(shown * mask)
+        total = np.sum(normal, axis=0)
+        score = np.zeros(height.shape, np.float32)
+        for i, shown in enumerate(normal):
+            own = shown * (total - shown) / np.maximum(number - sees[i], 1)
+            each[k, i] = _blur(own, sigma_cells)
+            score += own * sees[i]
+        score /= np.maximum(number, 1)
+        if level <= FINE:
+            score -= DIFFERENCE_WEIGHT * _difference([r / g for r, g in zip(raw, gains, strict=True)], sees, number)
+            joint[k] = 0.5 * (_blur(score, SHARP) + _blur(score, WIDE))
+        else:
+            joint[k] = _blur(score, sigma_cells)
+    return _best(joint, each, sees, offsets, height)
+
+
+def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
+    side = 2 * round(2.5 * sigma) + 1
+    return cv2.GaussianBlur(values, (side, side), sigma)
+
+
+def _difference(shown: list[np.ndarray], sees: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Mean difference of the photographs from their median, each at most `DIFFERENCE`, as a share of that."""
+    mean = sum(one * mask for one, mask in zip(shown, sees, strict=True)) / np.maximum(number, 1)
+    values = [np.where(mask > 0, one, mean) for one, mask in zip(shown, sees, strict=True)]
+    middle = _median(values)
+    away = sum(np.minimum(np.abs(one - middle), DIFFERENCE) * mask for one, mask in zip(values, sees, strict=True))
+    return (away / (np.maximum(number, 1) * DIFFERENCE)).astype(np.float32)
+
+
+def _median(values: list[np.ndarray]) -> np.ndarray:
+    """Median of arrays, element by element, by exchanges: ten times as fast as NumPy's for a few large arrays."""
+    ordered, count = list(values), len(values)
+    for i in range(count // 2 + 1):
+        for j in range(count - 1, i, -1):
+            low = np.minimum(ordered[j - 1], ordered[j])
+            ordered[j], ordered[j - 1] = np.maximum(ordered[j - 1], ordered[j]), low
+    return ordered[count // 2] if count % 2 else (ordered[count // 2 - 1] + ordered[count // 2]) / 2
+
+
+def _best(
+    joint: Float32[np.ndarray, "K H W"],
+    each: Float32[np.ndarray, "K V H W"],
+    sees: Float32[np.ndarray, "V H W"],
+    offsets: np.ndarray,
+    height: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the height of the best score, its standard error, and the mean correlation there."""
+    number = sees.sum(0)
+    step = float(offsets[1] - offsets[0])
+    pulled = joint - PULL * (offsets / offsets[-1])[:, None, None] ** 2
+    best = pulled[1:-1].argmax(0) + 1
+    low, mid, high = (np.take_along_axis(joint, (best + d)[None], 0)[0] for d in (-1, 0, 1))
+    curvature = np.maximum(2 * mid - low - high, 1e-3)
+    shift = np.clip((high - low) / (2 * curvature), -1, 1)
+    # The same for each photograph against the mean of the others.
+    index = np.broadcast_to(best[None, None] + np.array([-1, 0, 1])[:, None, None, None], (3, *each.shape[1:]))
+    own = np.take_along_axis(each, index, 0)
+    bend = np.maximum(2 * own[1] - own[0] - own[2], 1e-3)
+    alone = np.clip((own[2] - own[0]) / (2 * bend), -2, 2)
+    weight = sees * bend
+    spread = (weight * (alone - shift) ** 2).sum(0) / np.maximum(weight.sum(0), 1e-6)
+    error = np.sqrt(spread / np.maximum(number - 1, 1))
+    correlation = (own[1] * sees).sum(0) / np.maximum(number, 1)
+    blank = 0.3 * np.sqrt(np.maximum(1 - correlation, 0.02) / (curvature * np.maximum(number, 1)))
+    valid = number >= 2
+    found = height + offsets[best] + shift * step
+    parts = (found, np.hypot(error, blank) * step, correlation)
+    return tuple(np.where(valid, part, np.nan).astype(np.float32) for part in parts)  # type: ignore[return-value]
+
+
+def _cleaned(
+    found: np.ndarray, sigma: np.ndarray, score: np.ndarray, before: np.ndarray, level: int, step: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fill cells without a match from their surroundings and the surface before, and remove single outliers."""
+    valid = np.isfinite(found)
+    height = np.where(valid, found, before).astype(np.float32)
+    median = cv2.medianBlur(height, 5)
+    height = np.where(np.abs(height - median) > 3 * step, median, height)
+    sigma = np.nan_to_num(sigma, nan=10 * step).astype(np.float32)
+    score = np.nan_to_num(score).astype(np.float32)
+    if level > FINE:
+        weight = np.where(valid, np.clip(score, 0.02, 1) ** 2 / (sigma**2 + (0.05 * step) ** 2), 1e-6)
+        weight = weight.astype(np.float32)
+        height = _blur(height * weight, 1.0) / np.maximum(_blur(weight, 1.0), 1e-12)
+    elif level == 1:
+        height = cv2.bilateralFilter(height, 9, BILATERAL_STEPS * step, BILATERAL_CELLS)
+    return height.astype(np.float32), sigma, score

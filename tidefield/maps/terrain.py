@@ -1,0 +1,159 @@
+"""Take plants and buildings off a surface model, and shade surfaces for people.
+
+Ground is found on coarse cells, from the low part of each, by progressive morphological opening (Pingel, Clarke and
+McBride, An improved simple morphological filter for the terrain classification of airborne LIDAR data, 2013): what an
+opening of a growing window removes, and is higher than the ground could rise within the window, is no ground. The
+ground between is interpolated. Fine cells near it keep their own heights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from tidefield.maps.rasters import NODATA, Raster, need, raster_writer
+
+COARSE_M = 0.25
+"""Coarse cells are about as large, or as the map's own, in metres."""
+LOW = 0.2
+"""Quantile of the heights in a coarse cell that is taken for its ground."""
+WIDEST_M = 9.0
+"""Largest radius of an opening: wider plants than twice that are taken for ground."""
+SLOPE = 0.15
+"""Of the ground, at most (Pingel and others, table 1)."""
+LEAST_RISE_M = 0.1
+"""What rises less above the ground belongs to it: ripples, and errors."""
+GROUND_SIGMAS = 2.0
+"""A fine cell belongs to the ground if it is not higher above it than so many standard errors, or `LEAST_RISE_M`."""
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
+ROWS = 512
+"""Of a raster that are read at once."""
+
+
+def blocks(path: Path, around: int = 0) -> Iterator[tuple[int, int, Float32[np.ndarray, "h w"]]]:
+    """Read a band by whole rows: the first row, rows without their surroundings, and values with them.
+
+    Args:
+        path: of the raster.
+        around: rows above and below that are read, too; outside of the raster the nearest row is repeated.
+    """
+    rasterio = need("rasterio")
+    with rasterio.open(path) as dataset:
+        for row in range(0, dataset.height, ROWS):
+            count = min(ROWS, dataset.height - row)
+            first, last = max(0, row - around), min(dataset.height, row + count + around)
+            values = dataset.read(1, window=((first, last), (0, dataset.width))).astype(np.float32)
+            if dataset.nodata is not None:
+                values[values == np.float32(dataset.nodata)] = np.nan
+            pad = (around - (row - first), around - (last - row - count))
+            yield row, count, np.pad(values, (pad, (0, 0)), mode="edge")
+
+
+def coarse_ground(
+    low: Float32[np.ndarray, "h w"], cell_m: float, scale: float = 1.0
+) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Find the ground of coarse cells; returns its height everywhere, and which cells are ground themselves.
+
+    Args:
+        low: low height of each cell, NaN where there is none.
+        cell_m: side of a cell, metres.
+        scale: vertical units per metre.
+    """
+    from rasterio.fill import fillnodata
+
+    known = np.isfinite(low)
+    if not known.any():
+        return low, known
+    far = float(max(low.shape))
+    surface = fillnodata(np.nan_to_num(low), known.astype(np.uint8), max_search_distance=far)
+    last = surface
+    other = np.zeros(low.shape, bool)
+    for radius in range(1, max(1, round(WIDEST_M / cell_m)) + 1):
+        disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        opened = cv2.morphologyEx(last, cv2.MORPH_OPEN, disk, borderType=cv2.BORDER_REPLICATE)
+        other |= last - opened > max(SLOPE * radius * cell_m, LEAST_RISE_M) * scale
+        last = opened
+    ground = known & ~other
+    if not ground.any():
+        return surface, known
+    filled = fillnodata(np.where(ground, surface, 0), ground.astype(np.uint8), max_search_distance=far)
+    smooth = cv2.GaussianBlur(filled, (0, 0), 1.0)
+    return np.where(ground, surface, smooth).astype(np.float32), ground
+
+
+def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
+    """Write the terrain model of a surface model.
+
+    Args:
+        dsm, sigma: heights and their standard errors.
+        out: what to write.
+        grid: of all three.
+    """
+    cell_m = grid.cell / grid.frame.metre
+    factor = max(1, round(COARSE_M / cell_m))
+    rows, columns = -(-grid.rows // factor), -(-grid.columns // factor)
+    low = np.full((rows, columns), np.nan, np.float32)
+    held: list[np.ndarray] = []
+    first = 0
+    for row, count, values in blocks(dsm):
+        held.append(values)
+        joined = np.concatenate(held)
+        whole = len(joined) // factor if row + count < grid.rows else -(-len(joined) // factor)
+        for k in range(whole):
+            part = joined[k * factor : (k + 1) * factor]
+            part = np.pad(part, ((0, 0), (0, columns * factor - grid.columns)), constant_values=np.nan)
+            part = part.reshape(len(part), columns, factor).transpose(1, 0, 2).reshape(columns, -1)
+            low[first + k] = _quantile(part)
+        first += whole
+        held = [joined[whole * factor :]]
+    ground, _ = coarse_ground(low, factor * cell_m, grid.frame.metre_up)
+    with raster_writer(out, grid) as writer:
+        for (row, count, height), (_, _, error) in zip(blocks(dsm), blocks(sigma), strict=True):
+            u = ((np.arange(grid.columns) + 0.5) / factor - 0.5).astype(np.float32)
+            v = ((np.arange(row, row + count) + 0.5) / factor - 0.5).astype(np.float32)
+            u, v = np.meshgrid(u, v)
+            below = cv2.remap(ground, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            rise = np.maximum(GROUND_SIGMAS * np.minimum(np.nan_to_num(error), LEAST_RISE_M), LEAST_RISE_M)
+            terrain = np.where(height - below <= rise * grid.frame.metre_up, height, below)
+            writer.write(row, np.where(np.isfinite(height), terrain, NODATA)[None])
+
+
+def _quantile(part: np.ndarray) -> np.ndarray:
+    """The `LOW` quantile of each row's known values; NaN where there are none."""
+    ordered = np.sort(part, axis=1)  # NaN last
+    count = np.isfinite(part).sum(1)
+    index = np.clip((LOW * (count - 1)).round().astype(int), 0, None)
+    return np.where(count > 0, ordered[np.arange(len(part)), index], np.nan)
+
+
+def hillshade(height: Float[np.ndarray, "h w"], cell: float) -> Float[np.ndarray, "h w"]:
+    """Shade a surface by a sun in the north-west, 0 to 1, as GDAL does (Horn, Hill shading and the reflectance map,
+    1981).
+
+    Args:
+        height: of cells, row 0 in the north.
+        cell: side of a cell, in the heights' unit.
+    """
+    kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]], dtype=np.float32) / (8 * cell)
+    values = height.astype(np.float32)
+    east = cv2.filter2D(values, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
+    north = -cv2.filter2D(values, cv2.CV_32F, kernel.T, borderType=cv2.BORDER_REPLICATE)
+    azimuth, elevation = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ELEVATION_DEG)
+    sun = np.array([math.sin(azimuth), math.cos(azimuth)]) * math.cos(elevation)
+    shade = (math.sin(elevation) - sun[0] * east - sun[1] * north) / np.sqrt(1 + east**2 + north**2)
+    return np.clip(shade, 0, 1)
+
+
+def write_hillshade(heights: Path, out: Raster, grid: Any) -> None:
+    """Write the hillshade of a raster of heights: 1 to 255, 0 where there is none."""
+    cell = grid.cell / grid.frame.metre * grid.frame.metre_up
+    with raster_writer(out, grid) as writer:
+        for row, count, values in blocks(heights, around=1):
+            shade = np.round(1 + 254 * np.nan_to_num(hillshade(values, cell)[1 : count + 1]))
+            writer.write(row, np.where(np.isfinite(values[1 : count + 1]), shade, 0)[None])
