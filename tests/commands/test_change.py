@@ -82,6 +82,20 @@ def test_the_numbers_tell_volumes_intervals_and_where_they_come_from(compared: t
         assert [row["volume"] for row in csv.DictReader(file)][:3] == ["net", "cut", "fill"]
 
 
+def test_the_report_is_one_page_with_the_volumes_and_the_pictures(compared: tuple[Path, np.ndarray]):
+    import re
+
+    out, _ = compared
+    page = (out / "change.html").read_text()
+    assert page.count('src="data:image/png;base64,') >= 5
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert "Between 2023-05-01 and 2024-05-03" in page
+    cut = json.loads((out / "change.json").read_text())["volumes"]["cut"]
+    assert f"{cut['value_m3']:.1f} m³ were cut" in page
+    assert "red is lower, blue is higher" in page
+    assert str(out.parent) not in page  # of paths only their last names
+
+
 def test_clouds_are_compared_as_surfaces_and_by_m3c2(tmp_path: Path):
     import laspy
     from pyproj import CRS

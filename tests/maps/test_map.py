@@ -135,6 +135,14 @@ def test_terrain_contours_and_hillshades_lie_on_the_same_cells(out: Path):
     assert len(json.loads((out / "contours" / "contours.geojson").read_text())["features"]) == about["lines"] > 0
 
 
+def test_the_report_shows_the_map_without_the_network(out: Path):
+    page = (out / "odm_report" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert "http://" not in page
+    assert "not georeferenced" in page
+    assert "how far this map is from surveyed points is not known" in page
+
+
 def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
     cloud = laspy.read(out / CLOUD)
     assert (cloud.header.version.major, cloud.header.version.minor, cloud.header.point_format.id) == (1, 4, 7)

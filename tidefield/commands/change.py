@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 import sys
 from dataclasses import dataclass, replace
@@ -26,9 +27,10 @@ log = logging.getLogger(__name__)
 class Change:
     """Measure what changed between two surveys: what was eroded, what grew, and how sure that is.
 
-    OUT is a new folder: change.tif (difference, its standard error and p-value), significant.tif, change.gpkg
-    (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have 95% intervals from the
-    random, the spatially correlated and the systematic part of the error, which are measured over stable ground.
+    OUT is a new folder: change.html (the report), change.tif (difference, its standard error and p-value),
+    significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have
+    95% intervals from the random, the spatially correlated and the systematic part of the error, which are measured
+    over stable ground.
     """
 
     earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
@@ -79,6 +81,7 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     from tidefield.change.clouds import compare_clouds, write_distances
     from tidefield.change.inputs import open_pair
     from tidefield.change.measure import Options, measure
+    from tidefield.change.page import write_page
     from tidefield.change.regions import read_regions
     from tidefield.change.write import write_all
     from tidefield.progress import ProgressBar
@@ -106,7 +109,8 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     for remark in found.remarks:
         log.warning(remark)
     with completed_folder(options.out) as folder:
-        write_all(found, folder, shlex.join(["tidefield", *sys.argv[1:]]))
+        numbers = write_all(found, folder, _command())
+        write_page(found, numbers, folder / "change.html")
         if pair.clouds is not None:
             registration = found.errors.registration
             with ProgressBar(console, "Measuring M3C2 distances") as bar:
@@ -128,6 +132,12 @@ def _compare(options: Change, console: Console, work: Path) -> None:
         soft_wrap=True,
     )
     console.print(str(options.out), soft_wrap=True)
+
+
+def _command() -> str:
+    """The command as it was given, with the names of files and folders alone: a report is sent on."""
+    words = [Path(word).name if "/" in word or os.sep in word else word for word in sys.argv[1:]]
+    return shlex.join(["tidefield", *words])
 
 
 def _check(options: Change) -> None:

@@ -30,6 +30,7 @@ from tidefield.maps.contours import contours, interval_of, read_reduced, write_c
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
+from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
 from tidefield.maps.terrain import write_hillshade, write_terrain
@@ -346,6 +347,8 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
         },
         **found,
     }  # fmt: skip
+    shown = {"orthophoto": ORTHOPHOTO, "hillshade": DSM_HILLSHADE, "sigma": SIGMA, "views": VIEWS}
+    write_report(result, out, shown, job.fill)
     write_json(out / MAP_FILE, result)
     return result
 

@@ -45,9 +45,12 @@ BORDER_PX = 4.0
 """Pixels along a photograph's border that are not used."""
 STEP_PX = 0.7
 """Parallax between heights that are tried, of the photographs farthest apart, in cells."""
-HALF_STEPS = {8: (7, 7), 4: (5,), 2: (6,), 1: (7, 3)}
+HALF_STEPS = {8: (24, 7), 4: (5,), 2: (6,), 1: (7, 3)}
 """Heights that are tried above and below the surface found so far, in each sweep, by the size of the cells; the second
-sweep has half the step."""
+sweep has half the step. The first one finds trees without any sparse point."""
+EDGE_CELLS, EDGE_STEPS, EDGE_HALF = 6, 4.0, 3
+"""Where the surface within so many cells differs by more than so many steps, the heights on both sides of the edge are
+tried, too, with so many steps above and below: coarse windows widen plants."""
 SIGMA_CELLS = {8: 1.5, 4: 1.6, 2: 1.4, 1: 1.4}
 """Standard deviation of the windows in which photographs are normalised, in cells."""
 SHARP, WIDE = 1.0, 2.5
@@ -58,9 +61,9 @@ FINE = 2
 DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 """Grey values of 255 beyond which a photograph's difference from the median of all is an occlusion, and the weight of
 the mean difference, as a share of that, against the correlation."""
-SHARE_MATCHING, SHARES_ROUGHNESS = 0.1, ((1.2, 3.0), (0.2, 6.0))
+SHARE_MATCHING, SHARES_ROUGHNESS = 0.1, ((1.6, 3.0), (0.5, 6.0), (0.2, 12.0))
 """Shares of the standard error: of that of single cells' matching, which the windows and the filter reduce, and of the
-roughness within windows of so many cells."""
+roughness within windows of so many cells, found on three built-in flats with trees and marsh."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
 """Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
 FLOOR = 3.0
@@ -351,7 +354,9 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
         for sweep, half in enumerate(HALF_STEPS[level]):
             offsets = step / (1 + sweep) * np.arange(-half, half + 1, dtype=np.float32)
             found = _sweep(used, grey, factor, east, north, height, offsets, level)
-            height, sigma, score = _cleaned(*found, height, level, step)
+            if level <= FINE and sweep == 0:
+                found = _with_both_sides(found, used, grey, factor, east, north, height, step, level)
+            height, sigma, score = _cleaned(*found[:3], height, level, step)
     assert height is not None
     assert sigma is not None
     assert score is not None
@@ -401,8 +406,8 @@ def _sweep(
     height: np.ndarray,
     offsets: np.ndarray,
     level: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Try heights; returns the best one, its standard error and its score, NaN where fewer than two photographs see."""
+) -> tuple[np.ndarray, ...]:
+    """Try heights; returns the best one, its standard error, correlation and score; NaN where less than two see it."""
     views = []
     for view, index in used:
         picture = grey.read(index, factor)
@@ -448,6 +453,31 @@ def _sweep(
     return _best(joint, each, sees, offsets, height)
 
 
+def _with_both_sides(
+    found: tuple[np.ndarray, ...],
+    used: list[tuple[View, int]],
+    grey: GreyPhotographs,
+    factor: int,
+    east: np.ndarray,
+    north: np.ndarray,
+    height: np.ndarray,
+    step: float,
+    level: int,
+) -> tuple[np.ndarray, ...]:
+    """Near edges, try the surface of either side in each cell; returns what scores best."""
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE_CELLS + 1,) * 2)
+    low, high = cv2.erode(height, disk), cv2.dilate(height, disk)
+    edge = high - low > EDGE_STEPS * step
+    if not edge.any():
+        return found
+    offsets = step * np.arange(-EDGE_HALF, EDGE_HALF + 1, dtype=np.float32)
+    for side in (low, high):
+        other = _sweep(used, grey, factor, east, north, _blur(side, 2.0), offsets, level)
+        better = edge & (other[3] > np.nan_to_num(found[3], nan=-np.inf))
+        found = tuple(np.where(better, a, b) for a, b in zip(other, found, strict=True))
+    return found
+
+
 def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
     side = 2 * round(2.5 * sigma) + 1
     return cv2.GaussianBlur(values, (side, side), sigma)
@@ -478,8 +508,8 @@ def _best(
     sees: Float32[np.ndarray, "V H W"],
     offsets: np.ndarray,
     height: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the height of the best score, its standard error, and the mean correlation there."""
+) -> tuple[np.ndarray, ...]:
+    """Find the height of the best score, its standard error, the mean correlation there, and the score."""
     number = sees.sum(0)
     step = float(offsets[1] - offsets[0])
     pulled = joint - PULL * (offsets / offsets[-1])[:, None, None] ** 2
@@ -499,8 +529,8 @@ def _best(
     blank = 0.3 * np.sqrt(np.maximum(1 - correlation, 0.02) / (curvature * np.maximum(number, 1)))
     valid = number >= 2
     found = height + offsets[best] + shift * step
-    parts = (found, np.hypot(error, blank) * step, correlation)
-    return tuple(np.where(valid, part, np.nan).astype(np.float32) for part in parts)  # type: ignore[return-value]
+    parts = (found, np.hypot(error, blank) * step, correlation, mid)
+    return tuple(np.where(valid, part, np.nan).astype(np.float32) for part in parts)
 
 
 def _cleaned(

@@ -1,0 +1,222 @@
+"""Draw the maps and charts of a page of change: red lowers, blue rises."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+from markupsafe import Markup
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from tidefield.change.errors import Z95
+from tidefield.change.measure import Change
+from tidefield.change.surfaces import Grid
+
+LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
+INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
+_SIDE = 1400
+"""Longest side of a map, cells."""
+_INCHES = 7.6
+_DPI = 130
+_SUN = np.array([-1, 1, 1.4]) / np.linalg.norm([-1, 1, 1.4])
+"""From the north-west."""
+_STYLE: list[Any] = [
+    "default",
+    {
+        "font.size": 9.5,
+        "text.parse_math": False,
+        "text.color": INK,
+        "axes.edgecolor": SOFT,
+        "axes.labelcolor": SOFT,
+        "xtick.color": SOFT,
+        "ytick.color": SOFT,
+        "axes.linewidth": 0.8,
+    },
+]
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """A change at the detail of a page.
+
+    Attributes:
+        dz, heights: of the difference and the earlier survey.
+        signs: of the outlines.
+        stable: ground that errors were measured on.
+    """
+
+    grid: Grid
+    dz: Float32[np.ndarray, "rows columns"]
+    heights: Float32[np.ndarray, "rows columns"]
+    signs: np.ndarray
+    stable: np.ndarray
+
+
+def thinned(change: Change) -> Thinned:
+    """Take every second, third, ... cell of a large change."""
+    grid = change.grid
+    step = -(-max(grid.shape) // _SIDE)
+    rows, columns = len(range(0, grid.rows, step)), len(range(0, grid.columns, step))
+    heights = np.empty((rows, columns), np.float32)
+    with change.earlier.on_grid(grid) as read:
+        for part in grid.strips():
+            first = -(-part.start // step) * step
+            heights[first // step : -(-part.stop // step)] = read(part.start, part.stop)[
+                first - part.start :: step, ::step
+            ]
+    small = Grid(grid.crs, grid.west_m, grid.north_m, grid.cell_m * step, columns, rows)
+    lookup = np.concatenate([[0], change.outlines.signs])
+    return Thinned(
+        small,
+        change.dz[::step, ::step],
+        heights,
+        lookup[change.outlines.labels[::step, ::step]],
+        change.stable[::step, ::step],
+    )
+
+
+def hillshade(heights: Float32[np.ndarray, "rows columns"], cell_m: float) -> Float32[np.ndarray, "rows columns"]:
+    """Shade heights with the light from the north-west, in [0, 1]; NaN where unknown. Flats are exaggerated."""
+    north, east = np.gradient(heights, cell_m)
+    known = np.isfinite(north) & np.isfinite(east)
+    if not known.any():
+        return np.full(heights.shape, np.nan, np.float32)
+    steep = float(np.quantile(np.hypot(north, east)[known], 0.9))
+    scale = min(8.0, 0.35 / max(steep, 1e-6))
+    normal = np.stack([-east * scale, north * scale, np.ones_like(east)])
+    light = np.tensordot(_SUN, normal, 1) / np.sqrt((normal**2).sum(axis=0))
+    return np.where(known, light.clip(0, 1), np.nan).astype(np.float32)
+
+
+def draw_change(small: Thinned, limit_m: float, what: str) -> Markup:
+    """The map of dz over the earlier survey's relief, with the outlines."""
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    dz = small.dz.clip(-limit_m, limit_m)
+    alpha = np.where(np.isfinite(dz), 0.15 + 0.8 * np.minimum(np.abs(np.nan_to_num(dz)) / (0.5 * limit_m), 1), 0)
+    image = axes.imshow(
+        dz, cmap="RdBu", vmin=-limit_m, vmax=limit_m, alpha=alpha, extent=_extent(small.grid), interpolation="nearest"
+    )
+    image.set_rasterized(True)
+    for sign, colour in ((-1, LOWER), (1, HIGHER)):
+        if (small.signs == sign).any():
+            place = {"extent": _extent(small.grid), "origin": "upper"}
+            axes.contour(small.signs == sign, levels=[0.5], colors=colour, linewidths=0.9, **place)
+    bar = figure.colorbar(image, ax=axes, fraction=0.035, pad=0.02, alpha=1)
+    bar.set_label("later minus earlier height (m)")
+    return _png(figure, what)
+
+
+def draw_stable(small: Thinned, what: str) -> Markup:
+    """The map of the ground that shift and errors were measured on."""
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    cover = np.where(small.stable & np.isfinite(small.dz), 1.0, np.nan)
+    axes.imshow(cover, cmap=ListedColormap([STABLE]), alpha=0.55, extent=_extent(small.grid), interpolation="nearest")
+    axes.legend(handles=[Patch(color=STABLE, alpha=0.55, label="stable ground")], loc="lower left", framealpha=0.9)
+    return _png(figure, what)
+
+
+def draw_stable_histogram(change: Change, what: str) -> Markup:
+    """Residuals over stable ground, before and after co-registration, and the level of detection."""
+    step = 1 + math.isqrt(change.dz.size // 1_000_000)
+    after = change.dz[::step, ::step][change.stable[::step, ::step]]
+    after = after[np.isfinite(after)]
+    figure = _figure(5.0, 2.7)
+    axes = figure.add_axes((0.11, 0.2, 0.86, 0.74))
+    shift = change.errors.registration.vertical_m
+    reach = max(3 * Z95 / 2 * change.errors.registration.after[2], abs(shift) * 1.2, 1e-3)
+    edges = np.linspace(-reach, reach, 81)
+    for values, colour, label in ((after + shift, SOFT, "before"), (after, "#1f5f86", "after")):
+        axes.hist(values, edges.tolist(), histtype="step", color=colour, label=label)
+    for sign in (-1, 1):
+        axes.axvline(sign * change.detection_m[1], color=LOWER, linewidth=0.8, linestyle="--")
+    axes.set(xlabel="dz over stable ground (m); dashed: level of detection", yticks=[])
+    axes.spines[["left", "top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    return _png(figure, what)
+
+
+def draw_variogram(change: Change, what: str) -> Markup | None:
+    """The variogram over stable ground and the model; None where it could not be measured."""
+    variogram = change.errors.variogram
+    if not variogram.lags_m:
+        return None
+    figure = _figure(5.0, 2.7)
+    axes = figure.add_axes((0.12, 0.2, 0.85, 0.74))
+    lags = np.array(variogram.lags_m)
+    line = np.geomspace(lags[0], lags[-1], 200)
+    axes.semilogx(lags, variogram.semivariances, "o", color="#1f5f86", markersize=3.5, label="measured")
+    axes.semilogx(line, 1 - variogram.correlation(line), color=SOFT, linewidth=1, label="model")
+    axes.axhline(variogram.nugget, color=RULE, linewidth=0.8)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set(xlabel="distance (m)", ylabel="semivariance over variance", ylim=(0, None))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="lower right")
+    return _png(figure, what)
+
+
+def draw_section(change: Change, row: int, what: str) -> Markup:
+    """Heights of both dates along a row of the grid, with the 95% band of the later one."""
+    grid = change.grid
+    with change.earlier.on_grid(grid) as read:
+        earlier = read(row, row + 1)[0]
+    later = earlier + change.dz[row]
+    band = Z95 * change.errors.cell_sigma(slice(row, row + 1))[0]
+    x = (np.arange(grid.columns) + 0.5) * grid.cell_m
+    figure = _figure(_INCHES, 2.5)
+    axes = figure.add_axes((0.08, 0.22, 0.9, 0.73))
+    axes.fill_between(x, later - band, later + band, color=HIGHER, alpha=0.25, linewidth=0)
+    axes.plot(x, earlier, color=INK, linewidth=0.9, label=change.earlier.name)
+    axes.plot(x, later, color=HIGHER, linewidth=0.9, label=f"{change.later.name}, with its 95% band of change")
+    axes.set(xlabel="metres from the western edge", ylabel="height (m)", xlim=(x[0], x[-1]))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    return _png(figure, what)
+
+
+def _figure(width: float, height: float) -> Figure:
+    with style.context(_STYLE):
+        return Figure(figsize=(width, height), dpi=_DPI)
+
+
+def _map(grid: Grid) -> tuple[Figure, Axes]:
+    aspect = min(1.5, max(0.25, grid.rows / grid.columns))
+    with style.context(_STYLE):
+        figure = Figure(figsize=(_INCHES, _INCHES * 0.86 * aspect + 0.5), dpi=_DPI, layout="constrained")
+        axes = figure.add_subplot()
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.locator_params(nbins=5)
+    axes.tick_params(labelsize=8)
+    axes.set_aspect("equal")
+    return figure, axes
+
+
+def _relief(axes: Axes, small: Thinned) -> None:
+    shade = hillshade(small.heights, small.grid.cell_m)
+    axes.imshow(0.45 + 0.5 * shade, cmap="gray", vmin=0, vmax=1, extent=_extent(small.grid), interpolation="nearest")
+
+
+def _extent(grid: Grid) -> tuple[float, float, float, float]:
+    west, south, east, north = grid.bounds
+    return west, east, south, north
+
+
+def _png(figure: Figure, what: str) -> Markup:
+    """An image element with the picture in it."""
+    buffer = io.BytesIO()
+    with style.context(_STYLE):
+        figure.savefig(buffer, format="png", metadata={"Software": None})
+    data = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(what, data)

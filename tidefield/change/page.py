@@ -1,0 +1,144 @@
+"""Write change.html: what changed in three sentences, maps, sections, and where the errors come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+from tidefield.change.figures import (
+    HIGHER,
+    LOWER,
+    draw_change,
+    draw_section,
+    draw_stable,
+    draw_stable_histogram,
+    draw_variogram,
+    thinned,
+)
+from tidefield.change.measure import Change
+from tidefield.change.write import outline_rows
+from tidefield.files import write_text
+
+MINUS = "\u2212"
+_SHOWN_OUTLINES = 12
+_SECTIONS = 2
+
+
+def write_page(change: Change, numbers: dict[str, Any], path: Path) -> None:
+    """Write the page, which needs no other file."""
+    environment = Environment(
+        loader=ChoiceLoader(
+            [PackageLoader("tidefield.change", "templates"), PackageLoader("tidefield.survey.report", "templates")]
+        ),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "metres": lambda value, digits=3: number(value, digits),
+        "signed": lambda value, digits=3: signed(value, digits),
+        "cubic": cubic,
+        "percent": lambda value: f"{100 * value:.1f}%",
+    }
+    small = thinned(change)
+    limit = max(float(np.nanquantile(np.abs(small.dz), 0.99)), 2 * change.detection_m[1])
+    earlier, later = change.earlier.name, change.later.name
+    named = f"between {earlier} and {later}"
+    rows = outline_rows(change)
+    html = environment.get_template("change.html").render(
+        n=numbers,
+        title=f"Change {named}",
+        sentences=sentences(change),
+        change_map=draw_change(small, limit, f"Map of the change of height {named}; red is lower, blue is higher"),
+        stable_map=draw_stable(small, "Map of the stable ground"),
+        histogram=draw_stable_histogram(change, "Histogram of dz over stable ground before and after co-registration"),
+        variogram=draw_variogram(change, "Variogram of dz over stable ground, and its model"),
+        sections=[
+            (row, draw_section(change, row, f"Section from west to east, {_from_north(change, row)}"))
+            for row in section_rows(change)
+        ],
+        from_north=lambda row: _from_north(change, row),
+        volumes=[("Net", change.net), ("Cut", change.cut), ("Fill", change.fill), ("Net outside", change.outside)],
+        outlines=rows[:_SHOWN_OUTLINES],
+        more=len(rows) - _SHOWN_OUTLINES,
+        colours={"lower": LOWER, "higher": HIGHER},
+        regions=change.per_region,
+        limits=limits(change),
+    )
+    write_text(path, html)
+
+
+def sentences(change: Change) -> list[str]:
+    """What changed, in three sentences."""
+    earlier, later = change.earlier.name, change.later.name
+    verb = {True: "gained", False: "lost"}[change.net.value_m3 > 0]
+    low, high = (cubic(v) for v in change.net.interval_m3)
+    first = (
+        f"Between {earlier} and {later} the ground {verb} {cubic(abs(change.net.value_m3))} m³ in all (95%: {low} to "
+        f"{high} m³ on {cubic(change.net.area_m2)} m²)"
+    )
+    first += "." if change.net.significant else ", which is not distinguishable from no change."
+    parts = [
+        f"{cubic(volume.value_m3)} m³ {word} (95%: {cubic(volume.interval_m3[0])} to {cubic(volume.interval_m3[1])} m³)"
+        f" on {cubic(volume.area_m2)} m²"
+        for word, volume in (("were cut", change.cut), ("were filled", change.fill))
+        if volume.area_m2 > 0
+    ]
+    second = "Nothing stands out from the errors: no ground is outlined."
+    if parts:
+        second = f"In the outlines {' and '.join(parts)}."
+    third = (
+        f"A single cell shows a change from {number(change.detection_m[1], 3)} m on; of the stable ground "
+        f"{100 * change.false_alarms:.1f}% does, where 5% are expected."
+    )
+    return [first, second, third]
+
+
+def section_rows(change: Change) -> list[int]:
+    """Rows of the grid through the largest cut and the largest fill."""
+    rows: list[int] = []
+    for sign in (-1, 1):
+        mine = [(volume.value_m3, k) for k, volume, _ in change.each if change.outlines.signs[k - 1] == sign]
+        if mine:
+            box = change.outlines.boxes[max(mine)[1] - 1]
+            rows.append((box[0].start + box[0].stop) // 2)
+    if not rows:
+        rows = [int(np.isfinite(change.dz).sum(axis=1).argmax())]
+    return sorted(set(rows))[:_SECTIONS]
+
+
+def _from_north(change: Change, row: int) -> str:
+    return f"{(row + 0.5) * change.grid.cell_m:.0f} m south of the northern edge"
+
+
+def limits(change: Change) -> list[str]:
+    """What the page does not tell."""
+    found = [
+        "Cut and fill are of the outlines. Narrow changes near the level of detection are in the net volume only.",
+        "Plants and water are part of the surfaces: where they changed, the change is not of the ground.",
+    ]
+    if change.errors.registration.shift_error_m == 0:
+        found.append("The surveys were compared where they lie: no horizontal shift was estimated.")
+    if change.errors.registration.model == "none":
+        found.append("Heights were taken as they are: no vertical shift was estimated.")
+    return found
+
+
+def number(value: float, digits: int) -> str:
+    """A number with a true minus."""
+    return f"{value:.{digits}f}".replace("-", MINUS)
+
+
+def signed(value: float, digits: int) -> str:
+    """A number with its sign."""
+    return f"{value:+.{digits}f}".replace("-", MINUS)
+
+
+def cubic(value: float) -> str:
+    """A volume or an area: whole, or with three digits where it is small."""
+    text = f"{value:,.0f}" if abs(value) >= 100 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+    return text.replace(",", "\u202f").replace("-", MINUS)
