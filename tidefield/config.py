@@ -52,9 +52,6 @@ class EncoderConfig:
     """Basic blocks of the residual stages; ResNet-34 has 3, 4, 6."""
     instance_norm: bool = True
     """Instance norms in place of ResNet's batch norms; without them features do not depend on how much is encoded."""
-    aligned: bool = True
-    """The decoder returns features to where they were computed. The shipped weights of `paper` have learned without
-    (docs/method.md, section 2)."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +189,7 @@ PAPER = Config(
     preset="paper",
     network=NetworkConfig(
         kind="paper",
-        encoder=EncoderConfig(aligned=False),
+        encoder=EncoderConfig(),
         passes=(PassConfig(stride=1, samples=64, feature_stride=4, feature_channels=64, hidden=64),),
         views=8,
     ),

@@ -21,9 +21,10 @@ class Encoder(nn.Module):
     Args:
         config: widths, blocks and norms.
         outputs: (stride, channels) of each output; strides 4, 2 and 1 are possible.
+        aligned: the decoder returns features to where they were computed (docs/method.md, section 2).
     """
 
-    def __init__(self, config: EncoderConfig, outputs: tuple[tuple[int, int], ...]) -> None:
+    def __init__(self, config: EncoderConfig, outputs: tuple[tuple[int, int], ...], aligned: bool = True) -> None:
         super().__init__()
         w0, w1, w2, w3 = config.widths
         norm = config.instance_norm
@@ -35,7 +36,7 @@ class Encoder(nn.Module):
         # Skips at strides 8 and 4 (layers 3 and 2 of Table 1), then, for finer outputs, 2 (layer 1) and 1 (the input).
         channels, skips = (w3, w2, w1, w0, min(w0, 8)), (w2, w1, w0, 3)
         steps = 2 + sum(min(self.strides) < stride for stride in (4, 2))
-        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm, config.aligned) for k in range(steps))
+        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm, aligned) for k in range(steps))
         at_stride = {4: w1, 2: w0, 1: min(w0, 8)}
         self.out = nn.ModuleList(nn.Conv2d(at_stride[s], c, 1) for s, c in outputs)
 

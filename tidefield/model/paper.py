@@ -44,7 +44,8 @@ class PaperNetwork(Network):
         super().__init__(config)
         (self.rays,) = config.passes
         hidden, channels = self.rays.hidden, self.rays.feature_channels
-        self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),))
+        # The shipped weights have learned with displaced features (docs/method.md, section 2).
+        self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),), aligned=False)
         self.aggregate = Aggregate(channels, hidden, uniform_weights="direction weights" in config.without)
         if "ray transformer" not in config.without:
             self.transformer = RayTransformer(hidden, config.heads)
