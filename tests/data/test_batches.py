@@ -146,7 +146,7 @@ def test_photographs_at_the_common_exposure():
 def test_unprojected_pixels_lie_on_the_wall():
     own = scene()
     camera, asked = own.cameras[2], torch.tensor([[4.0, 4.0], [44.0, 32.0], [50.0, -3.0]])
-    points = unproject_to_surface(camera, DepthPriors(own)[2], asked)
+    points = unproject_to_surface(camera, DepthPriors(own)[2].cells, asked)
     torch.testing.assert_close(points[:, 2], torch.full((3,), wall.DEPTH), rtol=1e-3, atol=0)
     uv = camera.project(points)[0][0]
     torch.testing.assert_close(uv[:2], asked[:2], atol=1e-3, rtol=0)
@@ -155,7 +155,7 @@ def test_unprojected_pixels_lie_on_the_wall():
 
 def test_without_points_the_surface_is_between_near_and_far():
     own = replace(scene(), points=None)
-    points = unproject_to_surface(own.cameras[0], DepthPriors(own)[0], torch.full((1, 2), 4.0))
+    points = unproject_to_surface(own.cameras[0], DepthPriors(own)[0].cells, torch.full((1, 2), 4.0))
     torch.testing.assert_close(points[:, 2], torch.full((1,), 2 / (1 / 3 + 1 / 10)))
 
 
@@ -164,7 +164,7 @@ def test_neighbours_of_a_view_are_training_photographs(strategy: str):
     own = scene()
 
     def neighbours(target: int, count: int) -> Neighbours:
-        prior = DepthPriors(own)[target]
+        prior = DepthPriors(own)[target].cells
         return choose_neighbours(own.cameras[target], prior, torch.zeros(2), (3, 2), 16, own, count, strategy)
 
     every = neighbours(1, 100)
@@ -177,7 +177,7 @@ def test_neighbours_of_a_view_are_training_photographs(strategy: str):
 
 def test_adjacent_tiles_share_the_blend_weights_of_their_common_corners():
     at = wall.scene(wall.cameras(12, 96, 72, step=0.2), (6,))
-    found = choose_neighbours(at.cameras[6], DepthPriors(at)[6], torch.zeros(2), (6, 4), 16, at, 4, "seen")
+    found = choose_neighbours(at.cameras[6], DepthPriors(at)[6].cells, torch.zeros(2), (6, 4), 16, at, 4, "seen")
     table = torch.zeros(6 * 4, 12, 4).scatter_(1, found.index[..., None].expand(-1, -1, 4), found.blend_weight)
     grid = table.reshape(4, 6, 12, 4)
     across = (grid[:, :-1, :, [1, 3]] - grid[:, 1:, :, [0, 2]]).abs()

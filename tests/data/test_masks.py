@@ -165,7 +165,7 @@ def test_surface_seen_through_masks_only_is_not_doubly_seen() -> None:
 
 def test_photographs_that_are_masked_there_are_no_neighbours() -> None:
     own = masked_wall(7, masked=(2, 4))
-    prior, corner = DepthPriors(own)[3], torch.tensor([2.0, 10.0])
+    prior, corner = DepthPriors(own)[3].cells, torch.tensor([2.0, 10.0])
     found = choose_neighbours(own.cameras[3], prior, corner, (1, 1), 8, own, 2, "view")
     weighty = found.index[found.blend_weight.amax(-1) > 1e-3]
     assert not torch.isin(weighty, torch.tensor([2, 4])).any()

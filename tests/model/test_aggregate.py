@@ -188,7 +188,15 @@ def comparing() -> ComparingAggregate:
 def gathered(valid: Tensor) -> Gathered:
     """What the views show at the samples; of it, the tests need the colours."""
     colours = torch.sigmoid(draw(T, N, P, 3, seed=3))
-    return Gathered(colours, draw(T, N, P, C), draw(T, N, P, 3), cosines(), valid, torch.ones(T, N, P).double())
+    return Gathered(
+        colours,
+        draw(T, N, P, C),
+        draw(T, N, P, 3),
+        cosines(),
+        valid,
+        torch.ones(T, N, P).double(),
+        torch.zeros(T, N, P).double(),
+    )
 
 
 def test_where_no_view_sees_the_colour_is_grey_and_nothing_is_known():

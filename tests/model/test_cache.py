@@ -43,7 +43,9 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     # Eight pixels around each middle, seen along rays of the view itself.
     around = seen_uv[:, None] + torch.tensor([[-8.0, -3.0], [0.0, 0.0], [7.0, 5.0]])
     directions = view.directions_world(around.reshape(1, -1, 2)).reshape(len(seen_uv), 3, 3)
-    found = views.read(1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5))
+    found = views.read(
+        1, view.position_world[None] + 5 * directions, directions, torch.full((4, 3, 2), 0.5), torch.ones(4, 3)
+    )
     assert found.valid.all()
     assert len(views.which.unique()) == 4
     column, row = around.reshape(-1, 2).long().unbind(-1)
@@ -82,5 +84,7 @@ def test_masked_pixels_are_no_valid_samples(network: Network):
         neighbours = Neighbours(torch.full((4, 1), index), torch.ones(4, 1, 4))
         views = FeatureCache(network, at, CPU).views(view, neighbours, middle)
         for stride, coarse in ((4, True), (1, False)):
-            found = views.read(stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), coarse)
+            found = views.read(
+                stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), torch.ones(4, 1), coarse
+            )
             assert found.valid[:, 0, 0].tolist() == expected

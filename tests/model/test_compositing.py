@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.model.compositing import composite, weights
-from tidefield.model.swift import surface_logits, surface_shares
+from tidefield.model.swift import surface_logits, surface_shares, widths
 
 
 def random_ray(rays: int = 20, samples: int = 9, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -95,19 +95,39 @@ def test_opaque_and_empty_samples_have_finite_gradients():
 def test_surface_logits_weigh_samples_by_the_softmax_of_their_scores(opaque: bool):
     _, delta = random_ray()
     score = 3 * torch.randn(delta.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    sigma = F.softplus(surface_logits(score, opaque)) / delta
-    candidates = score if opaque else F.pad(score, (0, 1))
+    empty = None if opaque else torch.tensor(-1.5, dtype=torch.float64)
+    sigma = F.softplus(surface_logits(score, empty)) / delta
+    # The score of an empty ray is against those of all 9 samples together.
+    candidates = score if empty is None else torch.cat([score, (empty + math.log(9)).expand(20, 1)], -1)
     expected = torch.softmax(candidates, -1)[..., : score.shape[-1]]
-    torch.testing.assert_close(surface_shares(score, opaque), expected)
+    torch.testing.assert_close(surface_shares(score, empty), expected)
     torch.testing.assert_close(weights(sigma, endless(delta) if opaque else delta), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_surface_logits_and_their_gradients_are_finite_for_samples_that_cannot_be_told_apart_from_nothing():
     score = torch.tensor([[-30.0] * 5, [-30.0, 0.0, -30.0, 40.0, -30.0], [60.0, -30.0, -30.0, -30.0, 0.0]])
-    for opaque in (True, False):
+    for empty in (None, torch.tensor(-3.0)):
         given = score.clone().requires_grad_()
-        logits = surface_logits(given, opaque)
+        logits = surface_logits(given, empty)
         logits.sum().backward()
         assert logits.isfinite().all()
         assert given.grad is not None
         assert given.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("where", ["evenly", "unevenly"])
+def test_more_samples_of_one_density_stop_no_more_light(where: str):
+    """The surface's distribution is a function of the place on the ray: sampling it densely changes nothing."""
+
+    def opacity(samples: int, before: float) -> Tensor:
+        s = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples
+        if where == "unevenly":
+            s = s**1.5
+        score = (-2 * (s - 0.4) ** 2)[None] + widths(s[None]).log()
+        sigma = F.softplus(surface_logits(score, torch.tensor(-0.7, dtype=torch.float64)))
+        return weights(sigma, torch.ones_like(sigma))[s[None] < before].sum()
+
+    for before in (0.5, 1.0):
+        few, many = opacity(24, before), opacity(384, before)
+        assert 0.1 < many < 0.9
+        assert abs(few - many) < 0.03, "a sample's width is 0.04"

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tidefield.config import PAPER, PRESETS, SWIFT, EncoderConfig
-from tidefield.model.encoder import Encoder
+from tidefield.model.encoder import Encoder, double
 
 SMALL = EncoderConfig(widths=(4, 4, 6, 8), blocks=(1, 1, 1), instance_norm=False)
 ALL = ((4, 5), (2, 4), (1, 3))
@@ -143,3 +143,26 @@ def test_the_basic_block_is_resnets_layer_by_layer():
     hidden = F.relu(block.first[1](block.first[0](x)))
     expected = F.relu(block.second[1](block.second[0](hidden)) + block.shortcut(x))
     torch.testing.assert_close(block(x), expected)
+
+
+@pytest.mark.parametrize("outputs", [((4, 6),), ((4, 6), (1, 2))])
+def test_features_stay_where_they_were_computed(outputs: tuple[tuple[int, int], ...]):
+    """With kernels that are symmetric, the features of a photograph upside down are those of the photograph, upside
+    down; if a step displaced them, they would be displaced the other way."""
+    encoder = randomise(Encoder(SMALL, outputs)).double()
+    for module in encoder.modules():
+        if isinstance(module, nn.Conv2d):
+            module.weight.data = (module.weight + module.weight.flip(-1, -2)).data / 2
+    # 16 k + 1 pixels: the texels of every stride then lie symmetrically.
+    image = torch.rand(1, 3, 65, 97, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with torch.no_grad():
+        for upright, turned in zip(encoder(image), encoder(image.flip(-1, -2)), strict=True):
+            torch.testing.assert_close(turned.flip(-1, -2), upright)
+
+
+def test_doubled_maps_have_their_texels_at_every_second_place():
+    ramp = torch.arange(5.0)[:, None] + 10 * torch.arange(4.0)
+    doubled = double(ramp[None, None])[0, 0]
+    assert doubled.shape == (10, 8)
+    torch.testing.assert_close(doubled[::2, ::2], ramp)
+    torch.testing.assert_close(doubled[1:-1:2, :-1], (doubled[:-2:2, :-1] + doubled[2::2, :-1]) / 2)

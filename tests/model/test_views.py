@@ -78,7 +78,7 @@ def test_views_read_each_sample_where_it_projects():
         points = torch.cat([xy, torch.full((4, 1), wall.DEPTH)], -1)
         points = torch.cat([points, torch.tensor([[0.0, 0.0, -wall.DEPTH]])]).expand(2, 5, 3)
         towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-        gathered = views.read(1, points, towards, MIDDLE)
+        gathered = views.read(1, points, towards, MIDDLE, torch.ones(points.shape[:2]))
     for n, index in enumerate([2, 4, 1, 5, 0]):
         camera = at.cameras[index]
         uv, z = camera.project(points[0])
@@ -101,7 +101,9 @@ def test_what_lies_behind_a_view_is_not_seen_by_it_wherever_its_pixels_would_be(
     with torch.inference_mode():
         _, views, _ = looking(own, at)
         assert views is not None
-        gathered = [views.read(s, behind, nn.functional.normalize(behind, dim=-1), MIDDLE) for s in (1, 4)]
+        gathered = [
+            views.read(s, behind, nn.functional.normalize(behind, dim=-1), MIDDLE, torch.ones(2, 500)) for s in (1, 4)
+        ]
     for each in gathered:
         assert not each.valid.any()
         assert each.features.isfinite().all()
@@ -117,5 +119,20 @@ def test_colours_come_from_the_photographs_at_full_resolution_whatever_the_featu
     assert views is not None
     points = torch.tensor([[0.1, -0.2, wall.DEPTH], [0.7, 0.3, wall.DEPTH]]).expand(2, 2, 3)
     towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
-    colours = views.read(4, points, towards, MIDDLE).colours
+    colours = views.read(4, points, towards, MIDDLE, torch.ones(points.shape[:2])).colours
     assert (colours - wall.texture(points[:, None, :, :2])).abs().max() < 0.08
+
+
+def test_a_view_of_half_the_size_is_an_octave_coarser():
+    own, at = network(SWIFT.network).eval(), scene()
+    with torch.inference_mode():
+        tiles, views, _ = looking(own, at)
+        points = torch.tensor([[0.1, -0.2, wall.DEPTH], [0.7, 0.3, wall.DEPTH]]).expand(2, 2, 3)
+        towards = nn.functional.normalize(points - tiles.cameras.position_world[:, None], dim=-1)
+        scale = tiles.pixels_per_unit(torch.full((2, 1, 2), 1 / wall.DEPTH))
+        same = views.read(1, points, towards, MIDDLE, scale).octaves_coarser
+        larger = views.read(1, points, towards, MIDDLE, 2 * scale).octaves_coarser
+        far_larger = views.read(1, points, towards, MIDDLE, 100 * scale).octaves_coarser
+    torch.testing.assert_close(same, torch.zeros_like(same), atol=1e-5, rtol=0)
+    torch.testing.assert_close(larger, torch.ones_like(same))
+    torch.testing.assert_close(far_larger, torch.full_like(same, 2.0))

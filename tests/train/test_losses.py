@@ -35,6 +35,7 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         corner_px=torch.zeros(TILES, 2),
         colours=uniform(TILES, pixels, 3),
         weight=torch.ones(TILES, pixels) if weight is None else weight,
+        detail=torch.zeros(TILES, pixels),
         inverse_depth=known * (0.2 + 0.01 * uniform(TILES, pixels)),
         depth_weight=known * uniform(TILES, pixels),
         neighbours=torch.zeros(TILES, 0, dtype=torch.long),

@@ -15,6 +15,7 @@ import torch.multiprocessing as processes
 from networks import SMALL
 from rich.console import Console
 from safetensors import safe_open
+from scenes_on_disk import PINHOLE, survey, write_colmap
 from torch.nn import functional as F
 
 from tidefield.commands.pretrain import Pretrain
@@ -69,7 +70,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(stream, "POOL_SIZE", 2)
     monkeypatch.setattr(stream, "STEPS_EACH", 4)
     generator = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
         names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
     assert set(names[0]) == {"7-000000", "7-000001"}
     assert set(names[1]) == {"7-000001", "7-000002"}
@@ -77,7 +78,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "cache").exists(), "the user's cache would grow without end"
     made = (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns
     again = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
         for _ in range(8):
             scenes.draw(0, again)  # the first is made once more, ...
         assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
@@ -104,13 +105,33 @@ def test_scenes_are_procedural_and_real_augmented_of_their_own() -> None:
     assert len({own.channels for own in every}) == 6
 
 
+def test_real_scenes_take_part_at_every_width_that_their_files_have(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    scenes = stream.at_several_widths(tmp_path / "flats", (32, 48, 256))
+    assert [int(one.cameras.size_px[0, 0]) for one in scenes] == [32, 48, 64]
+    torch.testing.assert_close(scenes[0].cameras.focal_px * 2, scenes[2].cameras.focal_px)
+    (whole,) = stream.at_several_widths(tmp_path / "flats", (400,))
+    assert int(whole.cameras.size_px[0, 0]) == 64
+
+
+def test_networks_that_encode_whole_photographs_learn_from_smaller_ones(tmp_path: Path, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(stream, "at_several_widths", lambda path, widths: asked.append(widths) or [])
+    for config in (SMALL, PRESETS["paper"]):
+        with Stream(tmp_path / config.preset, [tmp_path], 1, CPU, config):
+            pass
+    assert asked == [stream.WIDTHS, stream.WHOLE_WIDTHS]
+    assert max(stream.WHOLE_WIDTHS) <= 400
+    assert {200, 1600} <= set(stream.WIDTHS)
+
+
 def test_augmentation_is_few_points_and_photographs_and_exposures_that_are_off(tmp_path: Path) -> None:
     at = wall.scene(wall.cameras(6))
     easy, hard = (
         stream.Draw(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
         stream.Draw(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
     )
-    with Stream(tmp_path / "scenes", [], 1, CPU) as scenes:
+    with Stream(tmp_path / "scenes", [], 1, CPU, SMALL) as scenes:
         whole, few = scenes._augmented(at, easy), scenes._augmented(at, hard)
         none = scenes._augmented(at, replace(easy, points_share=0.0))
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)

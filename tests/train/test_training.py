@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import textured_wall as wall
 import torch
-from networks import SMALL
+from networks import SMALL, SMALL_PAPER
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -245,40 +245,47 @@ def test_gradients_are_clipped_to_a_norm_of_one(scene: Scene) -> None:
     assert torch.stack(norms).norm().item() == pytest.approx(1.0, rel=1e-3)
 
 
-def test_runs_of_version_0_1_are_read_with_converted_names(scene: Scene, tmp_path: Path) -> None:
-    today = json.loads(json.dumps(config_to_json(SMALL)))
+def older(config: Config) -> dict[str, Any]:
+    """A configuration as version 0.1 wrote it."""
+    today = json.loads(json.dumps(config_to_json(config)))
     network = today["network"]
     network = {
         **{name: network[name] for name in ("encoder", "views", "heads", "harmonics_degree", "without")},
         **{"stages": network["passes"], "doubt": network["uniform_fraction"]},
-        **{"as_printed": False, "fold": True, "field": None},
+        **{"as_printed": config.network.kind == "paper", "fold": config.network.kind == "swift", "field": None},
     }
-    old = {**today, "network": network, "train": {**today["train"], "field_learning_rate": 1e-2}}
+    return {**today, "network": network, "train": {**today["train"], "field_learning_rate": 1e-2}}
+
+
+def test_configurations_of_version_0_1_are_read() -> None:
+    old = older(SMALL)
     assert config_from_json(old) == SMALL
     with pytest.raises(RunError, match="per-scene field"):
-        config_from_json({**old, "network": {**network, "field": {"levels": 12}}})
+        config_from_json({**old, "network": {**old["network"], "field": {"levels": 12}}})
 
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+
+def test_runs_of_version_0_1_are_read_if_they_are_of_the_papers_network(scene: Scene, tmp_path: Path) -> None:
+    small = replace(PAPER, network=SMALL_PAPER, train=replace(PAPER.train, tiles=1))
+    trainer = SceneTrainer(small, scene, seed=0, device=CPU)
     trainer.step(Budget(steps=5))
     trainer.save(tmp_path)
     with safe_open(tmp_path / CHECKPOINT_FILE, framework="pt") as file:
         metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    older = {}
+    renamed = {}
     for name, value in tensors.items():
-        name = re.sub(r"^network\.passes\.", "network.stages.", name).replace(".view_weight.", ".trust.")
-        for now, then in (("log_metric", "metric"), ("agreement", "match"), ("prior_height", "guide_height")):
-            name = name.replace(f".{now}", f".{then}")
-        name = name.replace(".prior_steepness", ".guide_steepness").replace(".prior_features.", ".guide.")
-        name = name.replace(".single_view_steepness", ".lone_steepness").replace(
-            "transformer.position", "transformer.place"
-        )
-        older[name] = value
-    assert len(set(older) - set(tensors)) > 20
+        name = re.sub(r"^network\.(?!encoder)", "network.stages.0.", name).replace(".view_weight.", ".trust.")
+        renamed[name.replace("transformer.position", "transformer.place")] = value
+    assert len(set(renamed) - set(tensors)) > 20
     header = {**json.loads(metadata["tidefield"]), "version": "0.1.0"}
     del header["sha256"], header["run"], header["cpu_precision"]
-    save_file(older, tmp_path / CHECKPOINT_FILE, metadata={"tidefield": json.dumps(header)})
-    again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
+    save_file(renamed, tmp_path / CHECKPOINT_FILE, metadata={"tidefield": json.dumps(header)})
+    again = SceneTrainer(small, scene, seed=1, device=CPU)
     again.resume(tmp_path)
     for name, value in weights(trainer).items():
         assert torch.equal(value, weights(again)[name]), name
     assert trainer.step(Budget(steps=5)) == again.step(Budget(steps=5))
+
+
+def test_runs_of_swift_of_version_0_1_are_refused() -> None:
+    with pytest.raises(RunError, match=r"swift of Tidefield 0\.1.*train it again"):
+        checkpoint.convert_names_0_1({"sharpen": torch.zeros(1), "stages.0.aggregate.second.bias": torch.zeros(1)})

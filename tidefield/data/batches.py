@@ -32,6 +32,7 @@ class Batch:
         weight: of each pixel in the loss: 0 where it is masked, 0 outside its photograph, which may be smaller than a
             tile, and
             `TrainConfig.unseen_weight` where fewer than two other training photographs see the surface.
+        detail: of the depth priors, at each pixel.
         inverse_depth: of the sparse points that the target photograph observed, at their pixels; 0 elsewhere.
         depth_weight: confidence in these depths, 0 to 1; 0 where there is none.
         neighbours: photographs serving as the tiles' neighbouring views.
@@ -46,6 +47,7 @@ class Batch:
     corner_px: Float[Tensor, "T 2"]
     colours: Float[Tensor, "T R 3"]
     weight: Float[Tensor, "T R"]
+    detail: Float[Tensor, "T R"]
     inverse_depth: Float[Tensor, "T R"]
     depth_weight: Float[Tensor, "T R"]
     neighbours: Int[Tensor, "T N"]
@@ -125,7 +127,7 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
     corner = (torch.rand(len(targets), 2, generator=generator) * free).floor()
     tiles = []
     for target, at in zip(targets.tolist(), corner, strict=True):
-        camera, prior = scene.cameras[target], priors[target]
+        camera, prior = scene.cameras[target], priors[target].cells
         middle_world = unproject_to_surface(camera, prior, at[None] + side / 2)[0]
         found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours)
         colours, inside = _tile(scene, target, at.long(), side)
@@ -136,9 +138,10 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
             seen = tile_doubly_seen(camera, prior, at, side, scene.cameras[others], masks)
             weight[~seen] = config.unseen_weight
         depth = _sparse_depth(priors.observed(target), at, side)
-        tiles.append((colours, weight * inside, *depth, found.index[0], found.blend_weight[0], middle_world))
+        detail = priors[target].detail_of_tiles(at[None], side)[0]
+        tiles.append((colours, weight * inside, detail, *depth, found.index[0], found.blend_weight[0], middle_world))
     columns = (torch.stack(column) for column in zip(*tiles, strict=True))
-    colours, weight, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
+    colours, weight, detail, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
     if not views:
         which, images, corners, used = neighbours, (), (), ()
     elif config.crop_px is None:
@@ -150,6 +153,7 @@ def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: in
         corner_px=corner,
         colours=colours,
         weight=weight,
+        detail=detail,
         inverse_depth=inverse_depth,
         depth_weight=depth_weight,
         neighbours=neighbours,

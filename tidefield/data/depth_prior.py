@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,27 @@ class Observed:
     uv_px: Float[Tensor, "K 2"]
     inverse_depth: Float[Tensor, " K"]
     weight: Float[Tensor, " K"]
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """Where the rays of one camera are searched.
+
+    Attributes:
+        cells: expected, nearest and farthest inverse z-depth, on cells of `STRIDE` pixels.
+        detail: what the inverse depth of each pixel has beyond the interpolated cells; None where nothing is known.
+    """
+
+    cells: Float[Tensor, "3 h w"]
+    detail: Float[Tensor, "H W"] | None = None
+
+    def detail_of_tiles(self, corner_px: Float[Tensor, "T 2"], side_px: int) -> Float[Tensor, "T R"]:
+        """Return the detail of the pixels of tiles, row by row; 0 outside of the image."""
+        if self.detail is None:
+            return self.cells.new_zeros(len(corner_px), side_px**2)
+        padded = F.pad(self.detail, (0, side_px, 0, side_px))
+        tiles = [padded[v : v + side_px, u : u + side_px] for u, v in corner_px.long().tolist()]
+        return torch.stack(tiles).flatten(1)
 
 
 def surface_prior(
@@ -139,17 +161,24 @@ class DepthPriors:
     Args:
         scene: of the cameras.
         observed: points for `observed` (the supervision of depth); the scene's own if not given.
+        match: finds the surface of a camera from its prior's cells (`matching.Matcher`); None leaves the cells.
     """
 
-    def __init__(self, scene: Scene, observed: SparsePoints | None = None) -> None:
-        self.scene, self.points = scene, observed or scene.points
-        self._priors: dict[int, Tensor] = {}
+    def __init__(
+        self,
+        scene: Scene,
+        observed: SparsePoints | None = None,
+        match: Callable[[Cameras, Float[Tensor, "3 h w"]], DepthPrior] | None = None,
+    ) -> None:
+        self.scene, self.points, self.match = scene, observed or scene.points, match
+        self._priors: dict[int, DepthPrior] = {}
         self._observed: dict[int, Observed] = {}
 
-    def __getitem__(self, index: int) -> Float[Tensor, "3 h w"]:
+    def __getitem__(self, index: int) -> DepthPrior:
         if index not in self._priors:
             cameras = self.scene.cameras
-            self._priors[index] = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
+            cells = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
+            self._priors[index] = DepthPrior(cells) if self.match is None else self.match(cameras[index], cells)
         return self._priors[index]
 
     def observed(self, index: int) -> Observed:

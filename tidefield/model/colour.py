@@ -143,32 +143,29 @@ class AngularColourBlend(ColourBlend):
     """Eqs. 7 and 8 with a prior on angles, for `swift`.
 
     Blending starts by inverse angle, as in unstructured lumigraph rendering (Buehler et al., 2001), with the angle on a
-    logarithmic scale as a further input. The target's colour is a difference to the neighbours' mean colour, and its
-    share starts small and does not depend on how many neighbours there are.
+    logarithmic scale and the view's footprint as further inputs. The target's colour is a difference to the blended
+    neighbours, and its share does not depend on how many there are.
     """
 
     def __init__(self, hidden: int, degree: int, neighbours_only: bool = False) -> None:
-        super().__init__(hidden, degree, neighbours_only, inputs=6)
+        super().__init__(hidden, degree, neighbours_only, inputs=7)
         self.angle = nn.Parameter(torch.tensor(1.0))
         with torch.no_grad():
-            self.target.bias[0] = -4.0  # a share of 1.8%
+            self.target.bias[0] = -2.0  # a share of 12%
 
-    def forward(  # type: ignore[override]
-        self,
-        evidence: Evidence,
-        gathered: Gathered,
-        direction: Float[Tensor, "T P 3"],
-        mean_colour: Float[Tensor, "T P 3"],
+    def forward(
+        self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
     ) -> Float[Tensor, "T P 3"]:
-        """Colours of P samples per tile; `mean_colour` is the neighbours' under the direction weights."""
-        target_logit, target = self.target_colour(evidence, direction, mean_colour)
         # 1e-4 is the angle, 0.8 degrees, below which a closer view is no better than its resampling.
         closeness = -torch.log((1 - gathered.cosine).clamp(min=0) + 1e-4)
-        logits = self.view_logits(evidence, gathered, [*self.view_inputs(evidence, gathered, direction), closeness / 4])
+        inputs = [*self.view_inputs(evidence, gathered, direction), closeness / 4, gathered.octaves_coarser]
+        logits = self.view_logits(evidence, gathered, inputs)
         logits = logits + self.angle * closeness + gathered.blend_weight.log()
-        logits = logits.masked_fill(~gathered.valid, -torch.inf)
-        if not self.neighbours_only:
-            # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
-            total = logits.masked_fill(~gathered.valid, -1e4).logsumexp(1)
-            target_logit = target_logit + torch.where(gathered.valid.any(1), total, 0.0)
-        return blend(logits, self.restrict(target_logit, gathered.valid), gathered.colours, target)
+        share = torch.softmax(logits.masked_fill(~gathered.valid, -torch.inf), dim=1)
+        # Where no view is valid the softmax is of nothing, and the target's colour is around middle grey.
+        seen = evidence.valid[..., None]
+        blended = torch.where(seen, weighted_sum(gathered.colours, share.nan_to_num()), 0.5)
+        target_logit, target = self.target_colour(evidence, direction, blended)
+        # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
+        target_share = torch.sigmoid(self.restrict(target_logit, gathered.valid))[..., None]
+        return torch.where(seen, torch.lerp(blended, target, target_share), target)

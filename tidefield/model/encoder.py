@@ -21,9 +21,10 @@ class Encoder(nn.Module):
     Args:
         config: widths, blocks and norms.
         outputs: (stride, channels) of each output; strides 4, 2 and 1 are possible.
+        aligned: the decoder returns features to where they were computed (docs/method.md, section 2).
     """
 
-    def __init__(self, config: EncoderConfig, outputs: tuple[tuple[int, int], ...]) -> None:
+    def __init__(self, config: EncoderConfig, outputs: tuple[tuple[int, int], ...], aligned: bool = True) -> None:
         super().__init__()
         w0, w1, w2, w3 = config.widths
         norm = config.instance_norm
@@ -35,7 +36,7 @@ class Encoder(nn.Module):
         # Skips at strides 8 and 4 (layers 3 and 2 of Table 1), then, for finer outputs, 2 (layer 1) and 1 (the input).
         channels, skips = (w3, w2, w1, w0, min(w0, 8)), (w2, w1, w0, 3)
         steps = 2 + sum(min(self.strides) < stride for stride in (4, 2))
-        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm) for k in range(steps))
+        self.up = nn.ModuleList(_Up(channels[k], skips[k], channels[k + 1], norm, aligned) for k in range(steps))
         at_stride = {4: w1, 2: w0, 1: min(w0, 8)}
         self.out = nn.ModuleList(nn.Conv2d(at_stride[s], c, 1) for s, c in outputs)
 
@@ -82,16 +83,29 @@ def _stage(inputs: int, outputs: int, blocks: int, norm: bool) -> nn.Sequential:
     return nn.Sequential(first, *(_Block(outputs, outputs, 1, norm) for _ in range(blocks - 1)))
 
 
+def double(maps: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C H W"]:
+    """Maps with twice as many texels: every second one is a texel of `maps`, the others lie halfway between.
+
+    A convolution with stride 2 centres its texel k on texel 2 k of what it read, so that is where it must return to.
+    `F.interpolate` would place it half a texel further, and neighbours flown the other way would be displaced the
+    other way.
+    """
+    height, width = maps.shape[-2:]
+    between = F.interpolate(maps, size=(2 * height - 1, 2 * width - 1), mode="bilinear", align_corners=True)
+    return F.pad(between, (0, 1, 0, 1), mode="replicate")
+
+
 class _Up(nn.Module):
     """3x3 upconv x2, then a 3x3 convolution on [skip, upsampled] (layers 6-7 and 8-9 of Table 1)."""
 
-    def __init__(self, inputs: int, skip: int, outputs: int, norm: bool) -> None:
+    def __init__(self, inputs: int, skip: int, outputs: int, norm: bool, aligned: bool) -> None:
         super().__init__()
+        self.aligned = aligned
         self.widen = _ConvNorm(inputs, outputs, 3, 1, norm)
         self.merge = _ConvNorm(skip + outputs, outputs, 3, 1, norm)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         # By 2 exactly, then cut: an odd size was rounded up on the way down, and fitting it would shift features.
-        x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+        x = double(x) if self.aligned else F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
         x = x[..., : skip.shape[-2], : skip.shape[-1]]
         return F.relu(self.merge(torch.cat([skip, F.relu(self.widen(x))], dim=1)))

@@ -66,9 +66,11 @@ class Network(nn.Module, ABC):
         config: its configuration.
         grids: the rays of its passes, coarse to fine.
         fills_unseen: whether renderings are continued into pixels that no neighbour sees.
+        matches_surface: whether photographs are matched first, for the surface that its rays are searched around.
     """
 
     fills_unseen = False
+    matches_surface = False
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -88,7 +90,13 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def forward(
-        self, tiles: Tiles, views: Views, start: Intervals, opaque: bool, generator: torch.Generator | None = None
+        self,
+        tiles: Tiles,
+        views: Views,
+        start: Intervals,
+        opaque: bool,
+        detail: Float[Tensor, "T R"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> TileRendering:
         """Render tiles.
 
@@ -97,6 +105,7 @@ class Network(nn.Module, ABC):
             views: the neighbouring views of the tiles.
             start: intervals of the first pass's rays (`start_intervals`).
             opaque: light that passes all samples is stopped by the last; False lets it through to the background.
+            detail: what the expected inverse depth of each pixel has beyond that of the first pass's rays.
             generator: jitters samples, for training.
         """
 
@@ -111,9 +120,14 @@ class Network(nn.Module, ABC):
         )
 
 
-def make_network(config: NetworkConfig) -> Network:
-    """The network of a configuration, with random weights."""
+def network_class(config: NetworkConfig) -> type[Network]:
+    """The class of a configuration's network."""
     from tidefield.model.paper import PaperNetwork
     from tidefield.model.swift import SwiftNetwork
 
-    return {"paper": PaperNetwork, "swift": SwiftNetwork}[config.kind](config)
+    return {"paper": PaperNetwork, "swift": SwiftNetwork}[config.kind]
+
+
+def make_network(config: NetworkConfig) -> Network:
+    """The network of a configuration, with random weights."""
+    return network_class(config)(config)

@@ -44,7 +44,8 @@ class PaperNetwork(Network):
         super().__init__(config)
         (self.rays,) = config.passes
         hidden, channels = self.rays.hidden, self.rays.feature_channels
-        self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),))
+        # The shipped weights have learned with displaced features (docs/method.md, section 2).
+        self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),), aligned=False)
         self.aggregate = Aggregate(channels, hidden, uniform_weights="direction weights" in config.without)
         if "ray transformer" not in config.without:
             self.transformer = RayTransformer(hidden, config.heads)
@@ -59,13 +60,22 @@ class PaperNetwork(Network):
         return Encoded(maps, maps_from_images(photographs, corner, 1))
 
     def forward(
-        self, tiles: Tiles, views: Views, start: Intervals, opaque: bool, generator: torch.Generator | None = None
+        self,
+        tiles: Tiles,
+        views: Views,
+        start: Intervals,
+        opaque: bool,
+        detail: Float[Tensor, "T R"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> TileRendering:
         uv = tiles.rays_px(self.rays.stride)
+        if detail is not None:
+            start = start.moved(detail)
         even = torch.ones_like(start.inv_near)[..., None]
         samples = place_samples(tiles.cameras, uv, start, sample(even, self.rays.samples, generator))
         in_tile = (uv - tiles.corner_px[:, None]) / tiles.side_px
-        gathered = views.read(self.rays.feature_stride, samples.points_world, samples.directions, in_tile)
+        scale = tiles.pixels_per_unit(samples.inverse_depth)
+        gathered = views.read(self.rays.feature_stride, samples.points_world, samples.directions, in_tile, scale)
         evidence = self.aggregate(gathered.features, gathered.cosine, gathered.valid)
         rays = samples.s.shape
         valid = evidence.valid.unflatten(1, rays[1:])

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tidefield.config import USUAL_SAMPLING, Config, Sampling
-from tidefield.data.depth_prior import surface_prior, unproject_to_surface
+from tidefield.data.depth_prior import DepthPrior, surface_prior, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
+from tidefield.data.matching import Matcher
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.errors import SceneError
@@ -58,6 +59,7 @@ class Renderer:
     ) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.cache = FeatureCache(network, scene, device, sampling.cones)
+        self.matcher = Matcher(scene, self.cache.pyramid) if network.matches_surface else None
         self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
@@ -80,10 +82,10 @@ class Renderer:
         side = self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
         if prior is not None and side > 1:
             prior = prior.repeat_interleave(side, 1).repeat_interleave(side, 2)
-        return render_with_rays(partial(self._render, prior=prior), camera, side)
+        return render_with_rays(partial(self._render, cells=prior), camera, side)
 
     @torch.inference_mode()
-    def _render(self, camera: Cameras, prior: Float[Tensor, "3 h w"] | None = None) -> Rendering:
+    def _render(self, camera: Cameras, cells: Float[Tensor, "3 h w"] | None = None) -> Rendering:
         scene = self.scene
         sources = scene.sources(camera)
         if not sources:
@@ -91,8 +93,12 @@ class Renderer:
                 f"{scene.root} has no training photograph besides the camera's own: expected another to render its "
                 "view from; add photographs"
             )
-        if prior is None:
-            prior = surface_prior(camera, scene.points, scene.cameras, scene.hull)
+        if cells is None:
+            prior = DepthPrior(surface_prior(camera, scene.points, scene.cameras, scene.hull))
+            if self.matcher is not None:
+                prior = self.matcher(camera, prior.cells)
+        else:
+            prior = DepthPrior(cells)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
         picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
         for top in range(0, rows, BLOCK_TILES):
@@ -114,15 +120,15 @@ class Renderer:
         return Rendering(colour=colour, depth=depth[..., 0].clone(), opacity=opacity[..., 0].clamp(0, 1))
 
     def _block(
-        self, camera: Cameras, prior: Float[Tensor, "3 h w"], corner: tuple[int, int], size: tuple[int, int]
+        self, camera: Cameras, prior: DepthPrior, corner: tuple[int, int], size: tuple[int, int]
     ) -> Float[Tensor, "H W 6"]:
         """Colour, opacity, depth and visibility of a block of tiles; corner and size in tiles."""
         (left, top), (columns, rows) = corner, size
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
-        middles = unproject_to_surface(camera, prior, corners + TILE_PX / 2)
+        middles = unproject_to_surface(camera, prior.cells, corners + TILE_PX / 2)
         views, strategy = self.network.config.views, self.config.train.neighbours
-        neighbours = choose_neighbours(camera, prior, corners[0], size, TILE_PX, self.scene, views, strategy)
+        neighbours = choose_neighbours(camera, prior.cells, corners[0], size, TILE_PX, self.scene, views, strategy)
         found = self._tiles(camera, prior, corners, neighbours, middles)
         stacked = found.reshape(rows, columns, TILE_PX, TILE_PX, 6)
         return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
@@ -130,7 +136,7 @@ class Renderer:
     def _tiles(
         self,
         camera: Cameras,
-        prior: Float[Tensor, "3 h w"],
+        prior: DepthPrior,
         corners: Float[Tensor, "T 2"],
         neighbours: Neighbours,
         middle_world: Float[Tensor, "T 3"],
@@ -151,11 +157,12 @@ class Renderer:
 
     @torch.inference_mode()  # each thread needs its own
     def _piece(
-        self, camera: Cameras, prior: Float[Tensor, "3 h w"], corners: Float[Tensor, "T 2"], views: Views
+        self, camera: Cameras, prior: DepthPrior, corners: Float[Tensor, "T 2"], views: Views
     ) -> Float[Tensor, "T R 6"]:
         index = torch.zeros(len(corners), dtype=torch.long)
         tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
-        start = self.network.start_intervals(tiles, prior[None].to(self.device))
-        found = self.network(tiles, views, start, self.scene.background_rgb is None)
+        start = self.network.start_intervals(tiles, prior.cells[None].to(self.device))
+        detail = prior.detail_of_tiles(corners, TILE_PX).to(self.device)
+        found = self.network(tiles, views, start, self.scene.background_rgb is None, detail)
         single = torch.stack([found.opacity, found.depth, found.visibility], dim=-1)
         return torch.cat([found.colour, single], dim=-1).cpu()

@@ -40,6 +40,11 @@ class Tiles:
         count = self.side_px // stride + 2 * margin
         return self.corner_px[:, None] + (pixel_grid(count, count, self.corner_px.device) - margin) * stride
 
+    def pixels_per_unit(self, inverse_depth: Float[Tensor, "T R M"]) -> Float[Tensor, "T P"]:
+        """Pixels that a unit of length shows as at samples' inverse z-depths, the samples of all rays one after the
+        other."""
+        return (inverse_depth * self.cameras.focal_px.mean(1)[:, None, None]).flatten(1)
+
 
 @dataclass(frozen=True)
 class Intervals:
@@ -58,6 +63,10 @@ class Intervals:
     def s_expected(self) -> Float[Tensor, "T R"]:
         """Normalised distance of the expected surface; NaN where nothing is known."""
         return (self.inv_near - self.inv_expected) / (self.inv_near - self.inv_far)
+
+    def moved(self, inverse_depth: Float[Tensor, "T R"]) -> Intervals:
+        """Return these intervals, moved in inverse depth."""
+        return Intervals(*(end + inverse_depth for end in (self.inv_near, self.inv_far, self.inv_expected)))
 
     def inverse_depth(self, s: Float[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
         return self.inv_near[..., None] + (self.inv_far - self.inv_near)[..., None] * s

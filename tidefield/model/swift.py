@@ -4,8 +4,9 @@ say it is.
 What it adds to `model.paper`:
 
 - A coarse pass with one ray for 4 x 4 pixels finds the surface; a fine pass searches around it.
-- Densities start from a score (`Pass.weights`): the prior from sparse points and the agreement of the views. The ray
-  transformer corrects it.
+- A score of each sample is the logarithm of how likely the surface is there (`Pass.weights`): the prior from matched
+  photographs and sparse points, the agreement of the views, and what the ray transformer finds from both. The density
+  is the hazard rate of that distribution, so more samples do not stop more light.
 - The views' colours are read by cubic interpolation from learnedly sharpened photographs, and blended by angle
   (`colour.AngularColourBlend`).
 - Views fade in and out (`blend_weight`), so that neither tiles nor frames of a video jump.
@@ -64,6 +65,7 @@ class SwiftNetwork(Network):
     """Coarse and fine pass: features -> samples -> aggregation -> density; then colour and volume rendering."""
 
     fills_unseen = True
+    matches_surface = True
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -81,7 +83,13 @@ class SwiftNetwork(Network):
         self.colour = AngularColourBlend(config.passes[-1].hidden, config.harmonics_degree, neighbours_only)
 
     def forward(
-        self, tiles: Tiles, views: Views, start: Intervals, opaque: bool, generator: torch.Generator | None = None
+        self,
+        tiles: Tiles,
+        views: Views,
+        start: Intervals,
+        opaque: bool,
+        detail: Float[Tensor, "T R"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> TileRendering:
         intervals, pdf = start, torch.ones_like(start.inv_near)[..., None]
         inverse_depths, coarse_colours = [], []
@@ -95,6 +103,7 @@ class SwiftNetwork(Network):
                 samples.points_world,
                 samples.directions,
                 in_tile,
+                tiles.pixels_per_unit(samples.inverse_depth),
                 mean_colours=not last and one.feature_stride > 1,
             )
             this = cast(Pass, self.passes[k])
@@ -103,9 +112,8 @@ class SwiftNetwork(Network):
             # 1e-6: a ray that nothing stops has its depth in the middle of its samples.
             known = weight.surface + 1e-6 / one.samples
             inverse_depths.append((known * samples.inverse_depth).sum(-1) / known.sum(-1))
-            mean_colour = mean_colours(evidence, gathered)
             if last:
-                colours = self.colour(evidence, gathered, samples.directions, mean_colour)
+                colours = self.colour(evidence, gathered, samples.directions)
                 return TileRendering(
                     colour=composite(weight.colour, colours.unflatten(1, samples.s.shape[1:])),
                     depth=1 / inverse_depths[-1],
@@ -114,10 +122,13 @@ class SwiftNetwork(Network):
                     inverse_depths=tuple(inverse_depths),
                     coarse_colours=tuple(coarse_colours),
                 )
+            mean_colour = mean_colours(evidence, gathered)
             coarse_colours.append(composite(weight.colour, mean_colour.unflatten(1, samples.s.shape[1:])))
             following = self.grids[k + 1]
             pdf = histogram(weight.surface.detach(), samples.s, one.samples, self.config.uniform_fraction)
             intervals, pdf = refine(intervals, pdf, one.stride // following.stride, following.margin)
+            if detail is not None and following.stride == 1:
+                intervals = intervals.moved(detail)
         raise AssertionError("a network has at least one pass")
 
     def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
@@ -156,32 +167,39 @@ class Pass(nn.Module):
             self.transformer = RayTransformer(hidden, network.heads)
         self.density = nn.Linear(hidden, 1)
         self.prior_features = nn.Linear(3, hidden)
+        self.agreement_features = nn.Linear(2, hidden)
         # At the start the surface is where the views agree and, in the first pass, within about two samples of where
         # it is expected (2 - 0.3 x^2 changes sign at x = 2.6); the network corrects it.
         self.agreement = nn.Parameter(torch.tensor(3.0))
         self.prior_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
         self.prior_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
         self.single_view_steepness = nn.Parameter(torch.tensor(10.0 if first else 0.0))
+        # Of there being no surface, where a scene may be empty: as likely as one in a single sample of usual score.
+        self.empty = nn.Parameter(torch.tensor(-math.log(config.samples)))
         nn.init.zeros_(self.density.weight)
         nn.init.zeros_(self.density.bias)
 
     def weights(self, evidence: Evidence, samples: Samples, intervals: Intervals, opaque: bool) -> Weights:
         """How much each sample contributes to its ray.
 
-        Density is predicted per interval of each sample, a length that features resolve whatever the scale of the
-        scene. It starts from the logits with which the weights are a softmax of the scores.
+        The scores z_k give the surface's distribution p(s) ~ exp(z(s)) over the ray's normalised distance s, of which a
+        sample has the share of the interval around it. Its hazard rate, p over the probability that the surface has not
+        been met yet, is the density with which volume rendering gives the samples these shares (docs/method.md,
+        section 6).
         """
         rays = samples.s.shape
         valid = evidence.valid.unflatten(1, rays[1:])
         degrees = degrees_of_freedom(evidence).unflatten(1, rays[1:])
-        x, prior = self._prior(evidence.density.unflatten(1, rays[1:]), samples, intervals, degrees)
-        score = prior + self._agreement_score(evidence, degrees)
-        likely = surface_shares(score, opaque)
-        bias = surface_logits(score.masked_fill(~valid, UNSEEN_SCORE), opaque)
+        agreement = self._agreement_score(evidence, degrees)
+        x, score = self._prior(evidence.density.unflatten(1, rays[1:]), samples, intervals, degrees, agreement)
         if hasattr(self, "transformer"):
             x = self.transformer(*(t.flatten(0, 1) for t in (x, samples.s, valid))).unflatten(0, rays[:2])
+        score = score + agreement + self.density(x)[..., 0] + widths(samples.s).log()
+        empty = None if opaque else self.empty
+        likely = surface_shares(score, empty)
         delta = samples.delta
-        sigma = F.softplus(self.density(x)[..., 0] + bias) * valid / delta.clamp(min=1e-9)
+        logits = surface_logits(score.masked_fill(~valid, UNSEEN_SCORE), empty)
+        sigma = F.softplus(logits) * valid / delta.clamp(min=1e-9)
         if opaque:
             delta = torch.cat([delta[..., :-1], torch.full_like(delta[..., -1:], torch.inf)], dim=-1)
         weight = weights(sigma, delta)
@@ -208,18 +226,21 @@ class Pass(nn.Module):
         samples: Samples,
         intervals: Intervals,
         degrees: Float[Tensor, "T R M"],
+        agreement: Float[Tensor, "T R M"],
     ) -> tuple[Float[Tensor, "T R M H"], Float[Tensor, "T R M"]]:
-        """Where the surface is expected, as a feature added to F_sigma, and as a score."""
+        """Where the surface is expected, as features added to F_sigma together with the agreement, and as a score."""
         expected = intervals.s_expected
         known = expected.isfinite()[..., None]
         # In samples, so that it means the same for any number of them and any interval.
         offset = (samples.s - expected[..., None]) * samples.s.shape[-1]
         offset = torch.where(known, offset, 0.0)
         features = torch.stack([offset / 4, torch.exp(-((offset / 2) ** 2)), torch.exp(-((offset / 8) ** 2))], dim=-1)
+        views_agree = torch.stack([torch.tanh(agreement / 4), torch.log1p(degrees)], dim=-1)
         # Where no two views see it, samples around where it is expected would only smear what one of them sees.
         steepness = self.prior_steepness + self.single_view_steepness * torch.exp(-degrees)
         score = (self.prior_height - steepness * offset.square()).clamp(min=LOWEST_PRIOR)
-        return x + self.prior_features(features) * known[..., None], torch.where(known, score, self.prior_height)
+        x = x + self.prior_features(features) * known[..., None] + self.agreement_features(views_agree)
+        return x, torch.where(known, score, self.prior_height)
 
 
 class ComparingAggregate(Aggregate):
@@ -253,25 +274,37 @@ def means_over_texels(photographs: Float[Tensor, "K 3 H W"], stride: int) -> Flo
     return F.avg_pool2d(photographs, odd, stride, odd // 2, count_include_pad=False)
 
 
-def surface_shares(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
-    """Probability of the surface at each sample: softmax(score), where the score of what lies behind the last sample is
-    0 unless the scene is opaque."""
-    return torch.softmax(score if opaque else F.pad(score, (0, 1)), dim=-1)[..., : score.shape[-1]]
+def widths(s: Float[Tensor, "*R M"]) -> Float[Tensor, "*R M"]:
+    """How much of a ray each sample stands for, from halfway to the one before to halfway to the next, times M: 1 where
+    samples are spread evenly."""
+    edges = torch.cat([torch.zeros_like(s[..., :1]), (s[..., 1:] + s[..., :-1]) / 2, torch.ones_like(s[..., :1])], -1)
+    return edges.diff(dim=-1).clamp(min=1e-4) * s.shape[-1]
 
 
-def surface_logits(score: Float[Tensor, "*R M"], opaque: bool) -> Float[Tensor, "*R M"]:
+def surface_shares(score: Float[Tensor, "*R M"], empty: Float[Tensor, ""] | None) -> Float[Tensor, "*R M"]:
+    """Probability of the surface at each sample: softmax(score); `empty` is the score of there being none, for all M
+    samples together, or None where there is one."""
+    return torch.softmax(_with_empty(score, empty), dim=-1)[..., : score.shape[-1]]
+
+
+def surface_logits(score: Float[Tensor, "*R M"], empty: Float[Tensor, ""] | None) -> Float[Tensor, "*R M"]:
     """Logits of the opacities 1 - exp(-sigma_i delta_i) with which samples get the weights softmax(score).
 
     T_i a_i is a softmax's p_i where a_i = p_i / sum_{j>=i} p_j, whose logit is score_i - log sum_{j>i} exp(score_j).
-    As 1 - exp(-softplus(x)) = sigmoid(x), it is a bias of a density that is a softplus. A score means the same wherever
-    on the ray its sample lies; were scores such biases themselves, many unlikely samples in front would hide the likely
-    one.
+    As 1 - exp(-softplus(x)) = sigmoid(x), sigma_i delta_i is a softplus of it. A score means the same wherever on the
+    ray its sample lies; were scores such logits themselves, many unlikely samples in front would hide the likely one.
 
     Args:
         score: of each sample, finite.
-        opaque: nothing lies behind the last sample; otherwise what does has the score 0.
+        empty: as for `surface_shares`; lies behind the last sample.
     """
-    behind = score[..., 1:] if opaque else F.pad(score[..., 1:], (0, 1))
-    later = behind.flip(-1).logcumsumexp(-1).flip(-1)
+    later = _with_empty(score, empty)[..., 1:].flip(-1).logcumsumexp(-1).flip(-1)
     # The last sample of an opaque ray stops all light whatever its logit.
-    return (score - (F.pad(later, (0, 1)) if opaque else later)).clamp(-LOGIT_LIMIT, LOGIT_LIMIT)
+    return (score - (F.pad(later, (0, 1)) if empty is None else later)).clamp(-LOGIT_LIMIT, LOGIT_LIMIT)
+
+
+def _with_empty(score: Float[Tensor, "*R M"], empty: Float[Tensor, ""] | None) -> Tensor:
+    if empty is None:
+        return score
+    # Scores are of densities: M of them, each of an M-th of the ray, against one of the whole.
+    return torch.cat([score, (empty + math.log(score.shape[-1])).expand_as(score[..., :1])], dim=-1)

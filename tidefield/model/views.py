@@ -36,6 +36,7 @@ class Gathered:
         cosine: d.d_i with the target's direction.
         valid: whether the sample is in front of the camera, inside the encoded part of the photograph, and not masked.
         blend_weight: above 0, to 1; lets views fade in and out (`data.neighbours`).
+        octaves_coarser: how much larger the pixels of the view are there than the target's, in powers of 2.
     """
 
     colours: Float[Tensor, "T N P 3"]
@@ -44,6 +45,7 @@ class Gathered:
     cosine: Float[Tensor, "T N P"]
     valid: Bool[Tensor, "T N P"]
     blend_weight: Float[Tensor, "T N P"]
+    octaves_coarser: Float[Tensor, "T N P"]
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ class Views:
         points_world: Float[Tensor, "T P 3"],
         directions: Float[Tensor, "T P 3"],
         ray_in_tile: Float[Tensor, "T R 2"],
+        pixels_per_unit: Float[Tensor, "T P"],
         mean_colours: bool = False,
     ) -> Gathered:
         """Project samples into every view and read features and colours there.
@@ -114,6 +117,7 @@ class Views:
             points_world: of the samples of R rays, the samples of all rays one after the other.
             directions: d, unit, from the target camera to the samples.
             ray_in_tile: where the rays pass their tile, 0 to 1 from its left and from its top.
+            pixels_per_unit: of the target, that a unit of length shows as at the samples.
             mean_colours: take the mean colours of the feature maps instead of the photographs' own, in one read.
         """
         tiles, count = self.which.shape
@@ -148,7 +152,15 @@ class Views:
             cosine=(view_directions * directions[:, None]).sum(-1),
             valid=inside & on_map,
             blend_weight=self._blend_weight(ray_in_tile, points_world.shape[1], from_border(uv, size, FEATHER)),
+            octaves_coarser=self._octaves_coarser(z[..., 0], pixels_per_unit),
         )
+
+    def _octaves_coarser(
+        self, z: Float[Tensor, "T N P"], pixels_per_unit: Float[Tensor, "T P"]
+    ) -> Float[Tensor, "T N P"]:
+        """How much larger the views' pixels are than the target's; limited to two octaves either way."""
+        focal = self.cameras.focal_px.mean(1).reshape(*self.which.shape, 1)
+        return torch.log2((z * pixels_per_unit[:, None] / focal).clamp(0.25, 4.0))
 
     def _blend_weight(
         self, ray_in_tile: Float[Tensor, "T R 2"], samples: int, border: Float[Tensor, "T N P"]

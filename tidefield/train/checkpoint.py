@@ -267,32 +267,29 @@ def _fault(found: Tensor | None, wanted: Tensor | None) -> str | None:
     return None
 
 
-_NAMES_0_1 = (
-    (r"\btrust\.", "view_weight."),
-    (r"\bmetric$", "log_metric"),
-    (r"\btransformer\.place\.", "transformer.position."),
-    (r"\bguide\.", "prior_features."),
-    (r"\bmatch$", "agreement"),
-    (r"\bguide_height$", "prior_height"),
-    (r"\bguide_steepness$", "prior_steepness"),
-    (r"\blone_steepness$", "single_view_steepness"),
-)
+_NAMES_0_1 = ((r"\btrust\.", "view_weight."), (r"\btransformer\.place\.", "transformer.position."))
 """Parameters' names of version 0.1 as patterns, and today's."""
 
 
 def convert_names_0_1(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors of a file, with the parameter names of version 0.1 replaced by today's.
+    """Tensors of a file, with the parameter names that version 0.1 gave the paper's network replaced by today's.
 
     The order of the parameters, by which a checkpoint numbers the optimiser's state, is the same in both.
+
+    Raises:
+        RunError: they are of the preset `swift`, whose network was another.
     """
     if not any(re.search(r"\bstages\.\d+\.aggregate\.", name) for name in tensors):
         return tensors
-    # The paper's network has one pass, whose boxes are now the network's own.
-    swift = any(name.endswith("sharpen") for name in tensors)
+    if any(name.endswith("sharpen") for name in tensors):
+        raise RunError(
+            "these weights are of the preset swift of Tidefield 0.1, whose network was another: expected newer ones; "
+            "train it again"
+        )
     converted = {}
     for name, value in tensors.items():
-        # Not the encoder's stages, which keep their name.
-        name = re.sub(r"^(network\.)?stages\.(\d+)\.", r"\1passes.\2." if swift else r"\1", name)
+        # The one pass of the paper's network, whose boxes are now its own; not the encoder's stages.
+        name = re.sub(r"^(network\.)?stages\.\d+\.", r"\1", name)
         for pattern, today in _NAMES_0_1:
             name = re.sub(pattern, today, name)
         converted[name] = value

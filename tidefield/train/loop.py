@@ -20,6 +20,7 @@ from torch import nn
 
 from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
 from tidefield.data.depth_prior import DepthPriors
+from tidefield.data.matching import Matcher
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
@@ -161,7 +162,7 @@ class SceneTrainer(Trainer):
             read_weights(weights, network)
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
         self.config = config
-        self.priors = DepthPriors(scene)
+        self.priors = DepthPriors(scene, match=Matcher(scene) if network.matches_surface else None)
         self.batch_loss: nn.Module = BatchLoss(network, config.train)
 
     @property

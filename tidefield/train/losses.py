@@ -63,7 +63,7 @@ class BatchLoss(nn.Module):
         """
         network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
         batch = draw_batch(scene, priors, config, views, generator).to(device)
-        own = torch.stack([priors[i] for i in batch.targets.tolist()]).to(device)
+        own = torch.stack([priors[i].cells for i in batch.targets.tolist()]).to(device)
         opaque = scene.background_rgb is None
         parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]
         if len(parts) == 1:
@@ -100,7 +100,7 @@ class BatchLoss(nn.Module):
         neighbours = cameras[batch.neighbours.reshape(-1)]
         views = Views(neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
         tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)
-        return network(tiles, views, network.start_intervals(tiles, priors), opaque, generator)
+        return network(tiles, views, network.start_intervals(tiles, priors), opaque, batch.detail, generator)
 
     def _render_tensors(self, *arguments: Any) -> tuple[Tensor, ...]:
         return self._render(*arguments).tensors()

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
-from multiprocessing.pool import AsyncResult
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from tidefield.config import Config
 from tidefield.data.depth_prior import DepthPriors
-from tidefield.data.load import load_scene
+from tidefield.data.load import at_width, load_scene
+from tidefield.data.matching import Matcher
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.network import network_class
 from tidefield.processes import start_worker
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
@@ -35,8 +38,10 @@ STEPS_EACH = 200
 """Steps after which the oldest scene is replaced."""
 REAL_SHARE = 0.5
 """Share of real scenes, where there are some."""
-WIDTHS = (256, 400)
-"""Of the photographs of real scenes, pixels: each scene takes part at both."""
+WIDTHS = (200, 280, 400, 560, 800, 1600)
+"""Of the photographs of real scenes, pixels: each scene takes part at those that its files have."""
+WHOLE_WIDTHS = (200, 280, 400)
+"""The same for networks that encode photographs whole, of which larger ones would not fit into memory."""
 MISPOSED_DEG = 0.6
 """Error of attitudes that structure from motion got wrong."""
 SPARSE_SHARE = 0.25
@@ -172,6 +177,13 @@ def rotate(drawn: Drawn, quaternion: Float[Tensor, "4"]) -> Drawn:
     return replace(drawn, cameras=replace(drawn.cameras, T_world_camera=turn.to(pose) @ pose))
 
 
+def at_several_widths(root: Path, widths: Sequence[int]) -> list[Scene]:
+    """Load a real scene at each of the widths that its files have; at its own if it has none of them."""
+    largest = load_scene(root, width=max(widths))
+    own = int(largest.cameras.size_px[:, 0].max())
+    return [at_width(largest, width) for width in widths if width < own] + [largest]
+
+
 class Stream:
     """Draws scenes from a pool that is renewed as training goes on.
 
@@ -180,23 +192,28 @@ class Stream:
         real: folders of real scenes; only their training photographs are learned from.
         seed: of the procedural scenes.
         device: of the network.
+        config: of the network that learns.
     """
 
-    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device) -> None:
+    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, config: Config) -> None:
         self.folder, self.seed, self.device = folder, seed, device
-        self.real = [load_scene(path, width=width) for path in real for width in WIDTHS]
+        widths = WHOLE_WIDTHS if config.train.crop_px is None else WIDTHS
+        self.real = [scene for path in real for scene in at_several_widths(path, widths)]
+        self.matches_surface = network_class(config.network).matches_surface
         self.pool: dict[int, Drawn] = {}
-        self.pending: dict[int, AsyncResult[None]] = {}
+        self.pending: dict[int, Future[None]] = {}
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
-        self.maker = get_context("spawn").Pool(1, start_worker)
+        self.maker = ProcessPoolExecutor(1, get_context("spawn"), start_worker)
         folder.mkdir(parents=True, exist_ok=True)
+        # Of a training that was ended: some may never be drawn.
+        self.left = {int(path.name.split("-")[1]) for path in folder.glob(f"{seed}-*") if path.name[-6:].isdigit()}
 
     def __enter__(self) -> Stream:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.maker.terminate()
-        self.maker.join()
+        # The scene that is being made is completed: ending a process that holds a lock of the pool's may hang.
+        self.maker.shutdown(cancel_futures=True)
 
     def draw(self, step: int, generator: torch.Generator) -> Drawn:
         """A scene for a step, the same for the same step, seed and state of the generator.
@@ -205,10 +222,11 @@ class Stream:
         """
         first = step // STEPS_EACH
         number = first + int(torch.randint(POOL_SIZE, (), generator=generator))
-        for gone in [k for k in {*self.pool, *self.pending} if k < first]:
+        for gone in [k for k in {*self.pool, *self.pending, *self.left} if k < first]:
+            self.left.discard(gone)
             self.pool.pop(gone, None)
             if gone in self.pending:  # made, but never drawn
-                self.pending.pop(gone).get()
+                self.pending.pop(gone).result()
             shutil.rmtree(self._path(gone), ignore_errors=True)
         for soon in range(first, first + POOL_SIZE + 1):
             self._order(soon)
@@ -223,14 +241,14 @@ class Stream:
 
     def _made(self, number: int) -> Scene:
         if number in self.pending:
-            self.pending.pop(number).get()
+            self.pending.pop(number).result()
         return load_scene(self._path(number), cache=self._path(number) / "decoded")  # deleted with the scene
 
     def _order(self, number: int) -> None:
         """Start making a procedural scene, unless it exists or is pending."""
         recipe_ = self._describe(number).recipe
         if recipe_ is not None and number not in self.pending and not self._path(number).exists():
-            self.pending[number] = self.maker.apply_async(make, (recipe_, self._path(number)))
+            self.pending[number] = self.maker.submit(make, recipe_, self._path(number))
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
@@ -253,4 +271,5 @@ class Stream:
                 photographs, colours=tuple(c[..., own.channels] for c in photographs.colours), files=()
             )
         augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
-        return Drawn(augmented, DepthPriors(augmented, scene.points), cameras.to(self.device))
+        match = Matcher(augmented) if self.matches_surface else None
+        return Drawn(augmented, DepthPriors(augmented, scene.points, match), cameras.to(self.device))

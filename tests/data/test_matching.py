@@ -1,0 +1,141 @@
+"""Matching finds the textured wall from a wrong start, leaves what it cannot see, and says how far to search."""
+
+from dataclasses import replace
+
+import pytest
+import textured_wall as wall
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tidefield.data import matching
+from tidefield.data.depth_prior import DepthPrior, DepthPriors, surface_prior
+from tidefield.data.matching import Matcher
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras
+
+TARGET = 3
+STEP = 0.25
+
+
+def scene(width: int = 128, height: int = 96) -> Scene:
+    return wall.scene(wall.cameras(7, width, height, step=STEP), (TARGET,))
+
+
+def inverse_depth(prior: DepthPrior, camera: Cameras) -> Float[Tensor, "H W"]:
+    """The expected inverse depth of every pixel: cells and detail."""
+    assert prior.detail is not None
+    return matching._on_pixels(camera, prior.cells[0]) + prior.detail
+
+
+def parallax_px(at: Scene, found: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Error of inverse depths, in pixels of parallax to the next camera."""
+    camera = at.cameras[TARGET]
+    return (found - 1 / wall.true_depth(camera)).abs() * STEP * camera.focal_px[0, 0]
+
+
+def matched(at: Scene, cells: Float[Tensor, "3 h w"], names: bool = True) -> Float[Tensor, "H W"]:
+    camera = at.cameras[TARGET] if names else replace(at.cameras[TARGET], names=())
+    return inverse_depth(Matcher(at)(camera, cells), camera)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.15])
+def test_the_wall_is_found_from_a_start_that_is_off(factor: float):
+    at = scene()
+    camera = at.cameras[TARGET]
+    cells = surface_prior(camera, at.points, at.cameras)
+    start = factor * cells
+    error = parallax_px(at, matched(at, start))
+    inner = error[6:-6, 12:-12]
+    assert inner.median() < 0.05
+    assert inner.max() < 0.3
+    if factor != 1:
+        before = parallax_px(at, matching._on_pixels(camera, start[0]))
+        assert before.median() > 10 * inner.median(), "the start was right already"
+
+
+def test_without_any_expected_depth_all_of_the_range_is_searched():
+    at = scene()
+    camera = at.cameras[TARGET]
+    cells = surface_prior(camera, None, at.cameras)
+    assert cells[0].isnan().all()
+    error = parallax_px(at, matched(at, cells))[6:-6, 12:-12]
+    assert error.median() < 0.05
+
+
+def test_the_interval_is_a_few_pixels_of_parallax_around_the_surface():
+    at = scene()
+    camera = at.cameras[TARGET]
+    prior = Matcher(at)(camera, surface_prior(camera, at.points, at.cameras))
+    expected, near, far = prior.cells
+    assert ((near > expected) & (expected > far)).all()
+    # The photographs that are compared are one, two or three steps away.
+    pixels = (near - expected) * STEP * camera.focal_px[0, 0]
+    assert (pixels > matching.HALF_PX / 3).all()
+    assert (pixels < matching.HALF_PX * 1.01).all()
+
+
+def test_rays_without_an_expected_depth_beside_others_keep_what_they_have():
+    at = scene()
+    camera = at.cameras[TARGET]
+    cells = surface_prior(camera, at.points, at.cameras)
+    cells[0, :4] = torch.nan
+    prior = Matcher(at)(camera, cells)
+    torch.testing.assert_close(prior.cells[:, :4], cells[:, :4], equal_nan=True)
+    assert prior.detail is not None
+    assert (prior.detail[:16] == 0).all()
+    assert prior.cells[:, 4:].isfinite().all()
+
+
+def test_where_no_photograph_looks_the_start_stays():
+    at = scene()
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 3.0  # the others are all to the left
+    at = replace(at, cameras=replace(at.cameras, T_world_camera=pose))
+    camera = at.cameras[TARGET]
+    cells = surface_prior(camera, at.points, at.cameras)
+    assert parallax_px(at, matched(at, cells)).median() < 0.1
+    away = replace(camera, T_world_camera=camera.T_world_camera * torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    prior = Matcher(at)(away, cells)
+    assert torch.equal(prior.cells, cells)
+    assert prior.detail is not None
+    assert (prior.detail == 0).all()
+
+
+def test_a_cameras_own_photograph_takes_no_part():
+    at = wall.scene(wall.cameras(7, 128, 96, step=STEP), ())
+    cells = surface_prior(at.cameras[TARGET], at.points, at.cameras)
+    without = matched(at, cells)
+    other = [colours.clone() for colours in at.photographs.colours]
+    other[TARGET] = 255 - other[TARGET]
+    at = replace(at, photographs=replace(at.photographs, colours=tuple(other)))
+    assert torch.equal(matched(at, cells), without)
+    assert not torch.equal(matched(at, cells, names=False), without)
+
+
+def test_parts_of_a_large_picture_fit_together(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    cells = 1.05 * surface_prior(at.cameras[TARGET], at.points, at.cameras)
+    whole = matched(at, cells)
+    monkeypatch.setattr(matching, "FRAME_PX", 64)
+    monkeypatch.setattr(matching, "OVERLAP_PX", 32)
+    parts = matched(at, cells)
+    assert not torch.equal(parts, whole)
+    assert ((parts - whole).abs() * STEP * at.cameras.focal_px[0, 0])[6:-6, 12:-12].max() < 0.3
+
+
+def test_the_depth_priors_of_training_are_matched_once():
+    at, calls = scene(), []
+
+    def match(camera: Cameras, cells: Float[Tensor, "3 h w"]) -> DepthPrior:
+        calls.append(camera.names)
+        return DepthPrior(cells, torch.full((camera.height, camera.width), 0.5))
+
+    priors = DepthPriors(at, match=match)
+    tiles = priors[2].detail_of_tiles(torch.tensor([[0.0, 0.0], [120.0, 90.0]]), 16)
+    assert priors[2] is priors[2]
+    assert calls == [(at.names[2],)]
+    assert (tiles[0] == 0.5).all()
+    inside = torch.zeros(16, 16)
+    inside[:6, :8] = 0.5
+    torch.testing.assert_close(tiles[1], inside.flatten())

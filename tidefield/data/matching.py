@@ -1,0 +1,342 @@
+"""Match photographs to find the surface that a camera sees (docs/method.md, section 13).
+
+A plane sweep from coarse to fine: at each level every pixel tries a few depths around those of the level before. The
+photographs are projected there and compared without their local means and contrasts, over windows; the depth at which
+they agree best is taken from a parabola through the three best costs, and smoothed the more the less it is determined.
+The first level starts from the depth prior, that is from the sparse points.
+
+Alphabet: V photographs, K depths that are tried, H W pixels of a camera, h w cells of a prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import replace
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from tidefield.data.depth_prior import STRIDE, DepthPrior
+from tidefield.data.neighbours import BORDER, from_border
+from tidefield.data.pyramid import Pyramid
+from tidefield.data.scene import Scene
+from tidefield.data.surface import in_frame
+from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
+
+LEVELS = 4
+"""Levels, each twice as fine as the one before; the last has the camera's own pixels."""
+FIRST_STEPS, STEPS, MOST_STEPS = 4, 2, 48
+"""Depths that are tried on each side, a pixel of parallax apart: at the first level, at the others, and at most at the
+first where nothing says where the surface is."""
+VIEWS = 4
+"""Photographs that are compared at a pixel: those from the most similar directions."""
+SOFTNESS_RAD = 0.02
+"""Angle at which a photograph's weight has halved."""
+CONTRAST_PX = 9
+"""Side of the windows whose mean and contrast are removed from the photographs."""
+NOISE = 2 / 255
+"""Standard deviation of the grey values that is no contrast."""
+WINDOW_PX, WIDE_PX, WIDE_SHARE = 5, 15, 0.5
+"""Sides of the windows that photographs are compared over, and the share of the second: it decides where the first one
+holds too little texture."""
+HOLD = 0.002
+"""Cost of a step away from the depth of the level before, squared: what decides where there is no texture."""
+SMOOTH_PX = 3
+"""Side of the window of the smoothing."""
+LEAST_COST = 0.02
+"""Cost that perfect agreement counts as in the smoothing."""
+HALF_PX = 3.0
+"""Half of the interval that is left to search, in pixels of parallax."""
+FRAME_PX, OVERLAP_PX = 768, 96
+"""Side of the parts of a camera that are matched at once, and how far they overlap."""
+MARGIN_PX = 2.0
+"""Pixels at the borders of photographs that are not compared: other depths would be read outside of them."""
+KEPT_BYTES = 300_000_000
+"""Memory for photographs without their means and contrasts; those that were not read for the longest time go first."""
+
+
+class Matcher:
+    """Finds the surfaces that cameras see in one scene.
+
+    Args:
+        scene: whose training photographs are compared, except for a camera's own.
+        pyramid: of the scene, where there is one already.
+    """
+
+    def __init__(self, scene: Scene, pyramid: Pyramid | None = None) -> None:
+        self.scene, self.pyramid = scene, pyramid or Pyramid(scene)
+        self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+
+    @torch.inference_mode()
+    def __call__(self, camera: Cameras, cells: Float[Tensor, "3 h w"]) -> DepthPrior:
+        """Match the surface of a camera's pixels, starting from its depth prior.
+
+        Rays without an expected depth keep what they have.
+        """
+        expected, near, far = cells
+        known = expected.isfinite()
+        start = _on_pixels(camera, torch.where(known, expected, (near + far) / 2))
+        # Without any expected depth all of the range is searched first.
+        reach = 0.0 if known.any() else float((near - far).max() / 2)
+        known = known | ~known.any()
+        found, half = torch.empty_like(start), torch.empty_like(start)
+        for outer, inner in _parts(camera):
+            (left, top), (right, bottom) = outer
+            part = replace(
+                camera,
+                principal_px=camera.principal_px - camera.principal_px.new_tensor([left, top]),
+                size_px=camera.size_px.new_tensor([[right - left, bottom - top]]),
+            )
+            surface, step = self._match(part, start[top:bottom, left:right], reach)
+            (x0, y0), (x1, y1) = inner
+            found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
+            half[y0:y1, x0:x1] = HALF_PX * step
+        matched = torch.stack([_on_cells(cells, image) for image in (found, half)])
+        middle, half = matched
+        ends = middle + half, torch.minimum(middle - half, middle)
+        result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
+        detail = found - _on_pixels(camera, torch.where(known, result[0], middle))
+        seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
+        return DepthPrior(result, torch.where(seen, detail, 0.0))
+
+    def _match(self, camera: Cameras, start: Float[Tensor, "H W"], reach: float) -> tuple[Float[Tensor, "H W"], float]:
+        """Inverse depths of the surface, and the inverse depth that is a pixel of parallax (0 if nothing matches).
+
+        Args:
+            reach: how far around the start the first level searches, where that is more than usual.
+        """
+        step, found = 0.0, start
+        coarsest = _smaller(camera, LEVELS - 1)
+        weight, views = self._views(coarsest, _resized(start, coarsest))
+        if not len(views):
+            return start, 0.0
+        for level in reversed(range(LEVELS)):
+            small, first = _smaller(camera, level), level == LEVELS - 1
+            own = FIRST_STEPS if first else STEPS
+            found, step = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
+        return found, step
+
+    def _views(
+        self, camera: Cameras, inverse_depth: Float[Tensor, "H W"]
+    ) -> tuple[Float[Tensor, "V H W"], Int[Tensor, " V"]]:
+        """The photographs to compare, and their weights at pixels: of each pixel's `VIEWS` photographs from the most
+        similar directions, as in unstructured lumigraph rendering (Buehler et al., 2001)."""
+        indices = torch.tensor(self.scene.sources(camera), dtype=torch.long)
+        sources = self.scene.cameras[indices]
+        shape = inverse_depth.shape
+        rays = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
+        points = camera.position_world[0] + rays / inverse_depth.reshape(-1, 1)
+        uv, z = sources.project(points)
+        seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
+        theirs = F.normalize(points - sources.position_world[:, None], dim=-1)
+        angle = angle_between(F.normalize(rays, dim=-1), theirs).masked_fill(~seen, torch.inf)
+        nearest, which = angle.topk(min(VIEWS + 1, len(sources)), dim=0, largest=False)
+        # The weight falls to 0 at the first photograph left out, so that the cost is continuous.
+        limit = nearest[VIEWS] if len(sources) > VIEWS else torch.full_like(nearest[0], torch.inf)
+        nearest, which = nearest[:VIEWS], which[:VIEWS]
+        share = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
+        weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
+        weight = weight * from_border(uv, sources.size_px[:, None], BORDER)
+        used = (weight > 0).any(1)
+        return weight[used].unflatten(1, shape), indices[used]
+
+    def _level(
+        self,
+        camera: Cameras,
+        start: Float[Tensor, "H W"],
+        weight: Float[Tensor, "V a b"],
+        views: Int[Tensor, " V"],
+        steps: int,
+        reach: float,
+    ) -> tuple[Float[Tensor, "H W"], float]:
+        """One level: the best of 2 `steps` + 1 depths of every pixel, and the step between them.
+
+        Args:
+            start: inverse depths to try others around.
+            weight: of the views, at the coarsest level's pixels.
+            reach: inverse depth on each side that more steps are made for.
+        """
+        looks = self._looks(camera, start, weight, views)
+        parallax = sum(float((look.parallax_px * look.weight).sum()) for look in looks)
+        if parallax <= 0:
+            return start, 0.0
+        step = sum(float(look.weight.sum()) for look in looks) / parallax
+        steps = max(steps, min(MOST_STEPS, math.ceil(reach / step)))
+        total = torch.zeros_like(start)
+        for look in looks:
+            total[look.rows, look.columns] += look.weight
+        total = total.clamp(min=1e-6)
+        offsets = torch.arange(-steps, steps + 1, device=start.device)[:, None, None]
+        mean, square = (start.new_zeros(len(offsets), *start.shape) for _ in range(2))
+        for look in looks:
+            at = (..., look.rows, look.columns)
+            value = look.read(start[at[1:]] + step * offsets)
+            share = look.weight / total[at[1:]]
+            part = share * value
+            mean[at] += part
+            square[at] += part * value
+        # 2 is the variance of what has nothing in common: what one photograph alone has wrong counts no more.
+        cost = _windowed((square - mean.square()).clamp(0, 2)) + (0.0 if reach else HOLD) * offsets**2
+        best = cost.argmin(0, keepdim=True).clamp(1, 2 * steps - 1)
+        before, lowest, after = (cost.gather(0, best + k)[0] for k in (-1, 0, 1))
+        curvature = (before - 2 * lowest + after).clamp(min=1e-6)
+        offset = best[0] - steps + ((before - after) / (2 * curvature)).clamp(-1, 1)
+        known = curvature / (lowest + LEAST_COST) + 1e-4
+        return _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX), step
+
+    def _looks(
+        self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V a b"], views: Int[Tensor, " V"]
+    ) -> list[_Look]:
+        height, width = start.shape
+        rays = camera.directions_world(pixel_grid(width, height)[None])[0].unflatten(0, (height, width))
+        origin = camera.position_world[0]
+        middle = origin + camera.directions_world(camera.size_px[None].to(start) / 2)[0] / start.median()
+        weight = F.interpolate(weight[None], size=(height, width), mode="bilinear", align_corners=False)[0]
+        levels = self.pyramid.levels(camera, views[None], middle)[0]
+        looks = []
+        for view, photograph, level in zip(weight, views.tolist(), levels.tolist(), strict=True):
+            rows, columns = (_extent((view > 0).any(dim)) for dim in (1, 0))
+            if rows.stop == rows.start:
+                continue
+            source = self.pyramid.cameras[int(self.pyramid.row(torch.tensor(photograph), torch.tensor(level)))]
+            image = self._image(photograph, level, source)
+            looks.append(
+                _Look(
+                    image, source, rows, columns, view[rows, columns], rays[rows, columns], origin, start[rows, columns]
+                )
+            )
+        return looks
+
+    def _image(self, photograph: int, level: int, camera: Cameras) -> Float[Tensor, "1 1 H W"]:
+        """A photograph at a level of the pyramid without its local means and contrasts."""
+        key = photograph, level
+        if key not in self._kept:
+            colours, _ = self.pyramid.read(photograph, level)
+            grey = (colours.float() / 255 / camera.gain_of_rows()).mean(-1)
+            mean = _box(grey, CONTRAST_PX)
+            variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
+            self._kept[key] = ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
+            while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > KEPT_BYTES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+
+class _Look:
+    """One photograph, read at depths of the pixels of a part of a camera.
+
+    Attributes:
+        rows, columns: the part.
+        weight: of the photograph.
+        parallax_px: pixels that the photograph's point moves by per inverse depth.
+    """
+
+    def __init__(
+        self,
+        image: Float[Tensor, "1 1 a b"],
+        source: Cameras,
+        rows: slice,
+        columns: slice,
+        weight: Float[Tensor, "h w"],
+        rays: Float[Tensor, "h w 3"],
+        origin_world: Float[Tensor, "3"],
+        start: Float[Tensor, "h w"],
+    ) -> None:
+        self.image, self.rows, self.columns, self.weight = image, rows, columns, weight
+        matrix = source.projection[0]
+        # Of origin + ray / d the homogeneous pixel is, times d: matrix ray + d matrix origin.
+        far, near = rays @ matrix[:, :3].T, matrix[:, :3] @ origin_world + matrix[:, 3]
+        uv = _over(far[..., :2] + start[..., None] * near[:2], (far[..., 2] + start * near[2])[..., None])
+        self.parallax_px = _over(near[:2] - uv * near[2], (far[..., 2] + start * near[2])[..., None]).norm(dim=-1)
+        # The weights are of the coarsest level's pixels, which may lie half outside of the photograph.
+        inside = (uv > MARGIN_PX).all(-1) & (uv < source.size_px[0] - MARGIN_PX).all(-1)
+        self.weight = self.weight * inside
+        moved = source.displaced(uv.reshape(1, -1, 2)).reshape(uv.shape) - uv
+        # From pixels to what `grid_sample` takes: -1 to 1 from border to border.
+        scale = 2 / source.size_px[0]
+        self._far = [far[..., k] * scale[k] - far[..., 2] for k in (0, 1)] + [far[..., 2]]
+        self._near = [near[k] * scale[k] - near[2] for k in (0, 1)] + [near[2]]
+        self._moved = [moved[..., k] * scale[k] for k in (0, 1)]
+
+    def read(self, inverse_depth: Float[Tensor, "K h w"]) -> Float[Tensor, "K h w"]:
+        """What the photograph shows at inverse depths of the pixels."""
+        x, y, z = (torch.addcmul(far, inverse_depth, near) for far, near in zip(self._far, self._near, strict=True))
+        inverse = z.clamp(min=1e-6).reciprocal_()
+        grid = torch.stack([torch.addcmul(m, q, inverse) for q, m in zip((x, y), self._moved, strict=True)], dim=-1)
+        grid = grid.flatten(0, 1)[None]
+        value = F.grid_sample(self.image, grid, padding_mode="border", align_corners=False)
+        return value.reshape(inverse_depth.shape)
+
+
+def _over(values: Tensor, z: Tensor) -> Tensor:
+    """Values over z, which is kept positive: what is behind a camera is out of its frame."""
+    return values / z.clamp(min=1e-6)
+
+
+def _extent(used: Tensor) -> slice:
+    """From the first to the last that is used."""
+    where = used.nonzero()[:, 0]
+    return slice(int(where[0]), int(where[-1]) + 1) if len(where) else slice(0, 0)
+
+
+def _box(values: Tensor, side: int) -> Tensor:
+    """Means over windows, of a picture or of several."""
+    shape = values.shape
+    values = values.reshape(1, -1, *shape[-2:])
+    for window in ((side, 1), (1, side)):
+        padding = (window[0] // 2, window[1] // 2)
+        values = F.avg_pool2d(values, window, 1, padding, count_include_pad=False)
+    return values.reshape(shape)
+
+
+def _windowed(cost: Float[Tensor, "K H W"]) -> Float[Tensor, "K H W"]:
+    near = _box(cost, WINDOW_PX)
+    return near + WIDE_SHARE * _box(near, WIDE_PX)
+
+
+def _smaller(camera: Cameras, octaves: int) -> Cameras:
+    return camera.resized(*(max(1, side >> octaves) for side in (camera.width, camera.height)))
+
+
+def _resized(image: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "h w"]:
+    """An image of inverse depths on the pixels of a camera of another size."""
+    size = camera.height, camera.width
+    if image.shape[0] > size[0]:
+        return F.interpolate(image[None, None], size=size, mode="area")[0, 0]
+    return F.interpolate(image[None, None], size=size, mode="bilinear", align_corners=False)[0, 0]
+
+
+def _on_pixels(camera: Cameras, cells: Float[Tensor, "h w"]) -> Float[Tensor, "H W"]:
+    """Values of cells of `STRIDE` pixels, interpolated at the pixels as `read_prior` does."""
+    image = F.interpolate(cells[None, None], scale_factor=STRIDE, mode="bilinear", align_corners=False)[0, 0]
+    return image[: camera.height, : camera.width]
+
+
+def _on_cells(cells: Float[Tensor, "3 h w"], image: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+    """Means of pixels over cells of `STRIDE` pixels; those that reach beyond the image continue its border."""
+    height, width = (STRIDE * side for side in cells.shape[1:])
+    padded = F.pad(image[None, None], (0, width - image.shape[1], 0, height - image.shape[0]), mode="replicate")
+    return F.avg_pool2d(padded, STRIDE)[0, 0]
+
+
+_Box = tuple[tuple[int, int], tuple[int, int]]
+"""Upper left corner of a part of a picture, and the corner that it ends before."""
+
+
+def _parts(camera: Cameras) -> list[tuple[_Box, _Box]]:
+    """Parts of a camera's picture to match, and the part of each that is used."""
+    sides = []
+    for side in (camera.width, camera.height):
+        count = max(1, -(-side // FRAME_PX))
+        edges = [round(k * side / count) for k in range(count + 1)]
+        sides.append([(max(0, a - OVERLAP_PX), min(side, b + OVERLAP_PX), a, b) for a, b in pairwise(edges)])
+    columns, rows = sides
+    return [
+        (((left, top), (right, bottom)), ((x0, y0), (x1, y1)))
+        for top, bottom, y0, y1 in rows
+        for left, right, x0, x1 in columns
+    ]
