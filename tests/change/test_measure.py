@@ -35,7 +35,7 @@ def east(grid) -> list[Region]:
 def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
     earlier, later, truth = pair(tmp_path, 0, 0.10)
     found = measured(earlier, later)
-    assert [volume.area_m2 > 50 for _, volume, _ in found.each].count(True) == 2
+    assert [volume.area_m2 > 100 for _, volume, _ in found.each].count(True) == 2
     for volume, sign in ((found.cut, -1), (found.fill, 1)):
         true = float((sign * truth).clip(min=0).sum()) * AREA
         low, high = volume.interval_m3

@@ -152,7 +152,10 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     finite = np.isfinite(residuals)
     if finite.sum() < 100:
         return UNCORRELATED
-    scale = nmad(residuals[finite]) or float(residuals[finite].std())
+    # What one number is taken from needs no more than a million cells.
+    every = 1 + math.isqrt(residuals.size // 1_000_000)
+    some = residuals[::every, ::every][finite[::every, ::every]]
+    scale = nmad(some) or float(some.std())
     if scale == 0:
         return UNCORRELATED
     sums: dict[int, np.ndarray] = {}
@@ -184,7 +187,8 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     if len(table) < 4:
         return UNCORRELATED
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
-    return _with_patches(_fitted(lags, gammas, pairs), residuals / np.float32(residuals[finite].std()), cell_m)
+    thinned = residuals[::every, ::every] / np.float32(some.std())
+    return _with_patches(_fitted(lags, gammas, pairs), thinned, every * cell_m)
 
 
 def _padded(rows: int, columns: int) -> tuple[int, int]:
@@ -212,7 +216,7 @@ def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Va
     else:
         return fitted
     means = sums[full] / counts[full]
-    predicted = fitted.nugget / side**2 + mean_correlation(fitted, side * cell_m)
+    predicted = fitted.nugget / float(counts[full].mean()) + mean_correlation(fitted, side * cell_m)
     reach = 2 * side * cell_m
     share = mean_correlation(Variogram((1.0,), (reach,)), side * cell_m)
     sill = (float(np.mean(means**2)) - predicted) / share

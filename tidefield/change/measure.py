@@ -271,17 +271,21 @@ def _settle(
             residual[rows][inside] = (dz[rows] - bare.plane(grid, rows))[inside]
         left = float(np.nanmedian(_sampled(residual, ground)))
         after = statistics(_sampled(residual, ground))
-        scaled = residual if own is None else residual / own
-        values = _sampled(scaled, ground)
-        values = values - np.median(values)
+        if own is not None:
+            residual /= own
+        values = _sampled(residual, ground)
+        middle = np.float32(np.median(values))
+        values = values - middle
         size = deviation95(values)
         if len(values) < _NMAD_CELLS:
             size = max(size, nmad(values))
         if size == 0:
             size = 1e-6
         sigma = size if own is None else own * np.float32(size)
-        normal = (scaled - np.float32(np.median(_sampled(scaled, ground)))) / np.float32(size)
-        variogram = fit_variogram(normal, grid.cell_m)
+        residual -= middle
+        residual /= np.float32(size)
+        variogram = fit_variogram(residual, grid.cell_m)
+        del residual
         found = Registration(
             model,
             coefficients,
@@ -297,6 +301,7 @@ def _settle(
         for rows in grid.strips():
             moved[rows] = dz[rows] - found.plane(grid, rows)
         outlines = find_outlines(moved, sigma, found.systematic_m, variogram, grid.cell_m, options.windows)
+        del moved
         ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
     raise AssertionError("the last turn returns")
 
@@ -308,9 +313,9 @@ def _unchanged(
     known = np.isfinite(dz)
     ground = known
     for window in (5, 11):
-        share = uniform_filter(known.astype(np.float32), window, mode="constant")
-        scaled = np.where(known, dz if own is None else dz / own, np.float32(0))
-        mean = uniform_filter(scaled, window, mode="constant") / np.maximum(share, np.float32(1e-6))
+        mean = np.where(known, dz if own is None else dz / own, np.float32(0))
+        uniform_filter(mean, window, output=mean, mode="constant")
+        mean /= np.maximum(uniform_filter(known.astype(np.float32), window, mode="constant"), np.float32(1e-6))
         middle, spread = 0.0, math.inf
         for _ in range(_TURNS):
             some = _sampled(mean, ground)

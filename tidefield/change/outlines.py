@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
-from scipy.ndimage import find_objects, label, median_filter, uniform_filter
+from scipy.ndimage import find_objects, label, maximum_filter, median_filter, uniform_filter
 from scipy.special import ndtr
 
 from tidefield.change.errors import Variogram, mean_correlation
@@ -76,16 +76,7 @@ def find_outlines(
         systematic_m: one sigma of the error that all cells share.
         windows: cells along each side of the windows; odd.
     """
-    limited = _limited(dz, sigma)
-    z = window_z(limited, sigma, systematic_m, variogram, cell_m, windows[0])
-    first = z.copy()
-    for window in windows[1:]:
-        other = window_z(limited, sigma, systematic_m, variogram, cell_m, window)
-        for rows in _strips(len(z)):
-            # A large window reaches beyond the edge of a change; the smallest one has to show a little of it, too.
-            larger = np.abs(other[rows]) > np.abs(z[rows])
-            np.copyto(z[rows], other[rows], where=larger & (first[rows] * np.sign(other[rows]) > _SHOWS))
-    del limited, first
+    z = _largest_z(dz, sigma, systematic_m, variogram, cell_m, windows)
     threshold = _threshold(z, len(windows))
     margin = sorted(windows)[len(windows) // 2] // 2 + 1
     labels = np.zeros(dz.shape, np.int32)
@@ -96,13 +87,17 @@ def find_outlines(
         numbered = np.zeros(dz.shape, np.int32)
         # False where z is NaN.
         count = int(label(z * sign > min(_CONNECTED, threshold), _EIGHT, output=numbered))  # type: ignore[arg-type]
-        sizes = np.bincount(numbered.ravel(), minlength=count + 1)
-        found = np.bincount(numbered[z * sign > threshold], minlength=count + 1) > 0
+        sizes, found = np.zeros(count + 1, np.int64), np.zeros(count + 1, bool)
+        for rows in _strips(len(z)):
+            sizes += np.bincount(numbered[rows].ravel(), minlength=count + 1)
+            found[numbered[rows][z[rows] * sign > threshold]] = True
         kept = np.flatnonzero(found & (sizes >= min(windows) ** 2) & (np.arange(count + 1) > 0))
         lookup = np.zeros(count + 1, np.int32)
         lookup[kept] = np.arange(1, len(kept) + 1) + len(signs)
         signs += [sign] * len(kept)
-        labels += lookup[numbered]
+        for rows in _strips(len(z)):
+            labels[rows] += lookup[numbered[rows]]
+        del numbered
     del z
     _add_margin(labels, margin)
     labels[~np.isfinite(dz)] = 0
@@ -125,23 +120,40 @@ def _limited(
     return out
 
 
+def _largest_z(
+    dz: Float32[np.ndarray, "rows columns"],
+    sigma: Float32[np.ndarray, "rows columns"] | float,
+    systematic_m: float,
+    variogram: Variogram,
+    cell_m: float,
+    windows: tuple[int, ...],
+) -> Float32[np.ndarray, "rows columns"]:
+    """For each cell the z of that window which is most significant."""
+    z = np.empty(dz.shape, np.float32)
+    halo = max(windows) // 2
+    for rows in _strips(len(dz)):
+        low, high = max(0, rows.start - halo), min(len(dz), rows.stop + halo)
+        inner = slice(rows.start - low, rows.stop - low)
+        own = sigma[low:high] if isinstance(sigma, np.ndarray) else sigma
+        limited = _limited(dz[low:high], own)
+        first = window_z(limited, own, systematic_m, variogram, cell_m, windows[0])[inner]
+        z[rows] = first
+        for window in windows[1:]:
+            other = window_z(limited, own, systematic_m, variogram, cell_m, window)[inner]
+            # A large window reaches beyond the edge of a change; the smallest one has to show a little of it, too.
+            larger = (np.abs(other) > np.abs(z[rows])) & (first * np.sign(other) > _SHOWS)
+            np.copyto(z[rows], other, where=larger)
+    return z
+
+
 def _add_margin(labels: Int32[np.ndarray, "rows columns"], margin: int) -> None:
     """Grow all regions into what is free around them, one cell at a time."""
     for _ in range(margin):
-        free = labels == 0
-        grown = labels.copy()
-        for axis in (0, 1):
-            for step in (1, -1):
-                moved = np.zeros_like(labels)
-                to, of = (
-                    (slice(step, None), slice(None, -step)) if step > 0 else (slice(None, step), slice(-step, None))
-                )
-                index = (to, slice(None)), (of, slice(None))
-                if axis:
-                    index = (slice(None), to), (slice(None), of)
-                moved[index[0]] = labels[index[1]]
-                np.copyto(grown, moved, where=free & (grown == 0))
-        labels[:] = grown
+        before = labels.copy()
+        for rows in _strips(len(labels)):
+            low = max(0, rows.start - 1)
+            around = maximum_filter(before[low : rows.stop + 1], 3)[rows.start - low :][: rows.stop - rows.start]
+            np.copyto(labels[rows], around, where=labels[rows] == 0)
 
 
 def _strips(rows: int) -> list[slice]:
