@@ -93,7 +93,7 @@ def compare_depths(scene: Scene, render: Render) -> dict[str, Any]:
         seen = doubly_seen(scene, camera) & true.isfinite()
         with torch.no_grad():
             rendered = render(camera).depth.cpu()
-        vegetation, edges = (part.reshape(true.shape) for part in _parts(scene, surface_points(camera, true)))
+        vegetation, edges = _parts(scene, surface_points(camera, true).reshape(*true.shape, 3))
         found["rendered"].append((rendered - true)[seen].double().numpy())
         found["points"].append((surface_depth(camera, scene.points, scene.cameras) - true)[seen].double().numpy())
         found["vegetation"].append(vegetation[seen].numpy())
@@ -108,20 +108,20 @@ def compare_depths(scene: Scene, render: Render) -> dict[str, Any]:
     }
 
 
-def _parts(scene: Scene, points: Float[Tensor, "P 3"]) -> tuple[Bool[Tensor, " P"], Bool[Tensor, " P"]]:
+def _parts(scene: Scene, points: Float[Tensor, "H W 3"]) -> tuple[Bool[Tensor, "H W"], Bool[Tensor, "H W"]]:
     """Which points of a built-in flat are plants, and which are on the edge of a channel, without plants."""
     truth = scene.root / "truth"
     about = json.loads((truth / "truth.json").read_text())["map"]
     first, step = about["first_pixel_centre_east_north_m"], about["pixel_step_east_north_m"]
-    east, north = (points[:, :2].double() + scene.origin_world[:2]).T.numpy()
-    u, v = ((east - first[0]) / step[0]).astype(np.float32), ((north - first[1]) / step[1]).astype(np.float32)
+    east, north = (points[..., :2].double() + scene.origin_world[:2]).unbind(-1)
+    u, v = ((east - first[0]) / step[0]).float().numpy(), ((north - first[1]) / step[1]).float().numpy()
     classes = cv2.imread(str(truth / "classes.png"), cv2.IMREAD_UNCHANGED)
     assert classes is not None
     bare = np.load(truth / "bare.npy")
     bare = cv2.GaussianBlur(bare, (0, 0), BASELINE_M / 2 / step[0])
     slope = np.hypot(*np.gradient(bare, step[0])).astype(np.float32)
-    plants = cv2.remap(classes, u[None], v[None], cv2.INTER_NEAREST)[0] == VEGETATION
-    steep = cv2.remap(slope, u[None], v[None], cv2.INTER_LINEAR)[0] > STEEP
+    plants = cv2.remap(classes, u, v, cv2.INTER_NEAREST) == VEGETATION
+    steep = cv2.remap(slope, u, v, cv2.INTER_LINEAR) > STEEP
     return torch.from_numpy(plants), torch.from_numpy(steep & ~plants)
 
 
