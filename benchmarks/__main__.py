@@ -265,6 +265,48 @@ def maps(
         print(table.markdown(), end="\n\n")
 
 
+def depth(
+    runs: Path = Path("runs/depth"),
+    categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
+    width: int = 800,
+    views: int = 24,
+    seed: int = 61,
+    weights: Path | None = None,
+    device: str = "auto",
+) -> None:
+    """Depths of held-out views of built-in flats against the exact truth and the triangulated points (minutes).
+
+    Args:
+        runs: Folder for flats and depth.json; what it holds is not measured again.
+        categories: Of flats.
+        width: Of the photographs in pixels.
+        views: Photographs of each survey.
+        seed: Of the flats.
+        weights: Of `tidefield pretrain`; those that came with Tidefield if not given.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    tune_process()
+    from benchmarks.depth import measure_depth, tables
+    from tidefield.config import PRESETS
+    from tidefield.device import choose_device
+    from tidefield.methods import zero_shot
+    from tidefield.train.checkpoint import given_or_shipped, weights_sha256
+
+    where, file = choose_device(device), given_or_shipped(weights, "swift")
+    record = measure_depth(
+        runs,
+        categories,
+        width,
+        views,
+        seed,
+        lambda scene: zero_shot(PRESETS["swift"], file, scene, where)[0],
+        {"preset": "swift", "weights": weights_sha256(file)},
+        partial(print, flush=True),
+    )
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -338,7 +380,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, kills, fuzz)
+    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, depth, change, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

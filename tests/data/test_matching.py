@@ -1,6 +1,7 @@
 """Matching finds the textured wall from a wrong start, leaves what it cannot see, and says how far to search."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import textured_wall as wall
@@ -72,7 +73,28 @@ def test_the_interval_is_a_few_pixels_of_parallax_around_the_surface():
     # The photographs that are compared are one, two or three steps away.
     pixels = (near - expected) * STEP * camera.focal_px[0, 0]
     assert (pixels > matching.HALF_PX / 3).all()
-    assert (pixels < matching.HALF_PX * 1.01).all()
+    assert (pixels[2:-2, 3:-3] < matching.HALF_PX * 1.1).all()
+    assert pixels.median() < matching.HALF_PX
+
+
+def test_the_interval_is_wider_where_the_depths_of_neighbouring_pixels_differ(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    camera = at.cameras[TARGET]
+    cells = surface_prior(camera, at.points, at.cameras)
+    level = Matcher._level
+
+    def torn(self: Matcher, *arguments: Any) -> tuple[Tensor, float]:
+        found, step = level(self, *arguments)
+        half = found.shape[1] // 2
+        return torch.cat([found[:, :half], 1.1 * found[:, half:]], dim=1), step
+
+    whole = Matcher(at)(camera, cells).cells
+    monkeypatch.setattr(Matcher, "_level", torn)
+    step = Matcher(at)(camera, cells).cells
+    width, before = (one[1] - one[2] for one in (step, whole))
+    middle = width.shape[1] // 2
+    assert (width[:, middle - 1 : middle + 1] > 2 * before[:, middle - 1 : middle + 1]).all()
+    assert (width[:, 4 : middle - 4] < 1.5 * before[:, 4 : middle - 4]).all()
 
 
 def test_rays_without_an_expected_depth_beside_others_keep_what_they_have():

@@ -49,8 +49,9 @@ SMOOTH_PX = 3
 """Side of the window of the smoothing."""
 LEAST_COST = 0.02
 """Cost that perfect agreement counts as in the smoothing."""
-HALF_PX = 3.0
-"""Half of the interval that is left to search, in pixels of parallax."""
+HALF_PX, SPREADS, SPREAD_PX = 1.0, 4.0, 9
+"""Half of the interval that is left to search: pixels of parallax, and standard deviations of the matched depths in a
+window of this side."""
 FRAME_PX, OVERLAP_PX = 768, 96
 """Side of the parts of a camera that are matched at once, and how far they overlap."""
 MARGIN_PX = 2.0
@@ -91,10 +92,10 @@ class Matcher:
                 principal_px=camera.principal_px - camera.principal_px.new_tensor([left, top]),
                 size_px=camera.size_px.new_tensor([[right - left, bottom - top]]),
             )
-            surface, step = self._match(part, start[top:bottom, left:right], reach)
+            surface, around = self._match(part, start[top:bottom, left:right], reach)
             (x0, y0), (x1, y1) = inner
             found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
-            half[y0:y1, x0:x1] = HALF_PX * step
+            half[y0:y1, x0:x1] = around[y0 - top : y1 - top, x0 - left : x1 - left]
         matched = torch.stack([_on_cells(cells, image) for image in (found, half)])
         middle, half = matched
         ends = middle + half, torch.minimum(middle - half, middle)
@@ -103,8 +104,13 @@ class Matcher:
         seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
         return DepthPrior(result, torch.where(seen, detail, 0.0))
 
-    def _match(self, camera: Cameras, start: Float[Tensor, "H W"], reach: float) -> tuple[Float[Tensor, "H W"], float]:
-        """Inverse depths of the surface, and the inverse depth that is a pixel of parallax (0 if nothing matches).
+    def _match(
+        self, camera: Cameras, start: Float[Tensor, "H W"], reach: float
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+        """Inverse depths of the surface, and half of the interval that is left to search (0 if nothing matches).
+
+        The interval is the wider the more the depths of neighbouring pixels differ: there are edges, or matches that
+        are not to be trusted.
 
         Args:
             reach: how far around the start the first level searches, where that is more than usual.
@@ -113,12 +119,13 @@ class Matcher:
         coarsest = _smaller(camera, LEVELS - 1)
         weight, views = self._views(coarsest, _resized(start, coarsest))
         if not len(views):
-            return start, 0.0
+            return start, torch.zeros_like(start)
         for level in reversed(range(LEVELS)):
             small, first = _smaller(camera, level), level == LEVELS - 1
             own = FIRST_STEPS if first else STEPS
             found, step = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
-        return found, step
+        spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
+        return found, HALF_PX * step + SPREADS * spread if step else torch.zeros_like(found)
 
     def _views(
         self, camera: Cameras, inverse_depth: Float[Tensor, "H W"]
