@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 from tidefield import __version__
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import ChangeError, Grid, require_rasterio
+from tidefield.change.surfaces import PLAIN, ChangeError, Grid, require_rasterio
 from tidefield.change.volumes import Volume
 from tidefield.files import write_json, write_text
 
@@ -238,7 +238,7 @@ def write_geopackage(change: Change, folder: Path) -> None:
             layer=name.replace(" ", "_"),
             driver="GPKG",
             geometry_type="MultiPolygon",
-            crs=change.grid.crs,
+            crs=change.grid.crs or PLAIN,
             append=path.exists(),
         )
 
