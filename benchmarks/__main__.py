@@ -299,6 +299,22 @@ def change(
     print(out)
 
 
+def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEASURED) -> None:
+    """Photographs of a built-in flat at two dates -> prepare -> map -> change, each against the truth (20-30 minutes).
+
+    Args:
+        work: Folder for photographs, scenes and maps; what is there is not made again.
+        views: Photographs of each survey.
+        width: Of the photographs in pixels.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_chain import run_chain
+
+    store(runs, "chain", run_chain(work, views, width, partial(print, flush=True)))
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -338,7 +354,8 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, maps, change, change_chain, kills, fuzz)
+    functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

@@ -157,6 +157,12 @@ def _st_leonards(folder: Path) -> list[dict[str, Any]]:
     return steps
 
 
+def store(runs: Path, part: str, found: Any) -> None:
+    """Keep what was measured of one part in RUNS/change.json."""
+    record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
+    write_json(runs / CHANGE_FILE, {**record, part: found, **describe()})
+
+
 def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Measure all parts, and store them in RUNS/change.json as they are done."""
     record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}

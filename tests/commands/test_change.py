@@ -152,3 +152,35 @@ def test_mistakes_are_told_in_one_message(
     polygons.write_text('{"type": "FeatureCollection", "features": [')
     assert "polygons" in fails(capsys, monkeypatch, "change", early, late, new, "--stable", polygons)
     assert not new.exists()
+
+
+def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_path: Path):
+    import pyogrio
+    import rasterio
+    from surveys_of_two_dates import write_surface
+
+    rng = np.random.default_rng(0)
+    columns = np.arange(240)
+    heights = np.broadcast_to(0.01 * columns, (160, 240))
+    for k, (year, covered) in enumerate(((2023, 60), (2024, 100))):
+        picture = np.where(columns[None, :, None] > 240 - covered, [95, 110, 60], [125, 112, 92]) * (1 - 0.2 * k)
+        picture = picture + rng.normal(0, 2, (160, 240, 3))
+        folder = tmp_path / f"{year}-06-01"
+        write_surface(folder / "dsm.tif", (heights + rng.normal(0, 0.01, heights.shape)).astype(np.float32))
+        write_surface(folder / "orthophoto.tif", picture.clip(0, 255).astype(np.uint8).transpose(2, 0, 1))
+    out = tmp_path / "out"
+    words = ("--water", 0.6, 0.4, "--levels", 1.0, "--register", "none", "--datum-error", 0.01)
+    call("change", tmp_path / "2023-06-01", tmp_path / "2024-06-01", out, "-q", *words)
+    numbers = json.loads((out / "change.json").read_text())
+    gained = numbers["cover"]["regions"]["all"]["gained"]
+    assert gained["value_m2"] == pytest.approx(40 * 160 * 0.25, rel=0.05)
+    line = numbers["water"]["waterline"]
+    assert line["move_m"] == pytest.approx(10, abs=1)
+    assert line["move_low_m"] < 10 < line["move_high_m"]
+    assert numbers["water"]["below"][0]["earlier_m2"] == pytest.approx(100 * 160 * 0.25, rel=0.02)
+    with rasterio.open(out / "cover.tif") as file:
+        assert set(np.unique(file.read(1))) == {0, 1, 2}
+    assert {name for name, _ in pyogrio.list_layers(out / "change.gpkg")} >= {"cover", "waterlines"}
+    page = (out / "change.html").read_text()
+    assert "Plants covered" in page
+    assert "seaward on average" in page

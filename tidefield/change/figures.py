@@ -18,11 +18,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from tidefield.change.cover import Cover
 from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
+from tidefield.change.water import Waterline
 
 LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
+GAINED, LOST = "#1a7a3c", "#b8742a"
 INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
 _SIDE = 1400
 """Longest side of a map, cells."""
@@ -124,6 +127,37 @@ def draw_stable(small: Thinned, what: str) -> Markup:
     cover = np.where(small.stable & np.isfinite(small.dz), 1.0, np.nan)
     axes.imshow(cover, cmap=ListedColormap([STABLE]), alpha=0.55, extent=_extent(small.grid), interpolation="nearest")
     axes.legend(handles=[Patch(color=STABLE, alpha=0.55, label="stable ground")], loc="lower left", framealpha=0.9)
+    return _png(figure, what)
+
+
+def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
+    """The map of plants gained, lost and at both dates over the earlier survey's relief."""
+    step = -(-max(cover.grid.shape) // _SIDE)
+    classes = cover.classes[::step, ::step]
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    handles = []
+    for code, colour, label in ((2, "#b9c8a0", "plants at both dates"), (1, GAINED, "gained"), (-1, LOST, "lost")):
+        shown = np.where(classes == code, 1.0, np.nan)
+        axes.imshow(shown, cmap=ListedColormap([colour]), extent=_extent(cover.grid), interpolation="nearest")
+        handles.append(Patch(color=colour, label=label))
+    axes.legend(handles=handles, loc="lower left", framealpha=0.9)
+    return _png(figure, what)
+
+
+def draw_waterlines(line: Waterline, small: Thinned, names: tuple[str, str], what: str) -> Markup:
+    """Both waterlines over the earlier survey's relief."""
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    for lines, colour, name, level in zip(line.lines, (INK, HIGHER), names, line.levels_m, strict=True):
+        for k, part in enumerate(lines):
+            x, y = np.asarray(part.coords).T[:2]
+            label = f"{name}, {level:.2f} m" if k == 0 else None
+            axes.plot(x, y, color=colour, linewidth=1.2, label=label)
+    west, east, south, north = _extent(small.grid)
+    axes.set(xlim=(west, east), ylim=(south, north))
+    if any(line.lines):
+        axes.legend(loc="lower left", framealpha=0.9)
     return _png(figure, what)
 
 

@@ -8,17 +8,21 @@ from typing import Any
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
+from tidefield.change.cover import Cover
 from tidefield.change.figures import (
     HIGHER,
     LOWER,
     draw_change,
+    draw_cover,
     draw_section,
     draw_stable,
     draw_stable_histogram,
     draw_variogram,
+    draw_waterlines,
     thinned,
 )
 from tidefield.change.measure import Change
+from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
 
@@ -27,7 +31,9 @@ _SHOWN_OUTLINES = 12
 _SECTIONS = 2
 
 
-def write_page(change: Change, numbers: dict[str, Any], path: Path) -> None:
+def write_page(
+    change: Change, numbers: dict[str, Any], path: Path, cover: Cover | None = None, water: Water | None = None
+) -> None:
     """Write the page, which needs no other file."""
     environment = Environment(
         loader=ChoiceLoader(
@@ -68,6 +74,13 @@ def write_page(change: Change, numbers: dict[str, Any], path: Path) -> None:
         colours={"lower": LOWER, "higher": HIGHER},
         regions=change.per_region,
         limits=limits(change),
+        cover=cover,
+        cover_map=None if cover is None else draw_cover(cover, small, f"Map of plants gained and lost {named}"),
+        cover_words=cover_words(cover),
+        water_words=water_words(water),
+        water_map=None
+        if water is None or water.waterline is None
+        else draw_waterlines(water.waterline, small, (earlier, later), f"Map of the waterlines {named}"),
     )
     write_text(path, html)
 
@@ -96,6 +109,44 @@ def sentences(change: Change) -> list[str]:
         f"{100 * change.false_alarms:.1f}% does, where 5% are expected."
     )
     return [first, second, third]
+
+
+def cover_words(cover: Cover | None) -> list[str]:
+    """Plants gained and lost, in a sentence."""
+    if cover is None:
+        return []
+    of = cover.areas["all"]
+
+    def area(what: str) -> str:
+        return f"{cubic(of[what].value_m2)} m² ({cubic(of[what].low_m2)} to {cubic(of[what].high_m2)})"
+
+    return [
+        f"Plants covered {area('earlier')} of {cubic(cover.known_m2)} m² at the earlier date and {area('later')} at "
+        f"the later one; {area('gained')} were gained, {area('lost')} lost."
+    ]
+
+
+def water_words(water: Water | None) -> list[str]:
+    """The waterline's move and areas below levels, in sentences."""
+    if water is None:
+        return []
+    words = []
+    line = water.waterline
+    if line is not None and not all(line.lines):
+        words.append("There is no waterline at these heights of the water at both dates.")
+    elif line is not None:
+        move, low, high = line.move_m
+        words.append(
+            f"The waterline moved {number(abs(move), 1)} m {'seaward' if move > 0 else 'landward'} on average (95%, "
+            f"seaward: {number(low, 1)} to {number(high, 1)} m): {cubic(line.land_gained_m2)} m² fell dry, "
+            f"{cubic(line.land_lost_m2)} m² came under water."
+        )
+    for below in water.below:
+        words.append(
+            f"Below {number(below.level_m, 2)} m lay {cubic(below.earlier_m2)} m², then {cubic(below.later_m2)} m²: "
+            f"{cubic(below.change_m2)} m² (95%: {cubic(below.low_m2)} to {cubic(below.high_m2)})."
+        )
+    return words
 
 
 def section_rows(change: Change) -> list[int]:

@@ -62,6 +62,10 @@ class Change:
     """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
     windows: tuple[int, ...] = (5, 11, 21)
     """Cells along each side of the windows in which change is tested, odd numbers."""
+    water: tuple[float, float] | None = None
+    """Heights of the water at both dates, in the earlier survey's heights: how far the waterline moved is told."""
+    levels: tuple[float, ...] = ()
+    """Heights: the ground below each is told at both dates."""
     m3c2: bool = False
     """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
     dates: tuple[str, str] | None = None
@@ -78,11 +82,15 @@ def change(options: Change, console: Console) -> None:
 
 
 def _compare(options: Change, console: Console, work: Path) -> None:
+    import numpy as np
+
     from tidefield.change.clouds import compare_clouds, write_distances
+    from tidefield.change.cover import measure_cover
     from tidefield.change.inputs import open_pair
     from tidefield.change.measure import Options, measure
-    from tidefield.change.page import write_page
+    from tidefield.change.page import cover_words, water_words, write_page
     from tidefield.change.regions import read_regions
+    from tidefield.change.water import measure_water
     from tidefield.change.write import write_all
     from tidefield.progress import ProgressBar
 
@@ -106,11 +114,17 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     ]
     with ProgressBar(console, "Reading surfaces") as bar:
         found = measure(earlier, later, asked, stable=reads[0], within=reads[1], regions=reads[2], tick=bar)
+    cover = None
+    if earlier.orthophoto is not None and later.orthophoto is not None:
+        regions = [region for region, *_ in found.per_region]
+        shift, known = found.errors.registration.shift_m, np.isfinite(found.dz)
+        cover = measure_cover(earlier.orthophoto, later.orthophoto, found.grid, shift, regions, known)
+    water = measure_water(found, options.water, options.levels) if options.water or options.levels else None
     for remark in found.remarks:
         log.warning(remark)
     with completed_folder(options.out) as folder:
-        numbers = write_all(found, folder, _command())
-        write_page(found, numbers, folder / "change.html")
+        numbers = write_all(found, folder, _command(), cover, water)
+        write_page(found, numbers, folder / "change.html", cover, water)
         if pair.clouds is not None:
             registration = found.errors.registration
             with ProgressBar(console, "Measuring M3C2 distances") as bar:
@@ -131,6 +145,8 @@ def _compare(options: Change, console: Console, work: Path) -> None:
         "are (5% expected)",
         soft_wrap=True,
     )
+    for line in [*cover_words(cover), *water_words(water)]:
+        console.print(line, soft_wrap=True)
     console.print(str(options.out), soft_wrap=True)
 
 
@@ -147,6 +163,9 @@ def _check(options: Change) -> None:
     if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
         given = " ".join(map(str, options.windows))
         raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
+    for level in (*(options.water or ()), *options.levels):
+        if not -12_000 < level < 9_000:
+            raise RunError(f"a level of {level} m was asked for: expected a height on the Earth; choose another")
     for date in options.dates or ():
         if len(date) != 10 or date[4] != "-" or date[7] != "-" or not date.replace("-", "").isdigit():
             raise RunError(f"--dates {date} was given: expected YYYY-MM-DD; write it so")
