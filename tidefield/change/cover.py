@@ -2,11 +2,13 @@
 
 A place is covered where its mean colour over half a metre is greener than bare ground's by a margin. Bare ground is
 the lowest of the common values of greenness. Areas come with the range that they have when the margin is moved by what
-greenness scatters from date to date over ground that is bare at both.
+greenness scatters from date to date over ground that is bare at both; what changed by less than that did
+not change.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,10 +128,10 @@ def compare_cover(
     bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
     difference = (second - first)[bare_ground]
     scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
-    scatter /= np.sqrt(2)
-    cell, areas = grid.cell_area_m2, {}
+    scatter /= math.sqrt(2)
+    cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
     inside = {"all": known} | {region.name: rasterised([region], grid) & known for region in regions or []}
-    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, grid) for k in (-1, 0, 1)}
+    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, least, grid) for k in (-1, 0, 1)}
     for name, where in inside.items():
         areas[name] = {}
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
@@ -145,10 +147,12 @@ def _classes(
     second: Float32[np.ndarray, "rows columns"],
     known: Bool[np.ndarray, "rows columns"],
     threshold: float,
+    least: float,
     grid: Grid,
 ) -> Int8[np.ndarray, "rows columns"]:
-    """Classes as `Cover` has them; patches of change that are too small keep what they were."""
+    """Classes as `Cover` has them; what changed too little, and patches that are too small, keep what they were."""
     before, after = first > threshold, second > threshold
+    after = np.where(np.abs(second - first) > least, after, before)
     for moved in (after & ~before, before & ~after):
         after = np.where(small_patches(moved, grid, LEAST_M2), before, after)
     classes = np.where(after, np.where(before, 2, 1), np.where(before, -1, 0)).astype(np.int8)
