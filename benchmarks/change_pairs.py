@@ -127,10 +127,10 @@ def true_change(earlier: Raster, later: Raster, grid: Grid) -> np.ndarray:
 def write_surface(path: Path, heights: np.ndarray, extent: Extent) -> Path:
     """Write heights whose cells' centres are the nodes of an extent, row 0 in the north."""
     import rasterio
-    from rasterio.transform import from_origin
+    from affine import Affine
 
     half = extent.cell_m / 2
-    transform = from_origin(extent.west_m - half, extent.north_m + half, extent.cell_m, extent.cell_m)
+    transform = Affine(extent.cell_m, 0, extent.west_m - half, 0, -extent.cell_m, extent.north_m + half)
     shape = {"width": extent.columns, "height": extent.rows, "count": 1, "dtype": "float32"}
     with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32631", transform=transform, **shape) as file:
         file.write(heights, 1)

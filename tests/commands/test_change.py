@@ -184,3 +184,45 @@ def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_pa
     page = (out / "change.html").read_text()
     assert "Plants covered" in page
     assert "seaward on average" in page
+
+
+def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from PIL import Image
+    from surveys_of_two_dates import write_surface
+
+    from tidefield.synthetic import write_survey
+    from tidefield.synthetic.grids import Extent
+    from tidefield.synthetic.two_dates import Difference, SurveyErrors, make_pair, surveyed
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = make_pair("ground_textures", 9, Difference(0.4, tide_m=0.0, sun_turn_deg=0.0), views=9, width=128)
+    extent = Extent.around([-25.0, -20.0], [25.0, 20.0], 0.25)
+    for name, survey in (("early", made.earlier), ("late", made.later)):
+        write_survey(survey, tmp_path / name)
+        heights = surveyed(survey.flat.bed, extent, np.random.default_rng(0), SurveyErrors(datum_m=0.0))
+        west, north = extent.west_m - 0.125, extent.north_m + 0.125
+        write_surface(tmp_path / f"{name}.tif", heights, 0.25, west, north, crs=None)
+    scenes = ("--scenes", tmp_path / "early", tmp_path / "late", "--view-width", 96, "--device", "cpu")
+    surfaces = (tmp_path / "early.tif", tmp_path / "late.tif")
+    call("change", *surfaces, tmp_path / "out", "-q", *scenes, "--cameras", "ground_textures_0004")
+    views = tmp_path / "out" / "views" / "ground_textures_0004"
+    names = {"earlier.png", "later.png", "side_by_side.png", "difference.png", "swipe.html", "fade.mp4"}
+    assert {path.name for path in views.iterdir()} == names
+    earlier = np.asarray(Image.open(views / "earlier.png")).astype(float)
+    later = np.asarray(Image.open(views / "later.png")).astype(float)
+    assert earlier.shape == later.shape == (72, 96, 3)
+    # The same ground is at the same pixel: a shift of a few pixels fits worse.
+    grey = [picture.mean(axis=2) for picture in (earlier, later)]
+    errors = [
+        np.abs(grey[0] - np.roll(grey[1], shift, axis))[8:-8, 8:-8].mean()
+        for shift, axis in ((0, 0), (-3, 0), (3, 0), (-3, 1), (3, 1))
+    ]
+    assert errors[0] < 0.85 * min(errors[1:])
+    assert "The same place then and now" in (tmp_path / "out" / "change.html").read_text()
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
+    assert "--scenes" in told
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
+    assert "none" in told
+    assert not (tmp_path / "new").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from tidefield.change.figures import (
     thinned,
 )
 from tidefield.change.measure import Change
+from tidefield.change.pictures import difference, jpeg, side_by_side
+from tidefield.change.views import View
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
@@ -29,10 +32,16 @@ from tidefield.files import write_text
 MINUS = "\u2212"
 _SHOWN_OUTLINES = 12
 _SECTIONS = 2
+_SHOWN_VIEWS = 4
 
 
 def write_page(
-    change: Change, numbers: dict[str, Any], path: Path, cover: Cover | None = None, water: Water | None = None
+    change: Change,
+    numbers: dict[str, Any],
+    path: Path,
+    cover: Cover | None = None,
+    water: Water | None = None,
+    views: Sequence[View] = (),
 ) -> None:
     """Write the page, which needs no other file."""
     environment = Environment(
@@ -75,6 +84,10 @@ def write_page(
         regions=change.per_region,
         limits=limits(change),
         cover=cover,
+        views=[
+            (view.name, jpeg(side_by_side(view, (earlier, later))), jpeg(difference(view)))
+            for view in views[:_SHOWN_VIEWS]
+        ],
         cover_map=None if cover is None else draw_cover(cover, small, f"Map of plants gained and lost {named}"),
         cover_words=cover_words(cover),
         water_words=water_words(water),

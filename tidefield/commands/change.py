@@ -6,6 +6,7 @@ import logging
 import os
 import shlex
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,12 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import Verbosity
+from tidefield.commands.common import Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from tidefield.change.cover import Cover
+    from tidefield.change.measure import Change as Measured
+    from tidefield.change.views import View
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +35,8 @@ class Change:
     OUT is a new folder: change.html (the report), change.tif (difference, its standard error and p-value),
     significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have
     95% intervals from the random, the spatially correlated and the systematic part of the error, which are measured
-    over stable ground.
+    over stable ground. Where both surveys have orthophotos, plants gained and lost are told, too (cover.tif,
+    cover.csv); with --scenes the same places then and now are in views, as pictures, a page that swipes and a video.
     """
 
     earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
@@ -68,6 +74,16 @@ class Change:
     """Heights: the ground below each is told at both dates."""
     m3c2: bool = False
     """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
+    scenes: tuple[Path, Path] | None = None
+    """Scenes or trained runs of both surveys: the same places then and now are rendered into OUT/views (scenes by the
+    trained weights that came with Tidefield)."""
+    cameras: tuple[str, ...] = ()
+    """Photographs of the earlier scene from whose cameras both are rendered; if not given, the one that looks at the
+    largest change."""
+    view_width: int = 960
+    """Width of these views in pixels."""
+    device: Device = "auto"
+    """Where they are rendered."""
     dates: tuple[str, str] | None = None
     """Dates of the surveys, if files and names do not tell: YYYY-MM-DD YYYY-MM-DD."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
@@ -124,7 +140,8 @@ def _compare(options: Change, console: Console, work: Path) -> None:
         log.warning(remark)
     with completed_folder(options.out) as folder:
         numbers = write_all(found, folder, _command(), cover, water)
-        write_page(found, numbers, folder / "change.html", cover, water)
+        views = [] if options.scenes is None else _views(options, found, cover, folder, console)
+        write_page(found, numbers, folder / "change.html", cover, water, views)
         if pair.clouds is not None:
             registration = found.errors.registration
             with ProgressBar(console, "Measuring M3C2 distances") as bar:
@@ -150,6 +167,38 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     console.print(str(options.out), soft_wrap=True)
 
 
+def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, console: Console) -> list[View]:
+    """Render both surveys from the cameras that were asked for, and write the pictures."""
+    from tidefield.change.pictures import write_views
+    from tidefield.change.views import Site, choose_camera, make_view
+    from tidefield.device import choose_device
+    from tidefield.progress import ProgressBar
+    from tidefield.train.checkpoint import RUN_FILE
+
+    assert options.scenes is not None
+    device, made = choose_device(options.device), []
+    with ExitStack() as stack:
+        sites = []
+        for path in options.scenes:
+            if (path / RUN_FILE).exists():
+                opened = open_trained(path, device, False, console, hold_out=False)
+                scene, render, _ = stack.enter_context(opened)
+            else:
+                scene = load(path, None, False, console, hold_out=False)
+                render, _ = open_zero_shot(ZeroShot(zero_shot=True), scene, device)
+            sites.append(Site.of(scene, render))
+        names = options.cameras or (choose_camera(found, sites[0]),)
+        with ProgressBar(console, "Rendering views") as bar:
+            for k, name in enumerate(names):
+                view = make_view(found, cover, sites[0], sites[1], name, options.view_width)
+                own = folder / "views" / Path(view.name).with_suffix("").as_posix().replace("/", "_")
+                own.mkdir(parents=True)
+                write_views(view, (found.earlier.name, found.later.name), own)
+                made.append(view)
+                bar(k + 1, len(names))
+    return made
+
+
 def _command() -> str:
     """The command as it was given, with the names of files and folders alone: a report is sent on."""
     words = [Path(word).name if "/" in word or os.sep in word else word for word in sys.argv[1:]]
@@ -163,6 +212,12 @@ def _check(options: Change) -> None:
     if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
         given = " ".join(map(str, options.windows))
         raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
+    if options.cameras and options.scenes is None:
+        raise RunError("--cameras was given without --scenes: expected the scenes of both surveys; name them")
+    if len(set(options.cameras)) < len(options.cameras):
+        raise RunError("--cameras names a photograph twice: expected each once; leave one out")
+    if not 64 <= options.view_width <= 8192:
+        raise RunError(f"--view-width {options.view_width} was asked for: expected 64 to 8192 pixels; choose another")
     for level in (*(options.water or ()), *options.levels):
         if not -12_000 < level < 9_000:
             raise RunError(f"a level of {level} m was asked for: expected a height on the Earth; choose another")
