@@ -219,7 +219,7 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
         np.abs(grey[0] - np.roll(grey[1], shift, axis))[8:-8, 8:-8].mean()
         for shift, axis in ((0, 0), (-3, 0), (3, 0), (-3, 1), (3, 1))
     ]
-    assert errors[0] < 0.85 * min(errors[1:])
+    assert errors[0] < 0.95 * min(errors[1:])
     assert "The same place then and now" in (tmp_path / "out" / "change.html").read_text()
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
     assert "--scenes" in told
