@@ -226,3 +226,48 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
     assert "none" in told
     assert not (tmp_path / "new").exists()
+
+
+def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    from surveys_of_two_dates import NORTH, WEST, noise, write_surface
+
+    rng, shape = np.random.default_rng(3), (120, 140)
+    rows, columns = np.indices(shape)
+    pit = np.hypot(rows - 40, columns - 40) < 20
+    names = []
+    for year, depth in ((2021, 0.0), (2022, 0.2), (2023, 0.5)):
+        heights = 0.002 * columns - depth * pit + noise(rng, shape, 0.012, 0.008, 4)
+        names.append(write_surface(tmp_path / f"dsm_{year}-05-01.tif", heights.astype(np.float32)))
+    square = [[WEST + x, NORTH - y] for x, y in ((5, 5), (35, 5), (35, 35), (5, 35), (5, 5))]
+    polygons = {"type": "FeatureCollection", "features": []}
+    polygons["crs"] = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32630"}}
+    geometry = {"type": "Polygon", "coordinates": [square]}
+    polygons["features"] = [{"type": "Feature", "properties": {"name": "pit"}, "geometry": geometry}]
+    (tmp_path / "pit.geojson").write_text(json.dumps(polygons))
+    out = tmp_path / "out"
+    call("change", *names[:2], out, "--series", names[2], "-q", "--polygons", tmp_path / "pit.geojson")
+    with (out / "series.csv").open() as file:
+        table = list(csv.DictReader(file))
+    volume = pit.sum() * 0.25
+    expected = {("step", "2021-05-01", "2022-05-01"): 0.2, ("step", "2022-05-01", "2023-05-01"): 0.3}
+    expected |= {("first", "2021-05-01", "2022-05-01"): 0.2, ("first", "2021-05-01", "2023-05-01"): 0.5}
+    cuts = {(r["since"], r["earlier"], r["later"]): r for r in table if r["region"] == "all" and r["volume"] == "cut"}
+    assert set(cuts) == set(expected)
+    for key, depth in expected.items():
+        assert float(cuts[key]["low_m3"]) < depth * volume < float(cuts[key]["high_m3"])
+    assert {row["region"] for row in table} == {"all", "pit"}
+    numbers = json.loads((out / "series.json").read_text())
+    assert numbers["surveys"] == ["2021-05-01", "2022-05-01", "2023-05-01"]
+    last = numbers["closure"]["pit"][-1]
+    assert last["steps_m3"] == pytest.approx(last["since_first_m3"], rel=0.1)
+    page = (out / "series.html").read_text()
+    assert page.count('src="data:image/png;base64,') == 2
+    for link in ("step_1/change.html", "step_2/change.html"):
+        assert link in page
+        assert (out / link).is_file()
+    told = fails(capsys, monkeypatch, "change", names[0], names[2], tmp_path / "new", "--series", names[1], "-q")
+    assert "order of time" in told or "earlier survey first" in told
+    told = fails(capsys, monkeypatch, "change", *names[:2], tmp_path / "new", "--series", names[2], "--water", 0, 0)
+    assert "two surveys" in told

@@ -164,11 +164,12 @@ def volume_rows(change: Change) -> list[dict[str, Any]]:
 
 def write_tables(change: Change, folder: Path) -> None:
     """Write volumes.csv and outlines.csv."""
-    _write_csv(folder / "volumes.csv", volume_rows(change))
-    _write_csv(folder / "outlines.csv", outline_rows(change))
+    write_csv(folder / "volumes.csv", volume_rows(change))
+    write_csv(folder / "outlines.csv", outline_rows(change))
 
 
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows with one set of keys; numbers are rounded to four decimals."""
     text = io.StringIO()
     if rows:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
@@ -193,7 +194,7 @@ def write_cover(cover: Cover, folder: Path) -> None:
         for region, of in cover.areas.items()
         for what, area in of.items()
     ]
-    _write_csv(folder / "cover.csv", table)
+    write_csv(folder / "cover.csv", table)
 
 
 Layer = tuple[str, list[BaseGeometry], list[dict[str, Any]]]
