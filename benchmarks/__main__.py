@@ -331,6 +331,21 @@ def change_cover(seeds: int = 4, runs: Path = MEASURED) -> None:
     store(runs, "cover", measure_covers(range(FIRST_SEED, FIRST_SEED + seeds), partial(print, flush=True)))
 
 
+def change_null(photographs: Path, work: Path, runs: Path = MEASURED) -> None:
+    """Two flights over swindale, 27 minutes apart, as two surveys: nothing dry changed (30 minutes).
+
+    Args:
+        photographs: Folder with swindale's photographs, gps.csv and gcp_list.txt.
+        work: Folder for scenes and maps; what is there is not made again.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_null import measure_null
+
+    store(runs, "null", measure_null(photographs, work, partial(print, flush=True)))
+
+
 def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEASURED) -> None:
     """Photographs of a built-in flat at two dates -> prepare -> map -> change, each against the truth (20-30 minutes).
 
@@ -386,7 +401,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    changes = (change, change_size, change_cover, change_chain)
+    changes = (change, change_size, change_cover, change_chain, change_null)
     measured = (speed, frames, memory, scales, surveys, maps, *changes, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
