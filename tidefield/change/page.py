@@ -82,7 +82,7 @@ def write_page(
         more=len(rows) - _SHOWN_OUTLINES,
         colours={"lower": LOWER, "higher": HIGHER},
         regions=change.per_region,
-        limits=limits(change),
+        limits=limits(change, cover is not None and (water is None or water.waterline is None)),
         cover=cover,
         views=[
             (view.name, jpeg(side_by_side(view, (earlier, later))), jpeg(difference(view)))
@@ -179,12 +179,14 @@ def _from_north(change: Change, row: int) -> str:
     return f"{(row + 0.5) * change.grid.cell_m:.0f} m south of the northern edge"
 
 
-def limits(change: Change) -> list[str]:
+def limits(change: Change, sea_may_be_green: bool = False) -> list[str]:
     """What the page does not tell."""
     found = [
         "Cut and fill are of the outlines. Narrow changes near the level of detection are in the net volume only.",
         "Plants and water are part of the surfaces: where they changed, the change is not of the ground.",
     ]
+    if sea_may_be_green:
+        found.append("Shallow water is green: it counts as plants, unless the water's heights are given (--water).")
     if change.errors.registration.shift_error_m == 0:
         found.append("The surveys were compared where they lie: no horizontal shift was estimated.")
     if change.errors.registration.model == "none":

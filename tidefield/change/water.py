@@ -62,6 +62,7 @@ class Waterline:
     Attributes:
         levels_m: of the water, in the earlier survey's heights.
         lines: of both dates, in map coordinates.
+        wet: cells under water at one date or both.
         land_gained_m2, land_lost_m2: dry at one date only.
         move_m: mean move towards the water (positive: the land grew), and its 95% interval.
         quantiles_m: 5, 50 and 95% of the distances of the later line's points from the earlier line, with that sign.
@@ -69,6 +70,7 @@ class Waterline:
 
     levels_m: tuple[float, float]
     lines: tuple[Lines, Lines]
+    wet: Bool[np.ndarray, "rows columns"]
     land_gained_m2: float
     land_lost_m2: float
     move_m: tuple[float, float, float]
@@ -169,7 +171,7 @@ def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: t
     length = float(np.mean([sum(part.length for part in part_of) for part_of in lines]))
     if length == 0:
         nothing = (math.nan, math.nan, math.nan)
-        return Waterline(levels, (lines[0], lines[1]), gained, lost, nothing, nothing)
+        return Waterline(levels, (lines[0], lines[1]), wet[0] | wet[1], gained, lost, nothing, nothing)
     half = Z95 * _level_error(change, earlier, later, levels)
     dry = [(later >= levels[1] + margin + move) & known for move in (-half, 0.0, half)]
     spread = [float(d.sum() - dry[1].sum()) * grid.cell_area_m2 / length for d in dry]
@@ -177,6 +179,7 @@ def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: t
     return Waterline(
         levels,
         (lines[0], lines[1]),
+        wet[0] | wet[1],
         gained,
         lost,
         (move, move + spread[2], move + spread[0]),

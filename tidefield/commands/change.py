@@ -198,12 +198,14 @@ def _measured(
     ]
     with ProgressBar(console, "Reading surfaces") as bar:
         found = measure(earlier, later, asked, stable=reads[0], within=reads[1], regions=reads[2], tick=bar)
+    water = measure_water(found, options.water, options.levels) if options.water or options.levels else None
     cover = None
     if earlier.orthophoto is not None and later.orthophoto is not None:
         regions = [region for region, *_ in found.per_region]
         shift, known = found.errors.registration.shift_m, np.isfinite(found.dz)
+        if water is not None and water.waterline is not None:
+            known &= ~water.waterline.wet
         cover = measure_cover(earlier.orthophoto, later.orthophoto, found.grid, shift, regions, known)
-    water = measure_water(found, options.water, options.levels) if options.water or options.levels else None
     for remark in found.remarks:
         log.warning(remark)
     return Found(pair, found, cover, water)
