@@ -341,6 +341,69 @@ def change(
     print(out)
 
 
+def change_size(million: float = 100, runs: Path = MEASURED) -> None:
+    """Time and peak memory of `tidefield change` on surfaces of many cells (10 minutes, 2 GB of disk).
+
+    Args:
+        million: Cells of each surface, in millions.
+        runs: Store the figures in this folder's change.json.
+    """
+    from benchmarks.change import store
+    from benchmarks.change_size import measure_size
+
+    found = measure_size(million, partial(print, flush=True))
+    print(
+        f"{found['million_cells']:.0f} million cells: {found['seconds']:.0f} s, {found['processor_seconds']:.0f} s of "
+        f"the processor, {found['peak_memory_bytes'] / 1e9:.2f} GB"
+    )
+    store(runs, "size", found)
+
+
+def change_cover(seeds: int = 4, runs: Path = MEASURED) -> None:
+    """Plants and waterlines of built-in pairs of dates against the truth (3 minutes).
+
+    Args:
+        seeds: Pairs of each category.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_cover import FIRST_SEED, measure_covers
+
+    store(runs, "cover", measure_covers(range(FIRST_SEED, FIRST_SEED + seeds), partial(print, flush=True)))
+
+
+def change_null(photographs: Path, work: Path, runs: Path = MEASURED) -> None:
+    """Two flights over swindale, 27 minutes apart, as two surveys: nothing dry changed (30 minutes).
+
+    Args:
+        photographs: Folder with swindale's photographs, gps.csv and gcp_list.txt.
+        work: Folder for scenes and maps; what is there is not made again.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_null import measure_null
+
+    store(runs, "null", measure_null(photographs, work, partial(print, flush=True)))
+
+
+def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEASURED) -> None:
+    """Photographs of a built-in flat at two dates -> prepare -> map -> change, each against the truth (20-30 minutes).
+
+    Args:
+        work: Folder for photographs, scenes and maps; what is there is not made again.
+        views: Photographs of each survey.
+        width: Of the photographs in pixels.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_chain import run_chain
+
+    store(runs, "chain", run_chain(work, views, width, partial(print, flush=True)))
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -380,7 +443,9 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, depth, change, kills, fuzz)
+    changes = (change, change_size, change_cover, change_chain, change_null)
+    measured = (speed, frames, memory, scales, surveys, maps, depth, *changes, kills, fuzz)
+    functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
