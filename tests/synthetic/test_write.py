@@ -79,6 +79,12 @@ def test_ground_truth_files_match_the_survey(folder: Path, survey: Survey) -> No
     column, row = np.rint((x - east) / step[0]).astype(int), np.rint((y - north) / step[1]).astype(int)
     assert np.median(np.abs(surface[row, column] - z)) < 0.3
     assert truth["gain"]["river_mouths_0001.png"] == [1.0, 1.0, 1.0]
+    # Plants alone rise above the ground and the water, and water is level.
+    bare, classes = np.load(folder / "truth" / "bare.npy"), cv2.imread(str(folder / "truth" / "classes.png"), -1)
+    assert set(np.unique(classes)) == {2, 3, 9}
+    assert np.abs(surface - bare)[classes != 3].max() < 0.03 <= (surface - bare)[classes == 3].min()
+    sea = survey.flat.ground.sample(torch.tensor([[east + 2 * step[0]], [north - 2 * step[0]]])).water_depth_m
+    assert (classes[2, 2] == 9) == bool(sea > 0.0125)
 
 
 def test_photographs_can_be_jpegs(survey: Survey, tmp_path: Path) -> None:

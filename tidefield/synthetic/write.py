@@ -9,20 +9,26 @@ import cv2
 import numpy as np
 import pycolmap
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from tidefield.errors import SceneError
+from tidefield.synthetic.flat import TidalFlat
 from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.survey import Survey
+
+GROUND, VEGETATION, WATER = 2, 3, 9
+"""Values of `classes.png`: those of the LAS specification."""
+_LEAST_PLANT_M, _LEAST_WATER_M = 0.03, 0.0125
+"""Height above the ground from which a plant counts, and the depth at which water is half drawn."""
 
 
 def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
     """Write `images/`, a COLMAP model in `sparse/0`, and `truth/`.
 
-    `truth/` holds `depth/NAME.npy` (float32 z-depth at pixel centres, metres), `orthophoto.png` and
-    `surface.npy` (float32 height, metres) on one north-up grid, and `truth.json` with that grid and each
-    photograph's gain.
+    `truth/` holds `depth/NAME.npy` (float32 z-depth at pixel centres, metres), and on one north-up grid
+    `orthophoto.png`, `surface.npy` (float32 height, metres), `bare.npy` (the same without plants) and `classes.png`
+    (`GROUND`, `VEGETATION` or `WATER`); and `truth.json` with that grid and each photograph's gain.
 
     Args:
         survey: photographs, cameras and truth.
@@ -89,6 +95,10 @@ def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
     colour, height_m = survey.flat.map(extent)
     _write_picture(folder / "orthophoto.png", (colour * 255).round().to(torch.uint8))
     np.save(folder / "surface.npy", height_m.numpy())
+    bare_m, classes = _classes(survey.flat, extent, height_m)
+    np.save(folder / "bare.npy", bare_m)
+    if not cv2.imwrite(str(folder / "classes.png"), classes):
+        raise SceneError(f"cannot write {folder / 'classes.png'}: free some space or name another folder")
     truth = {
         "category": survey.category,
         "seed": survey.seed,
@@ -99,7 +109,22 @@ def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
             "pixel_step_east_north_m": [cell, -cell],
             "colour": "sRGB, straight down, without mirrored light",
             "height": "metres above mean mud level, plants and water included",
+            "classes": {"ground": GROUND, "vegetation": VEGETATION, "water": WATER},
         },
         "gain": dict(zip(names, cameras.gain.tolist(), strict=True)),
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+
+
+def _classes(
+    flat: TidalFlat, extent: Extent, height_m: Float[Tensor, "H W"]
+) -> tuple[Float32[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
+    """Height of ground or water at the nodes of a map, row 0 in the north, and what is seen there from above."""
+    nodes = extent.nodes().split(1 << 20, dim=1)
+    bare, bed = (
+        torch.cat([raster.sample(part)[0] for part in nodes]).reshape(extent.rows, extent.columns).flip(0)
+        for raster in (flat.surface, flat.bed)
+    )
+    classes = torch.where(bare - bed > _LEAST_WATER_M, WATER, GROUND)
+    classes = torch.where(height_m - bare > _LEAST_PLANT_M, VEGETATION, classes)
+    return bare.numpy(), classes.to(torch.uint8).numpy()
