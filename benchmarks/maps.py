@@ -94,7 +94,7 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
     true, colour = _truth(root, grid)
     # The grid of coarse cells begins at the same corner.
     start = sparse_surface(scene, grid.coarser(COARSEST))
-    sparse = start.on(_whole(grid), 0, 1)[0][: grid.rows, : grid.columns]
+    sparse = start.on(_whole(grid), 0)[: grid.rows, : grid.columns]
     stereo = semi_global(scene, grid)
     kept = np.isfinite(height) & np.isfinite(true) & np.isfinite(stereo)
     # The photographs' common exposure differs from the truth by a factor of each channel.
