@@ -17,7 +17,7 @@ from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
 from tidefield.maps import make
-from tidefield.maps.make import CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
+from tidefield.maps.make import AGREEMENT, CLASSES, CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
 from tidefield.synthetic import Flight, make_survey, write_survey
 
 rasterio = pytest.importorskip("rasterio")
@@ -113,7 +113,7 @@ def test_the_orthophoto_shows_the_flat_in_its_place(scene: Path, out: Path):
 def test_rasters_are_cloud_optimised_and_say_that_the_frame_is_local(out: Path):
     from rio_cogeo import cog_validate
 
-    for name in (ORTHOPHOTO, DSM, SIGMA, VIEWS, MAIN):
+    for name in (ORTHOPHOTO, DSM, SIGMA, VIEWS, MAIN, AGREEMENT, CLASSES):
         valid, errors, _ = cog_validate(out / name)
         assert valid, errors
         with rasterio.open(out / name) as dataset:
@@ -137,7 +137,7 @@ def test_terrain_contours_and_hillshades_lie_on_the_same_cells(out: Path):
 
 def test_the_report_shows_the_map_without_the_network(out: Path):
     page = (out / "odm_report" / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert "http://" not in page
     assert "not georeferenced" in page
     assert "how far this map is from surveyed points is not known" in page
@@ -152,6 +152,8 @@ def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
         np.testing.assert_allclose(dsm.read(1)[rows, columns], cloud.z, atol=1e-3)
         np.testing.assert_allclose(sigma.read(1)[rows, columns], cloud.sigma_z)
     assert np.array(cloud.views).min() >= 2
+    with rasterio.open(out / CLASSES) as classes:
+        np.testing.assert_array_equal(classes.read(1)[rows, columns], cloud.classification)
     assert "not georeferenced" in cloud.header.parse_crs().name
 
 

@@ -66,8 +66,6 @@ DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 the mean difference, as a share of that, against the correlation."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
 """Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
-GLOSS_CELLS = 4.0
-"""Standard deviation of the windows, in cells, over which brightness is compared for `Matched.gloss`."""
 SHARE_MATCHING, SHARES_ROUGHNESS = 0.1, ((1.6, 3.0), (0.5, 6.0), (0.2, 12.0))
 FLOOR = 3.0
 """Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
@@ -87,8 +85,6 @@ class Matched:
         height: map units.
         sigma: standard error of the height, map units.
         score: mean normalised cross-correlation of the photographs there, -1 to 1.
-        gloss: standard deviation of the logarithm of the brightness in which the photographs show a cell's
-            surroundings: light that is mirrored depends on where it is seen from.
         count: photographs that see each cell.
         main: the one that sees it best, 0 for none, else its index plus 1.
     """
@@ -96,7 +92,6 @@ class Matched:
     height: Height
     sigma: Height
     score: Height
-    gloss: Height
     count: Int[np.ndarray, "H W"]
     main: Int[np.ndarray, "H W"]
 
@@ -374,8 +369,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
         rank = np.where(sees, view.rank(u, v, height, east, north), 0)
         main[rank > best] = index + 1
         best = np.maximum(rank, best)
-    gloss = _gloss(used, grey, factor, east, north, height)
-    return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, gloss, count, main)
+    return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, count, main)
 
 
 def standard_error(height: Height, matching: Height, spread: Height, moved: Height) -> Height:
@@ -395,30 +389,6 @@ def standard_error(height: Height, matching: Height, spread: Height, moved: Heig
         mean = _blur(height, cells)
         parts.append(share * np.sqrt(np.maximum(_blur((height - mean) ** 2, cells), 0)))
     return np.sqrt(sum(part**2 for part in parts)).astype(np.float32)
-
-
-def _gloss(
-    used: list[tuple[View, int]],
-    grey: GreyPhotographs,
-    factor: int,
-    east: np.ndarray,
-    north: np.ndarray,
-    height: np.ndarray,
-) -> Height:
-    """Standard deviation, among photographs, of the logarithm of the brightness of cells' surroundings."""
-    total, squares, number = (np.zeros(height.shape, np.float32) for _ in range(3))
-    for view, index in used:
-        picture = grey.read(index, factor)
-        u, v, z = view.pixels(east, north, height)
-        sees = view.sees(u, v, z, height, east, north).astype(np.float32)
-        scale = picture.shape[1] / view.size[0], picture.shape[0] / view.size[1]
-        shown = cv2.remap(picture, u * scale[0] - 0.5, v * scale[1] - 0.5, cv2.INTER_LINEAR)
-        value = np.log(_blur(shown.astype(np.float32), GLOSS_CELLS) / view.gain + FLOOR)
-        total += sees * value
-        squares += sees * value**2
-        number += sees
-    number = np.maximum(number, 1)
-    return np.sqrt(np.maximum(squares / number - (total / number) ** 2, 0))
 
 
 def _parallax(views: list[View], chosen: Sequence[int]) -> float:
