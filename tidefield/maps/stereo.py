@@ -72,7 +72,7 @@ def choose_pairs(
                 worth.append(gain)
     chosen: list[int] = []
     covered = np.zeros(sees[0].size)
-    gains = np.array(worth).reshape(len(pairs), -1)
+    gains = np.array(worth).reshape(len(pairs), covered.size)
     while len(chosen) < min(count, len(pairs)):
         total = (gains / (1 + covered)).sum(1)
         total[chosen] = -1
@@ -155,10 +155,8 @@ def stereo_heights(
     pad: int,
     low: float,
     high: float,
-) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Match pairs; returns the median height of each cell and its spread among the pairs.
-
-    Cells without any have NaN. The spread is a robust standard deviation (1.4826 times the median deviation).
+) -> Float32[np.ndarray, "H W"]:
+    """Match pairs; returns the median height of each cell, NaN where no pair has any.
 
     Args:
         pairs: indices of `views`.
@@ -177,15 +175,9 @@ def stereo_heights(
             found.append(one)
     heights = np.sort(np.stack(found), axis=0)  # NaN last
     number = np.isfinite(heights).sum(0)
-    middle = _median_of_sorted(heights, number)
-    spread = _median_of_sorted(np.sort(np.abs(heights - middle), axis=0), number)
-    return middle, (1.4826 * spread).astype(np.float32)
-
-
-def _median_of_sorted(values: np.ndarray, number: np.ndarray) -> np.ndarray:
-    low = np.take_along_axis(values, np.maximum((number - 1) // 2, 0)[None], 0)[0]
-    high = np.take_along_axis(values, np.minimum(number // 2, len(values) - 1)[None], 0)[0]
-    return np.where(number > 0, (low + np.where(number > 1, high, low)) / 2, np.nan).astype(np.float32)
+    low_middle = np.take_along_axis(heights, np.maximum((number - 1) // 2, 0)[None], 0)[0]
+    high_middle = np.take_along_axis(heights, np.minimum(number // 2, len(heights) - 1)[None], 0)[0]
+    return np.where(number > 0, (low_middle + high_middle) / 2, np.nan).astype(np.float32)
 
 
 def _pair(
@@ -203,8 +195,9 @@ def _pair(
         disp12MaxDiff=1, uniquenessRatio=UNIQUE, speckleWindowSize=SPECKLE, speckleRange=SPECKLE_RANGE,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
-    disparity = matcher.compute(a, b).astype(np.float32) / 16
-    valid = (disparity >= 0) & inside_a
+    # OpenCV rounds sixteenths of negative shifts up.
+    disparity = matcher.compute(a, b).astype(np.float32) / 16 - 1 / 32
+    valid = (disparity >= -1 / 32) & inside_a
     # Where the right picture has the same point.
     columns = np.arange(disparity.shape[1], dtype=np.float32) - disparity
     rows = np.broadcast_to(np.arange(disparity.shape[0], dtype=np.float32)[:, None], disparity.shape)
