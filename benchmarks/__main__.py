@@ -265,6 +265,26 @@ def maps(
         print(table.markdown(), end="\n\n")
 
 
+def map_control(
+    scene: tyro.conf.Positional[Path], control: tyro.conf.Positional[Path], runs: Path = Path("runs/maps")
+) -> None:
+    """Heights of a map's surface at ground control that is left out in turn (minutes).
+
+    Args:
+        scene: A scene that was prepared with ground control.
+        control: Its gcp_list.txt.
+        runs: Folder for map_control.json.
+    """
+    tune_process()
+    from benchmarks.map_control import measure_control, tables
+    from tidefield.files import write_json
+
+    record = measure_control(scene, control)
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+    write_json(runs / "map_control.json", record)
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -338,7 +358,21 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, kills, fuzz)
+    functions = (
+        speed,
+        frames,
+        memory,
+        scales,
+        table,
+        robustness,
+        card,
+        surveys,
+        maps,
+        map_control,
+        change,
+        kills,
+        fuzz,
+    )
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)
