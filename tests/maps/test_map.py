@@ -241,3 +241,114 @@ def test_a_georeferenced_map_has_a_compound_system_and_its_coordinates(scene: Pa
         assert dsm.transform.c % dsm.transform.a == pytest.approx(0, abs=1e-6)
     cloud = laspy.read(tmp_path / "map" / CLOUD)
     assert cloud.header.parse_crs().to_epsg() == 7405
+
+
+def test_photographs_leave_no_steps_on_flat_mud(scene: Path, out: Path):
+    """Where the photograph that contributes most changes, the map keeps the flat's colours to a grey value or two."""
+    with rasterio.open(out / ORTHOPHOTO) as ortho, rasterio.open(out / MAIN) as main:
+        shown = ortho.read([1, 2, 3]).transpose(1, 2, 0).astype(float)
+        colour = truth(scene, ortho)[1].astype(float)
+        photograph = main.read(1)
+    gain = colour.mean((0, 1)) / shown.mean((0, 1))
+    error = (shown * gain - colour).mean(2)
+    about = json.loads((scene / "truth" / "truth.json").read_text())["gain"]
+    gains = np.array([np.mean(about[name]) for name in sorted(about)])
+    steps: dict[tuple[int, int], list[float]] = {}
+    for a, b, left, right in (
+        (error[:, :-1], error[:, 1:], photograph[:, :-1], photograph[:, 1:]),
+        (error[:-1], error[1:], photograph[:-1], photograph[1:]),
+    ):
+        for row, column in zip(*np.nonzero(left != right), strict=True):
+            one, other = int(left[row, column]), int(right[row, column])
+            step = b[row, column] - a[row, column]
+            steps.setdefault((min(one, other), max(one, other)), []).append(step if one < other else -step)
+    long = {pair: np.array(values) for pair, values in steps.items() if len(values) >= 12}
+    assert long, "the photographs that contribute most should change within the map"
+    level = colour.mean()
+    uneven = [abs(np.log(gains[i - 1] / gains[j - 1])) * level for i, j in long]
+    assert max(uneven) > 8  # what the exposures alone would leave, in grey values of 255
+    for values in long.values():
+        assert abs(values.mean()) < 1 + 3 * values.std() / np.sqrt(len(values))
+
+
+def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
+    """Even tiles that are 12 grey values and 10 cm apart fade into each other across their margins."""
+    from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame, Tile
+
+    class Flat(make.Job):
+        """A job whose tiles are made already."""
+
+        def __init__(self, grid: Grid) -> None:
+            object.__setattr__(self, "grid", grid)
+
+        def tiles(self) -> list[Tile]:
+            return self.grid.tiles(64, make.MARGIN)
+
+    frame = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
+    grid = Grid(frame, 0.0, 0.0, 0.1, 150, 130, 5.0)
+    job = Flat(grid)
+    (tmp_path / make.TILES).mkdir()
+    for number, tile in enumerate(job.tiles()):
+        shape = tile.side, tile.side
+        odd = number % 2
+        every = np.ones(shape, bool)
+        np.savez(
+            make._file(tmp_path / make.TILES, tile),
+            height=np.full(shape, 5.0 + 0.1 * odd, np.float32),
+            sigma=np.full(shape, 0.01, np.float32),
+            score=np.ones(shape, np.float16),
+            count=np.full(shape, 3, np.uint16),
+            main=np.full(shape, 1, np.uint16),
+            seen=every,
+            shown=every,
+            colour=np.full((*shape, 3), 0.5 + 12 / 255 * odd, np.float32),
+        )
+    found = list(make.strips(job, tmp_path))
+    colour = np.concatenate([strip.colour for strip in found], axis=1)
+    height = np.concatenate([strip.height for strip in found])
+    assert colour.shape == (3, 130, 150)
+    assert np.ptp(colour) > 11 / 255
+    for values, largest in ((colour, 1 / 255), (height, 0.1 / 12)):
+        assert abs(np.diff(values, axis=-1)).max() < largest
+        assert abs(np.diff(values, axis=-2)).max() < largest
+
+
+@pytest.mark.parametrize("limit", [6_000, 30_000])
+def test_a_full_disk_is_one_message_and_loses_nothing(scene: Path, out: Path, tmp_path: Path, limit: int):
+    """The system refuses every byte of a file beyond a limit, as a full disk does."""
+    import resource
+    import signal
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handled = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        with pytest.raises(RunError, match="cannot be written"):
+            mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handled)
+    assert not list((tmp_path / "map").rglob("*.tif"))
+    assert not [path for path in (tmp_path / "map").rglob("*partial*") if path.stat().st_size]
+    mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+    with rasterio.open(out / DSM) as one, rasterio.open(tmp_path / "map" / DSM) as other:
+        np.testing.assert_array_equal(one.read(1), other.read(1))
+
+
+@pytest.mark.parametrize("program", ["gdalinfo", "pdal"])
+def test_other_programs_read_the_files(out: Path, program: str):
+    import shutil
+    import subprocess
+
+    if shutil.which(program) is None:
+        pytest.skip(f"{program} is not installed")
+    command = [program, "-json", out / DSM] if program == "gdalinfo" else [program, "info", "--summary", out / CLOUD]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=True)
+    about = json.loads(done.stdout)
+    if program == "gdalinfo":
+        with rasterio.open(out / DSM) as dsm:
+            assert about["size"] == [dsm.width, dsm.height]
+        assert "not georeferenced" in about["coordinateSystem"]["wkt"]
+    else:
+        assert about["summary"]["num_points"] == len(laspy.read(out / CLOUD).points)
+        assert "sigma_z" in about["summary"]["dimensions"]
