@@ -352,3 +352,22 @@ def test_other_programs_read_the_files(out: Path, program: str):
     else:
         assert about["summary"]["num_points"] == len(laspy.read(out / CLOUD).points)
         assert "sigma_z" in about["summary"]["dimensions"]
+
+
+def test_water_without_points_lies_on_the_map(scene: Path, tmp_path: Path):
+    from dataclasses import replace
+
+    from tidefield.data.load import load_scene
+    from tidefield.maps.grid import make_grid, map_frame
+
+    whole = load_scene(scene, hold_out=False)
+    assert whole.points is not None
+    north = whole.points.subset(whole.points.xyz_world[:, 1] > 5)
+    frame = map_frame(whole, None)
+    _, south, _, _ = make_grid(frame, replace(whole, points=north), None).bounds
+    assert south < -10
+    position = frame.to_map(whole.cameras.position_world.double().numpy())
+    # Not beyond what a photograph sees: its lower edge is nearer to the point below it than it flies high.
+    assert south > position[:, 1].min() - position[:, 2].max()
+    inside = make_grid(frame, replace(whole, points=north), None, (-5.0, -5.0, 5.0, 5.0))
+    assert inside.bounds == pytest.approx((-5, -5, 5, 5), abs=inside.cell)

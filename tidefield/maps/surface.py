@@ -32,7 +32,7 @@ from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER
 from tidefield.data.scene import Scene
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
-from tidefield.maps.grid import Grid, Tile
+from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
 from tidefield.maps.stereo import choose_pairs, fill_from_nearest, stereo_heights
 
 COARSEST = 8
@@ -41,8 +41,6 @@ PAD = 32
 """Cells around a tile that are matched with it: windows and the paths of semi-global matching reach beyond the tile."""
 VIEWS = 8
 """Photographs that are compared with each other; more add little and take as long each."""
-STEEPEST_DEG = 55.0
-"""Largest angle from the vertical at which a photograph sees a cell."""
 BORDER_PX = 4.0
 """Pixels along a photograph's border that are not used."""
 STEP_PX = 0.7
