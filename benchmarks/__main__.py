@@ -307,6 +307,26 @@ def depth(
         print(table.markdown(), end="\n\n")
 
 
+def map_control(
+    scene: tyro.conf.Positional[Path], control: tyro.conf.Positional[Path], runs: Path = Path("runs/maps")
+) -> None:
+    """Heights of a map's surface at ground control that is left out in turn (minutes).
+
+    Args:
+        scene: A scene that was prepared with ground control.
+        control: Its gcp_list.txt.
+        runs: Folder for map_control.json.
+    """
+    tune_process()
+    from benchmarks.map_control import measure_control, tables
+    from tidefield.files import write_json
+
+    record = measure_control(scene, control)
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+    write_json(runs / "map_control.json", record)
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -444,7 +464,7 @@ def main(words: Sequence[str] | None = None) -> None:
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, maps, depth, *changes, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, maps, map_control, depth, *changes, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
