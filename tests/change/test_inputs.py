@@ -13,7 +13,7 @@ from tidefield import cli
 from tidefield.change.inputs import open_pair, open_survey
 from tidefield.change.surfaces import ChangeError
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.cloud import UNCLASSIFIED, cloud_writer
+from tidefield.maps.cloud import GROUND, cloud_writer
 from tidefield.maps.grid import LOCAL_NAME, LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.make import CLOUD, DSM, FILLED, ORTHOPHOTO, SIGMA
 from tidefield.maps.rasters import NODATA, Raster, raster_writer
@@ -53,7 +53,7 @@ def write_map(folder: Path, heights: np.ndarray, georeferenced: bool, filled: np
             writer.write(0, np.stack(bands))
     with cloud_writer(folder / CLOUD, grid) as cloud:
         sigma, count = np.full(heights.shape, SIGMA_M), np.full(heights.shape, 5)
-        cloud.write(0, heights, sigma, colour, count, np.full(heights.shape, UNCLASSIFIED))
+        cloud.write(0, heights, sigma, colour, count, np.full(heights.shape, GROUND))
     return folder
 
 
