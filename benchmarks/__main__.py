@@ -265,6 +265,30 @@ def maps(
         print(table.markdown(), end="\n\n")
 
 
+def points(
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
+    runs: Path = Path("runs/points"),
+    widths: tuple[int, ...] = (400,),
+    device: str = "auto",
+) -> None:
+    """Zero-shot views of scenes with COLMAP's points, and of the same without any (minutes for each scene).
+
+    Args:
+        scenes: With COLMAP models, or posed photographs only, which get COLMAP's points first.
+        runs: Folder for the scenes without points, and points.json; what it holds is not measured again.
+        widths: Of the pictures in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    from benchmarks.points import measure_points, tables
+    from tidefield.compare.run import run_measured, tidefield
+
+    def run(words: list[str]) -> None:
+        run_measured(tidefield(*words), {})
+
+    for table in tables(measure_points(scenes, runs, widths, device, run, partial(print, flush=True))):
+        print(table.markdown(), end="\n\n")
+
+
 def depth(
     runs: Path = Path("runs/depth"),
     categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
@@ -464,7 +488,7 @@ def main(words: Sequence[str] | None = None) -> None:
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, maps, map_control, depth, *changes, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, maps, map_control, points, depth, *changes, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
