@@ -265,6 +265,30 @@ def maps(
         print(table.markdown(), end="\n\n")
 
 
+def points(
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
+    runs: Path = Path("runs/points"),
+    widths: tuple[int, ...] = (400,),
+    device: str = "auto",
+) -> None:
+    """Zero-shot views of scenes with COLMAP's points, and of the same without any (minutes for each scene).
+
+    Args:
+        scenes: With COLMAP models, or posed photographs only, which get COLMAP's points first.
+        runs: Folder for the scenes without points, and points.json; what it holds is not measured again.
+        widths: Of the pictures in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    from benchmarks.points import measure_points, tables
+    from tidefield.compare.run import run_measured, tidefield
+
+    def run(words: list[str]) -> None:
+        run_measured(tidefield(*words), {})
+
+    for table in tables(measure_points(scenes, runs, widths, device, run, partial(print, flush=True))):
+        print(table.markdown(), end="\n\n")
+
+
 def depth(
     runs: Path = Path("runs/depth"),
     categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
@@ -307,6 +331,26 @@ def depth(
         print(table.markdown(), end="\n\n")
 
 
+def map_control(
+    scene: tyro.conf.Positional[Path], control: tyro.conf.Positional[Path], runs: Path = Path("runs/maps")
+) -> None:
+    """Heights of a map's surface at ground control that is left out in turn (minutes).
+
+    Args:
+        scene: A scene that was prepared with ground control.
+        control: Its gcp_list.txt.
+        runs: Folder for map_control.json.
+    """
+    tune_process()
+    from benchmarks.map_control import measure_control, tables
+    from tidefield.files import write_json
+
+    record = measure_control(scene, control)
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+    write_json(runs / "map_control.json", record)
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -339,6 +383,69 @@ def change(
     measure_change(data, runs, pairs, partial(print, flush=True))
     write_page(runs, out)
     print(out)
+
+
+def change_size(million: float = 100, runs: Path = MEASURED) -> None:
+    """Time and peak memory of `tidefield change` on surfaces of many cells (10 minutes, 2 GB of disk).
+
+    Args:
+        million: Cells of each surface, in millions.
+        runs: Store the figures in this folder's change.json.
+    """
+    from benchmarks.change import store
+    from benchmarks.change_size import measure_size
+
+    found = measure_size(million, partial(print, flush=True))
+    print(
+        f"{found['million_cells']:.0f} million cells: {found['seconds']:.0f} s, {found['processor_seconds']:.0f} s of "
+        f"the processor, {found['peak_memory_bytes'] / 1e9:.2f} GB"
+    )
+    store(runs, "size", found)
+
+
+def change_cover(seeds: int = 4, runs: Path = MEASURED) -> None:
+    """Plants and waterlines of built-in pairs of dates against the truth (3 minutes).
+
+    Args:
+        seeds: Pairs of each category.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_cover import FIRST_SEED, measure_covers
+
+    store(runs, "cover", measure_covers(range(FIRST_SEED, FIRST_SEED + seeds), partial(print, flush=True)))
+
+
+def change_null(photographs: Path, work: Path, runs: Path = MEASURED) -> None:
+    """Two flights over swindale, 27 minutes apart, as two surveys: nothing dry changed (30 minutes).
+
+    Args:
+        photographs: Folder with swindale's photographs, gps.csv and gcp_list.txt.
+        work: Folder for scenes and maps; what is there is not made again.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_null import measure_null
+
+    store(runs, "null", measure_null(photographs, work, partial(print, flush=True)))
+
+
+def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEASURED) -> None:
+    """Photographs of a built-in flat at two dates -> prepare -> map -> change, each against the truth (20-30 minutes).
+
+    Args:
+        work: Folder for photographs, scenes and maps; what is there is not made again.
+        views: Photographs of each survey.
+        width: Of the photographs in pixels.
+        runs: Store the figures in this folder's change.json.
+    """
+    tune_process()
+    from benchmarks.change import store
+    from benchmarks.change_chain import run_chain
+
+    store(runs, "chain", run_chain(work, views, width, partial(print, flush=True)))
 
 
 def table(
@@ -380,7 +487,9 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, depth, change, kills, fuzz)
+    changes = (change, change_size, change_cover, change_chain, change_null)
+    measured = (speed, frames, memory, scales, surveys, maps, map_control, points, depth, *changes, kills, fuzz)
+    functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

@@ -31,7 +31,11 @@ INTRODUCTION = """# Change: what was measured
 
 `python -m benchmarks change --data DATA` measures this, and writes the page. The rules of outlines and intervals were
 chosen on other pairs of built-in surveys than those that are measured here. Stable ground that is given is a frame
-around the flat without what changed there."""
+around the flat without what changed there.
+
+`change_cover`, `change_chain`, `change_null` and `change_size` of the same program measure plants and waterlines, the
+whole chain from photographs, two flights between which nothing changed, and a large survey. False alarms of the two
+flights are counted on squares of dry ground that nothing was measured on."""
 LEO = ("20180606", "20180713", "20180920", "20190211", "20190328", "20190731")
 SANDPYPER_NMAD = (0.101219, 0.111155, 0.071532, 0.111180, 0.098167)
 """Of St Leonards' five steps (npucino/sandpyper, tests and notebook 3)."""
@@ -157,6 +161,12 @@ def _st_leonards(folder: Path) -> list[dict[str, Any]]:
     return steps
 
 
+def store(runs: Path, part: str, found: Any) -> None:
+    """Keep what was measured of one part in RUNS/change.json."""
+    record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
+    write_json(runs / CHANGE_FILE, {**record, part: found, **describe()})
+
+
 def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Measure all parts, and store them in RUNS/change.json as they are done."""
     record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
@@ -183,6 +193,11 @@ def tables(record: dict[str, Any]) -> list[Table]:
         made += _published_tables(record["published"])
     if "pairs" in record:
         made.append(_pairs_table(record["pairs"]))
+    for part, table in (("cover", _cover_tables), ("chain", _chain_tables), ("null", _null_tables)):
+        if part in record:
+            made += table(record[part])
+    if "size" in record:
+        made.append(_size_table(record["size"]))
     return made
 
 
@@ -263,6 +278,157 @@ def _pairs_table(pairs: list[dict[str, Any]]) -> Table:
     header = ["change, stable ground", "false alarms", "detected from", "cells found", "outlined", "bias where changed"]
     header += ["net", "cut in outlines", "fill in outlines", "all cut", "all fill"]
     return Table("Pairs of built-in surveys: 95% intervals that contain the truth", header, rows)
+
+
+def _cover_tables(pairs: list[dict[str, Any]]) -> list[Table]:
+    """Plants and waterlines of built-in pairs."""
+    plants, water = [], []
+    for of in pairs:
+        name = f"{of['category']} {of['seed']}"
+        cells = []
+        for what in ("earlier", "later", "gained", "lost"):
+            area = of["cover"][what]
+            cells.append(
+                f"{area['value_m2']:.0f} ({area['low_m2']:.0f} to {area['high_m2']:.0f}); {area['true_m2']:.0f}"
+            )
+        plants.append([name, *cells])
+        line = of["water"]
+        move, low, high = line["move_m"]
+        water.append(
+            [
+                name,
+                f"{line['land_gained_m2']:.0f}; {line['true_gained_m2']:.0f}",
+                f"{line['land_lost_m2']:.0f}; {line['true_lost_m2']:.0f}",
+                f"{move:+.2f} ({low:+.2f} to {high:+.2f})",
+            ]
+        )
+    return [
+        Table(
+            "Plants of built-in pairs (m²; found and its range; true)",
+            ["pair", "earlier", "later", "gained", "lost"],
+            plants,
+        ),
+        Table(
+            "Waterlines of built-in pairs after the tide fell 10 cm (m² found; true)",
+            ["pair", "fell dry", "came under water", "mean move seaward (m)"],
+            water,
+        ),
+    ]
+
+
+def _chain_tables(found: dict[str, Any]) -> list[Table]:
+    """The whole chain, step by step."""
+    surveys, changes = [], []
+    for name, step in found["steps"].items():
+        if "placed" in step:
+            surveys.append(
+                [
+                    name,
+                    f"{step['placed']} of {found['photographs']}",
+                    f"{100 * step['positions_horizontal_rms_m']:.1f}",
+                    f"{100 * step['positions_vertical_rms_m']:.1f}",
+                    f"{100 * step['median_m']:+.1f}",
+                    f"{100 * step['nmad_m']:.1f}",
+                    f"{100 * step['within_95']:.0f}%",
+                ]
+            )
+            continue
+        cells = []
+        for what in VOLUMES:
+            volume = step[what]
+            truth = volume["true_m3"] if what == "net" else volume["true_inside_m3"]
+            cells.append(
+                f"{volume['value_m3']:+.1f} ({volume['low_m3']:+.1f} to {volume['high_m3']:+.1f}); {truth:+.1f}"
+            )
+        changes.append(
+            [
+                name.removeprefix("change, "),
+                f"{100 * step['shift_m']:+.1f}",
+                f"{100 * step['false_alarms']:.1f}%",
+                f"{100 * step['detection_m']:.1f}",
+                f"{100 * step['detected']:.0f}%",
+                f"{100 * step['outlined']:.0f}%",
+                f"{100 * step['bias_where_changed_m']:+.1f}",
+                *cells,
+            ]
+        )
+    about = (
+        f"{found['photographs']} photographs of {found['width_px']} px at each date, {100 * found['change_m']:.0f} cm"
+    )
+    return [
+        Table(
+            f"The whole chain: surveys ({about})",
+            [
+                "survey",
+                "photographs placed",
+                "positions, horizontal RMS (cm)",
+                "vertical RMS (cm)",
+                "heights of bare ground, median error (cm)",
+                "NMAD (cm)",
+                "within 1.96 of their standard errors",
+            ],
+            surveys,
+        ),
+        Table(
+            "The whole chain: change of bare ground (m³ found, 95% interval; true)",
+            [
+                "",
+                "shift taken off (cm)",
+                "false alarms",
+                "detected from (cm)",
+                "cells found",
+                "outlined",
+                "bias where changed (cm)",
+                *VOLUMES,
+            ],
+            changes,
+        ),
+    ]
+
+
+def _null_tables(found: dict[str, Any]) -> list[Table]:
+    """Two flights over the same ground."""
+    rows = []
+    for model in ("vertical", "tilt"):
+        of = found[model]
+        rows.append(
+            [
+                model,
+                f"{100 * of['significant_share_of_other_half']:.1f}%",
+                f"{100 * of['detection_m'][1]:.1f}",
+                f"{100 * of['before'][0]:+.1f}",
+                f"{100 * of['after'][1]:.1f}",
+                _volume(of["net"]),
+                _volume(of["other_net"]),
+                f"{100 * of['outlined_share']:.1f}%",
+            ]
+        )
+    return [
+        Table(
+            f"Nothing changed: swindale's first and third flights, {found['dry_m2']:,.0f} m² of dry ground",
+            [
+                "co-registration",
+                "significant cells of the other half",
+                "detected from (cm)",
+                "median before (cm)",
+                "NMAD after (cm)",
+                "net (m³)",
+                "net of the other half (m³)",
+                "outlined",
+            ],
+            rows,
+        )
+    ]
+
+
+def _size_table(found: dict[str, Any]) -> Table:
+    rows = [
+        ["time", f"{found['seconds'] / 60:.1f} minutes"],
+        ["time of the processor", f"{found['processor_seconds'] / 60:.1f} minutes on {found['cores']} cores"],
+        ["peak memory", f"{found['peak_memory_bytes'] / 1e9:.2f} GB"],
+        ["files written", f"{found['written_bytes'] / 1e9:.2f} GB"],
+    ]
+    return Table(f"`tidefield change` on {found['million_cells']:.0f} million cells", ["", ""], rows)
 
 
 def _volume(volume: dict[str, Any]) -> str:

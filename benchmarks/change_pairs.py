@@ -53,15 +53,15 @@ def measure_pair(seed: int, amount: float, given: bool = True) -> dict[str, Any]
             side = 116.0 + k
             extent = Extent(2.0 - 0.3 * k, 2.0 - 0.4 * k, round(side / cell), round(side / cell), cell)
             heights = surveyed(ground, extent, np.random.default_rng([seed, 20265, k, round(1000 * amount) + 500]))
-            paths.append(_write(Path(folder) / f"{k}.tif", heights, extent))
-        stable = partial(_stable, earlier, later) if given else None
+            paths.append(write_surface(Path(folder) / f"{k}.tif", heights, extent))
+        stable = partial(stable_frame, earlier, later) if given else None
         change = measure(open_surface(paths[0]), open_surface(paths[1]), stable=stable)
     truth = true_change(earlier, later, change.grid)
     truth[~np.isfinite(change.dz)] = 0
     return compared(change, truth, change.grid)
 
 
-def _stable(earlier: Raster, later: Raster, grid: Grid) -> list[Region]:
+def stable_frame(earlier: Raster, later: Raster, grid: Grid) -> list[Region]:
     """A frame of a sixth of the side, without what changed and a margin around it."""
     same = np.abs(true_change(earlier, later, grid)) < 1e-6
     same &= ~dilated(~same, 8)
@@ -124,12 +124,13 @@ def true_change(earlier: Raster, later: Raster, grid: Grid) -> np.ndarray:
     return both[1] - both[0]
 
 
-def _write(path: Path, heights: np.ndarray, extent: Extent) -> Path:
+def write_surface(path: Path, heights: np.ndarray, extent: Extent) -> Path:
+    """Write heights whose cells' centres are the nodes of an extent, row 0 in the north."""
     import rasterio
-    from rasterio.transform import from_origin
+    from affine import Affine
 
     half = extent.cell_m / 2
-    transform = from_origin(extent.west_m - half, extent.north_m + half, extent.cell_m, extent.cell_m)
+    transform = Affine(extent.cell_m, 0, extent.west_m - half, 0, -extent.cell_m, extent.north_m + half)
     shape = {"width": extent.columns, "height": extent.rows, "count": 1, "dtype": "float32"}
     with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32631", transform=transform, **shape) as file:
         file.write(heights, 1)

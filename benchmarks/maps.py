@@ -20,8 +20,9 @@ from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
+from tidefield.maps.cloud import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, map_frame
-from tidefield.maps.make import DSM, MAP_FILE, ORTHOPHOTO, SIGMA
+from tidefield.maps.make import CLASSES, DSM, MAP_FILE, ORTHOPHOTO, SIGMA
 from tidefield.maps.surface import COARSEST, sparse_surface
 
 MAPS_FILE = "maps.json"
@@ -91,10 +92,12 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
     middle = float(np.median(scene.points.xyz_world[:, 2].numpy()))
     frame = map_frame(scene, None)
     grid = Grid(frame, transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
-    true, colour = _truth(root, grid)
+    true, colour, classes = _truth(root, grid)
+    with rasterio.open(out / CLASSES) as dataset:
+        found_classes = dataset.read(1)
     # The grid of coarse cells begins at the same corner.
     start = sparse_surface(scene, grid.coarser(COARSEST))
-    sparse = start.on(_whole(grid), 0, 1)[0][: grid.rows, : grid.columns]
+    sparse = start.on(_whole(grid), 0)[: grid.rows, : grid.columns]
     stereo = semi_global(scene, grid)
     kept = np.isfinite(height) & np.isfinite(true) & np.isfinite(stereo)
     # The photographs' common exposure differs from the truth by a factor of each channel.
@@ -108,7 +111,27 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
         "within": float((np.abs(height - true) < 1.96 * sigma)[kept].mean()),
         "sigma_median_m": float(np.median(sigma[kept])),
         "orthophoto_psnr": float(10 * np.log10(255**2 / mse)),
+        "classes": overlaps(found_classes[kept], classes[kept]),
+        "water": _levels(json.loads((out / MAP_FILE).read_text())["water"], true[kept & (classes == WATER)]),
     }
+
+
+def overlaps(found: np.ndarray, true: np.ndarray) -> dict[str, dict[str, float | None]]:
+    """Intersection over union of each class, and the share that it has of the true and the found cells."""
+    result = {}
+    for name, value in (("ground", GROUND), ("vegetation", VEGETATION), ("water", WATER)):
+        a, b = found == value, true == value
+        union = int((a | b).sum())
+        overlap = int((a & b).sum()) / union if union else None
+        result[name] = {"true": float(b.mean()), "found": float(a.mean()), "iou": overlap}
+    return result
+
+
+def _levels(bodies: Sequence[dict[str, float]], true: np.ndarray) -> list[dict[str, float | None]]:
+    """Levels of the bodies of water that were found, against the median of the true water's heights."""
+    if not len(true):
+        return [{**body, "error": None} for body in bodies]
+    return [{**body, "error": body["height"] - float(np.median(true))} for body in bodies]
 
 
 def errors(error: np.ndarray) -> dict[str, float]:
@@ -127,7 +150,8 @@ def _whole(grid: Grid) -> Any:
     return Tile(grid, 0, 0, max(grid.rows, grid.columns), 0)
 
 
-def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Heights, colours and classes of a flat at the centres of cells."""
     about = json.loads((root / "truth" / "truth.json").read_text())["map"]
     west, north = about["first_pixel_centre_east_north_m"]
     cell = about["pixel_step_east_north_m"][0]
@@ -137,7 +161,10 @@ def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     height = cv2.remap(np.load(root / "truth" / "surface.npy"), u, v, cv2.INTER_LINEAR)
     picture = cv2.imread(str(root / "truth" / "orthophoto.png"))
     assert picture is not None
-    return height, cv2.remap(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), u, v, cv2.INTER_LINEAR).astype(np.float64)
+    classes = cv2.imread(str(root / "truth" / "classes.png"), cv2.IMREAD_GRAYSCALE)
+    assert classes is not None
+    colour = cv2.remap(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), u, v, cv2.INTER_LINEAR).astype(np.float64)
+    return height, colour, cv2.remap(classes, u, v, cv2.INTER_NEAREST)
 
 
 def semi_global(scene: Scene, grid: Grid) -> np.ndarray:
@@ -270,4 +297,39 @@ def tables(record: dict[str, Any]) -> list[Table]:
         )
         for name, found in record["figures"].items()
     ]
-    return [Table("Errors of heights, cm", columns, rows), Table("Maps", others, more)]
+    shares = [
+        "flat",
+        *(f"{name}: {part}" for name in ("ground", "vegetation", "water") for part in ("true", "found", "IoU")),
+    ]
+    masks = [
+        (
+            name,
+            *(
+                cell
+                for one in ("ground", "vegetation", "water")
+                for cell in (
+                    f"{100 * found['classes'][one]['true']:.1f}%",
+                    f"{100 * found['classes'][one]['found']:.1f}%",
+                    "-" if found["classes"][one]["iou"] is None else f"{found['classes'][one]['iou']:.3f}",
+                )
+            ),
+        )
+        for name, found in record["figures"].items()
+    ]
+    levels = [
+        (
+            name,
+            f"{body['area']:.0f}",
+            f"{100 * body['height']:.1f}",
+            "no water there" if body["error"] is None else f"{100 * body['error']:+.2f}",
+            f"{100 * body['sigma']:.2f}",
+        )
+        for name, found in record["figures"].items()
+        for body in found["water"]
+    ]
+    return [
+        Table("Errors of heights, cm", columns, rows),
+        Table("Maps", others, more),
+        Table("Classes: shares of the cells, and intersection over union", shares, masks),
+        Table("Waterlines, cm", ["flat", "area, m2", "height", "error", "standard error"], levels),
+    ]

@@ -16,7 +16,7 @@ RANK = {
     "evaluation": 3,
     "render": 3,
     "train": 4,
-    "change": 4,
+    "change": 6,
     "baselines": 5,
     "maps": 5,
     "methods": 6,

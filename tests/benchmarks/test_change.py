@@ -45,3 +45,65 @@ def test_missing_data_are_told_of(tmp_path):
         measure_change(tmp_path, tmp_path, 0, print)
     with pytest.raises(ChangeError, match="benchmarks change"):
         write_page(tmp_path, tmp_path / "page.md")
+
+
+def test_the_command_is_measured_on_a_small_pair(tmp_path):
+    from benchmarks.change_size import measure_size
+
+    found = measure_size(0.05, print)
+    assert found["million_cells"] == pytest.approx(0.05, rel=0.02)
+    assert 50e6 < found["peak_memory_bytes"] < 4e9
+    assert found["processor_seconds"] > 0.5
+    assert found["written_bytes"] > 10_000
+
+
+def test_a_flight_is_copied_with_its_own_lines_of_the_lists(tmp_path):
+    from benchmarks.change_null import copy_flight
+
+    for number in (1413, 1414, 1481, 1548):
+        (tmp_path / f"IMG_{number}.jpg").write_bytes(b"jpeg")
+    (tmp_path / "gps.csv").write_text("image_name,lat,lon,gps_height\n")
+    lines = ["EPSG:27700", "1 2 3 4 5 IMG_1414.jpg A", "1 2 3 4 5 IMG_1548.jpg A"]
+    (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
+    copy_flight(tmp_path, (1414, 1481), tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.jpg")) == ["IMG_1414.jpg", "IMG_1481.jpg"]
+    assert (tmp_path / "out" / "gcp_list.txt").read_text().splitlines() == lines[:2]
+
+
+def test_photographs_of_the_chain_come_with_control_that_fits_them(tmp_path, monkeypatch):
+    import torch
+
+    from benchmarks import change_chain
+    from tidefield.change.surfaces import Grid
+    from tidefield.survey.io.photographs import read_survey
+    from tidefield.synthetic.two_dates import Difference, make_pair
+
+    monkeypatch.setattr(change_chain, "CONTROL_POINTS", 4)
+    pair = make_pair("ground_textures", 3, Difference(0.2), views=9, width=96)
+    change_chain.write_photographs(pair, tmp_path)
+    survey = read_survey(tmp_path / change_chain.DATES[1] / "photographs", None, None)
+    assert len(survey.photographs) == 9
+    assert survey.control is not None
+    grid = Grid(None, 499_990.0, 5_800_010.0, 0.5, 40, 40)
+    truth = change_chain.Truth(tmp_path / "truth.npz", grid)
+    # The middle cell lies a quarter of a metre beside the origin of the flat.
+    xy = torch.tensor([[0.25], [-0.25]])
+    assert truth.of["bed1"][20, 20] == pytest.approx(float(pair.later.flat.bed.sample(xy)[0]), abs=0.02)
+    assert truth.change[20, 20] == pytest.approx(float(pair.ground_change.sample(xy)[0]), abs=0.02)
+    assert truth.bare(0, 1).dtype == bool
+
+
+def test_parts_that_were_measured_are_on_the_page(tmp_path):
+    from benchmarks.change import store
+
+    size = {"million_cells": 100.0, "seconds": 600.0, "processor_seconds": 900.0, "peak_memory_bytes": 3e9}
+    store(tmp_path, "size", size | {"written_bytes": 1e9, "cores": 2})
+    area = {"value_m2": 10.0, "low_m2": 8.0, "high_m2": 12.0, "true_m2": 11.0}
+    water = {"land_gained_m2": 5.0, "true_gained_m2": 6.0, "land_lost_m2": 0.0, "true_lost_m2": 0.0}
+    of = {"category": "vegetation", "seed": 1, "cover": dict.fromkeys(("earlier", "later", "gained", "lost"), area)}
+    store(tmp_path, "cover", [of | {"water": water | {"move_m": [1.0, 0.5, 1.5]}}])
+    write_page(tmp_path, tmp_path / "page.md")
+    page = (tmp_path / "page.md").read_text()
+    assert "10 (8 to 12); 11" in page
+    assert "+1.00 (+0.50 to +1.50)" in page
+    assert "3.00 GB" in page

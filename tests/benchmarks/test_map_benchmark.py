@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.maps import _truth, errors, semi_global, tables
+from benchmarks.maps import _truth, errors, overlaps, semi_global, tables
 from tidefield.data.load import load_scene
 from tidefield.maps.grid import Grid, map_frame
 from tidefield.synthetic import make_survey, write_survey
@@ -33,8 +33,29 @@ def test_tables_show_what_was_stored():
     heights = {
         name: {"rmse_m": 0.02, "nmad_m": 0.01, "mean_m": -0.005} for name in ("map", "sparse points", "semi-global")
     }
-    figures = {"cells": 9, "cell_m": 0.05, "heights": heights, "within": 0.951, "sigma_median_m": 0.012}
-    first, second = tables({"figures": {"creek": {**figures, "orthophoto_psnr": 31.26, "seconds": 3.0}}})
+    classes = {
+        name: {"true": 0.25, "found": 0.5, "iou": iou}
+        for name, iou in (("ground", 0.75), ("vegetation", None), ("water", 0.4))
+    }
+    water = [{"height": -0.75, "sigma": 0.003, "area": 40.0, "error": 0.0021}]
+    figures = {
+        "cells": 9,
+        "classes": classes,
+        "water": water,
+        "cell_m": 0.05,
+        "heights": heights,
+        "within": 0.951,
+        "sigma_median_m": 0.012,
+    }
+    first, second, third, fourth = tables({"figures": {"creek": {**figures, "orthophoto_psnr": 31.26, "seconds": 3.0}}})
     assert "| creek | 2.0 | 1.0 | -0.5 |" in first.markdown()
     assert "95.1%" in second.markdown()
     assert "31.3" in second.markdown()
+    assert "| 25.0% | 50.0% | - |" in third.markdown()
+    assert "| creek | 40 | -75.0 | +0.21 | 0.30 |" in fourth.markdown()
+
+
+def test_overlaps_are_intersections_over_unions():
+    found = overlaps(np.array([2, 2, 3, 9]), np.array([2, 3, 3, 3]))
+    assert [found[name]["iou"] for name in ("ground", "vegetation", "water")] == [0.5, pytest.approx(1 / 3), 0.0]
+    assert overlaps(np.array([2]), np.array([2]))["water"]["iou"] is None

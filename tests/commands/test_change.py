@@ -152,3 +152,124 @@ def test_mistakes_are_told_in_one_message(
     polygons.write_text('{"type": "FeatureCollection", "features": [')
     assert "polygons" in fails(capsys, monkeypatch, "change", early, late, new, "--stable", polygons)
     assert not new.exists()
+
+
+def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_path: Path):
+    import pyogrio
+    import rasterio
+    from surveys_of_two_dates import write_surface
+
+    rng = np.random.default_rng(0)
+    columns = np.arange(240)
+    heights = np.broadcast_to(0.01 * columns, (160, 240))
+    for k, (year, covered) in enumerate(((2023, 60), (2024, 100))):
+        picture = np.where(columns[None, :, None] > 240 - covered, [95, 110, 60], [125, 112, 92]) * (1 - 0.2 * k)
+        picture = picture + rng.normal(0, 2, (160, 240, 3))
+        folder = tmp_path / f"{year}-06-01"
+        write_surface(folder / "dsm.tif", (heights + rng.normal(0, 0.01, heights.shape)).astype(np.float32))
+        write_surface(folder / "orthophoto.tif", picture.clip(0, 255).astype(np.uint8).transpose(2, 0, 1))
+    out = tmp_path / "out"
+    words = ("--water", 0.6, 0.4, "--levels", 1.0, "--register", "none", "--datum-error", 0.01)
+    call("change", tmp_path / "2023-06-01", tmp_path / "2024-06-01", out, "-q", *words)
+    numbers = json.loads((out / "change.json").read_text())
+    # What was under water at either date is not looked at: 0.6 m are 60 columns, and a margin of a cell's error.
+    assert numbers["cover"]["area_m2"] == pytest.approx(178 * 160 * 0.25, rel=0.02)
+    gained = numbers["cover"]["regions"]["all"]["gained"]
+    assert gained["value_m2"] == pytest.approx(40 * 160 * 0.25, rel=0.05)
+    line = numbers["water"]["waterline"]
+    assert line["move_m"] == pytest.approx(10, abs=1)
+    assert line["move_low_m"] < 10 < line["move_high_m"]
+    assert numbers["water"]["below"][0]["earlier_m2"] == pytest.approx(100 * 160 * 0.25, rel=0.02)
+    with rasterio.open(out / "cover.tif") as file:
+        assert set(np.unique(file.read(1))) == {-128, 0, 1, 2}
+    assert {name for name, _ in pyogrio.list_layers(out / "change.gpkg")} >= {"cover", "waterlines"}
+    page = (out / "change.html").read_text()
+    assert "Plants covered" in page
+    assert "seaward on average" in page
+
+
+def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from PIL import Image
+    from surveys_of_two_dates import write_surface
+
+    from tidefield.synthetic import write_survey
+    from tidefield.synthetic.grids import Extent
+    from tidefield.synthetic.two_dates import Difference, SurveyErrors, make_pair, surveyed
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = make_pair("ground_textures", 9, Difference(0.4, tide_m=0.0, sun_turn_deg=0.0), views=9, width=128)
+    extent = Extent.around([-25.0, -20.0], [25.0, 20.0], 0.25)
+    for name, survey in (("early", made.earlier), ("late", made.later)):
+        write_survey(survey, tmp_path / name)
+        heights = surveyed(survey.flat.bed, extent, np.random.default_rng(0), SurveyErrors(datum_m=0.0))
+        west, north = extent.west_m - 0.125, extent.north_m + 0.125
+        write_surface(tmp_path / f"{name}.tif", heights, 0.25, west, north, crs=None)
+    scenes = ("--scenes", tmp_path / "early", tmp_path / "late", "--view-width", 96, "--device", "cpu")
+    surfaces = (tmp_path / "early.tif", tmp_path / "late.tif")
+    call("change", *surfaces, tmp_path / "out", "-q", *scenes, "--cameras", "ground_textures_0004")
+    views = tmp_path / "out" / "views" / "ground_textures_0004"
+    names = {"earlier.png", "later.png", "side_by_side.png", "difference.png", "swipe.html", "fade.mp4"}
+    assert {path.name for path in views.iterdir()} == names
+    earlier = np.asarray(Image.open(views / "earlier.png")).astype(float)
+    later = np.asarray(Image.open(views / "later.png")).astype(float)
+    assert earlier.shape == later.shape == (72, 96, 3)
+    # The same ground is at the same pixel: a shift of a few pixels fits worse.
+    grey = [picture.mean(axis=2) for picture in (earlier, later)]
+    errors = [
+        np.abs(grey[0] - np.roll(grey[1], shift, axis))[8:-8, 8:-8].mean()
+        for shift, axis in ((0, 0), (-3, 0), (3, 0), (-3, 1), (3, 1))
+    ]
+    assert errors[0] < 0.95 * min(errors[1:])
+    assert "The same place then and now" in (tmp_path / "out" / "change.html").read_text()
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
+    assert "--scenes" in told
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
+    assert "none" in told
+    assert not (tmp_path / "new").exists()
+
+
+def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    from surveys_of_two_dates import NORTH, WEST, noise, write_surface
+
+    rng, shape = np.random.default_rng(3), (120, 140)
+    rows, columns = np.indices(shape)
+    pit = np.hypot(rows - 40, columns - 40) < 20
+    names = []
+    for year, depth in ((2021, 0.0), (2022, 0.2), (2023, 0.5)):
+        heights = 0.002 * columns - depth * pit + noise(rng, shape, 0.012, 0.008, 4)
+        names.append(write_surface(tmp_path / f"dsm_{year}-05-01.tif", heights.astype(np.float32)))
+    square = [[WEST + x, NORTH - y] for x, y in ((5, 5), (35, 5), (35, 35), (5, 35), (5, 5))]
+    polygons = {"type": "FeatureCollection", "features": []}
+    polygons["crs"] = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32630"}}
+    geometry = {"type": "Polygon", "coordinates": [square]}
+    polygons["features"] = [{"type": "Feature", "properties": {"name": "pit"}, "geometry": geometry}]
+    (tmp_path / "pit.geojson").write_text(json.dumps(polygons))
+    out = tmp_path / "out"
+    call("change", *names[:2], out, "--series", names[2], "-q", "--polygons", tmp_path / "pit.geojson")
+    with (out / "series.csv").open() as file:
+        table = list(csv.DictReader(file))
+    volume = pit.sum() * 0.25
+    expected = {("step", "2021-05-01", "2022-05-01"): 0.2, ("step", "2022-05-01", "2023-05-01"): 0.3}
+    expected |= {("first", "2021-05-01", "2022-05-01"): 0.2, ("first", "2021-05-01", "2023-05-01"): 0.5}
+    cuts = {(r["since"], r["earlier"], r["later"]): r for r in table if r["region"] == "all" and r["volume"] == "cut"}
+    assert set(cuts) == set(expected)
+    for key, depth in expected.items():
+        assert float(cuts[key]["low_m3"]) < depth * volume < float(cuts[key]["high_m3"])
+    assert {row["region"] for row in table} == {"all", "pit"}
+    numbers = json.loads((out / "series.json").read_text())
+    assert numbers["surveys"] == ["2021-05-01", "2022-05-01", "2023-05-01"]
+    last = numbers["closure"]["pit"][-1]
+    assert last["steps_m3"] == pytest.approx(last["since_first_m3"], rel=0.1)
+    page = (out / "series.html").read_text()
+    assert page.count('src="data:image/png;base64,') == 2
+    for link in ("step_1/change.html", "step_2/change.html"):
+        assert link in page
+        assert (out / link).is_file()
+    told = fails(capsys, monkeypatch, "change", names[0], names[2], tmp_path / "new", "--series", names[1], "-q")
+    assert "order of time" in told or "earlier survey first" in told
+    told = fails(capsys, monkeypatch, "change", *names[:2], tmp_path / "new", "--series", names[2], "--water", 0, 0)
+    assert "two surveys" in told

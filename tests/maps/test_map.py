@@ -17,7 +17,7 @@ from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
 from tidefield.maps import make
-from tidefield.maps.make import CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
+from tidefield.maps.make import AGREEMENT, CLASSES, CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
 from tidefield.synthetic import Flight, make_survey, write_survey
 
 rasterio = pytest.importorskip("rasterio")
@@ -113,7 +113,7 @@ def test_the_orthophoto_shows_the_flat_in_its_place(scene: Path, out: Path):
 def test_rasters_are_cloud_optimised_and_say_that_the_frame_is_local(out: Path):
     from rio_cogeo import cog_validate
 
-    for name in (ORTHOPHOTO, DSM, SIGMA, VIEWS, MAIN):
+    for name in (ORTHOPHOTO, DSM, SIGMA, VIEWS, MAIN, AGREEMENT, CLASSES):
         valid, errors, _ = cog_validate(out / name)
         assert valid, errors
         with rasterio.open(out / name) as dataset:
@@ -137,7 +137,7 @@ def test_terrain_contours_and_hillshades_lie_on_the_same_cells(out: Path):
 
 def test_the_report_shows_the_map_without_the_network(out: Path):
     page = (out / "odm_report" / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert "http://" not in page
     assert "not georeferenced" in page
     assert "how far this map is from surveyed points is not known" in page
@@ -152,6 +152,8 @@ def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
         np.testing.assert_allclose(dsm.read(1)[rows, columns], cloud.z, atol=1e-3)
         np.testing.assert_allclose(sigma.read(1)[rows, columns], cloud.sigma_z)
     assert np.array(cloud.views).min() >= 2
+    with rasterio.open(out / CLASSES) as classes:
+        np.testing.assert_array_equal(classes.read(1)[rows, columns], cloud.classification)
     assert "not georeferenced" in cloud.header.parse_crs().name
 
 
@@ -239,3 +241,133 @@ def test_a_georeferenced_map_has_a_compound_system_and_its_coordinates(scene: Pa
         assert dsm.transform.c % dsm.transform.a == pytest.approx(0, abs=1e-6)
     cloud = laspy.read(tmp_path / "map" / CLOUD)
     assert cloud.header.parse_crs().to_epsg() == 7405
+
+
+def test_photographs_leave_no_steps_on_flat_mud(scene: Path, out: Path):
+    """Where the photograph that contributes most changes, the map keeps the flat's colours to a grey value or two."""
+    with rasterio.open(out / ORTHOPHOTO) as ortho, rasterio.open(out / MAIN) as main:
+        shown = ortho.read([1, 2, 3]).transpose(1, 2, 0).astype(float)
+        colour = truth(scene, ortho)[1].astype(float)
+        photograph = main.read(1)
+    gain = colour.mean((0, 1)) / shown.mean((0, 1))
+    error = (shown * gain - colour).mean(2)
+    about = json.loads((scene / "truth" / "truth.json").read_text())["gain"]
+    gains = np.array([np.mean(about[name]) for name in sorted(about)])
+    steps: dict[tuple[int, int], list[float]] = {}
+    for a, b, left, right in (
+        (error[:, :-1], error[:, 1:], photograph[:, :-1], photograph[:, 1:]),
+        (error[:-1], error[1:], photograph[:-1], photograph[1:]),
+    ):
+        for row, column in zip(*np.nonzero(left != right), strict=True):
+            one, other = int(left[row, column]), int(right[row, column])
+            step = b[row, column] - a[row, column]
+            steps.setdefault((min(one, other), max(one, other)), []).append(step if one < other else -step)
+    long = {pair: np.array(values) for pair, values in steps.items() if len(values) >= 12}
+    assert long, "the photographs that contribute most should change within the map"
+    level = colour.mean()
+    uneven = [abs(np.log(gains[i - 1] / gains[j - 1])) * level for i, j in long]
+    assert max(uneven) > 8  # what the exposures alone would leave, in grey values of 255
+    for values in long.values():
+        assert abs(values.mean()) < 1 + 3 * values.std() / np.sqrt(len(values))
+
+
+def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
+    """Even tiles that are 12 grey values and 10 cm apart fade into each other across their margins."""
+    from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame, Tile
+
+    class Flat(make.Job):
+        """A job whose tiles are made already."""
+
+        def __init__(self, grid: Grid) -> None:
+            object.__setattr__(self, "grid", grid)
+
+        def tiles(self) -> list[Tile]:
+            return self.grid.tiles(64, make.MARGIN)
+
+    frame = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
+    grid = Grid(frame, 0.0, 0.0, 0.1, 150, 130, 5.0)
+    job = Flat(grid)
+    (tmp_path / make.TILES).mkdir()
+    for number, tile in enumerate(job.tiles()):
+        shape = tile.side, tile.side
+        odd = number % 2
+        every = np.ones(shape, bool)
+        np.savez(
+            make._file(tmp_path / make.TILES, tile),
+            height=np.full(shape, 5.0 + 0.1 * odd, np.float32),
+            sigma=np.full(shape, 0.01, np.float32),
+            score=np.ones(shape, np.float16),
+            count=np.full(shape, 3, np.uint16),
+            main=np.full(shape, 1, np.uint16),
+            seen=every,
+            shown=every,
+            colour=np.full((*shape, 3), 0.5 + 12 / 255 * odd, np.float32),
+        )
+    found = list(make.strips(job, tmp_path))
+    colour = np.concatenate([strip.colour for strip in found], axis=1)
+    height = np.concatenate([strip.height for strip in found])
+    assert colour.shape == (3, 130, 150)
+    assert np.ptp(colour) > 11 / 255
+    for values, largest in ((colour, 1 / 255), (height, 0.1 / 12)):
+        assert abs(np.diff(values, axis=-1)).max() < largest
+        assert abs(np.diff(values, axis=-2)).max() < largest
+
+
+@pytest.mark.parametrize("limit", [6_000, 30_000])
+def test_a_full_disk_is_one_message_and_loses_nothing(scene: Path, out: Path, tmp_path: Path, limit: int):
+    """The system refuses every byte of a file beyond a limit, as a full disk does."""
+    import resource
+    import signal
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handled = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        with pytest.raises(RunError, match="cannot be written"):
+            mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handled)
+    assert not list((tmp_path / "map").rglob("*.tif"))
+    assert not [path for path in (tmp_path / "map").rglob("*partial*") if path.stat().st_size]
+    mapped(scene, tmp_path / "map", area=polygon(tmp_path))
+    with rasterio.open(out / DSM) as one, rasterio.open(tmp_path / "map" / DSM) as other:
+        np.testing.assert_array_equal(one.read(1), other.read(1))
+
+
+@pytest.mark.parametrize("program", ["gdalinfo", "pdal"])
+def test_other_programs_read_the_files(out: Path, program: str):
+    import shutil
+    import subprocess
+
+    if shutil.which(program) is None:
+        pytest.skip(f"{program} is not installed")
+    command = [program, "-json", out / DSM] if program == "gdalinfo" else [program, "info", "--summary", out / CLOUD]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=True)
+    about = json.loads(done.stdout)
+    if program == "gdalinfo":
+        with rasterio.open(out / DSM) as dsm:
+            assert about["size"] == [dsm.width, dsm.height]
+        assert "not georeferenced" in about["coordinateSystem"]["wkt"]
+    else:
+        assert about["summary"]["num_points"] == len(laspy.read(out / CLOUD).points)
+        assert "sigma_z" in about["summary"]["dimensions"]
+
+
+def test_water_without_points_lies_on_the_map(scene: Path, tmp_path: Path):
+    from dataclasses import replace
+
+    from tidefield.data.load import load_scene
+    from tidefield.maps.grid import make_grid, map_frame
+
+    whole = load_scene(scene, hold_out=False)
+    assert whole.points is not None
+    north = whole.points.subset(whole.points.xyz_world[:, 1] > 5)
+    frame = map_frame(whole, None)
+    _, south, _, _ = make_grid(frame, replace(whole, points=north), None).bounds
+    assert south < -10
+    position = frame.to_map(whole.cameras.position_world.double().numpy())
+    # Not beyond what a photograph sees: its lower edge is nearer to the point below it than it flies high.
+    assert south > position[:, 1].min() - position[:, 2].max()
+    inside = make_grid(frame, replace(whole, points=north), None, (-5.0, -5.0, 5.0, 5.0))
+    assert inside.bounds == pytest.approx((-5, -5, 5, 5), abs=inside.cell)

@@ -18,11 +18,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from tidefield.change.cover import Cover
 from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
+from tidefield.change.water import Waterline
 
 LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
+GAINED, LOST = "#1a7a3c", "#b8742a"
 INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
 _SIDE = 1400
 """Longest side of a map, cells."""
@@ -114,7 +117,7 @@ def draw_change(small: Thinned, limit_m: float, what: str) -> Markup:
             axes.contour(small.signs == sign, levels=[0.5], colors=colour, linewidths=0.9, **place)
     bar = figure.colorbar(image, ax=axes, fraction=0.035, pad=0.02, alpha=1)
     bar.set_label("later minus earlier height (m)")
-    return _png(figure, what)
+    return png(figure, what)
 
 
 def draw_stable(small: Thinned, what: str) -> Markup:
@@ -124,7 +127,38 @@ def draw_stable(small: Thinned, what: str) -> Markup:
     cover = np.where(small.stable & np.isfinite(small.dz), 1.0, np.nan)
     axes.imshow(cover, cmap=ListedColormap([STABLE]), alpha=0.55, extent=_extent(small.grid), interpolation="nearest")
     axes.legend(handles=[Patch(color=STABLE, alpha=0.55, label="stable ground")], loc="lower left", framealpha=0.9)
-    return _png(figure, what)
+    return png(figure, what)
+
+
+def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
+    """The map of plants gained, lost and at both dates over the earlier survey's relief."""
+    step = -(-max(cover.grid.shape) // _SIDE)
+    classes = cover.classes[::step, ::step]
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    handles = []
+    for code, colour, label in ((2, "#b9c8a0", "plants at both dates"), (1, GAINED, "gained"), (-1, LOST, "lost")):
+        shown = np.where(classes == code, 1.0, np.nan)
+        axes.imshow(shown, cmap=ListedColormap([colour]), extent=_extent(cover.grid), interpolation="nearest")
+        handles.append(Patch(color=colour, label=label))
+    axes.legend(handles=handles, loc="lower left", framealpha=0.9)
+    return png(figure, what)
+
+
+def draw_waterlines(line: Waterline, small: Thinned, names: tuple[str, str], what: str) -> Markup:
+    """Both waterlines over the earlier survey's relief."""
+    figure, axes = _map(small.grid)
+    _relief(axes, small)
+    for lines, colour, name, level in zip(line.lines, (INK, HIGHER), names, line.levels_m, strict=True):
+        for k, part in enumerate(lines):
+            x, y = np.asarray(part.coords).T[:2]
+            label = f"{name}, {level:.2f} m" if k == 0 else None
+            axes.plot(x, y, color=colour, linewidth=1.2, label=label)
+    west, east, south, north = _extent(small.grid)
+    axes.set(xlim=(west, east), ylim=(south, north))
+    if any(line.lines):
+        axes.legend(loc="lower left", framealpha=0.9)
+    return png(figure, what)
 
 
 def draw_stable_histogram(change: Change, what: str) -> Markup:
@@ -132,7 +166,7 @@ def draw_stable_histogram(change: Change, what: str) -> Markup:
     step = 1 + math.isqrt(change.dz.size // 1_000_000)
     after = change.dz[::step, ::step][change.stable[::step, ::step]]
     after = after[np.isfinite(after)]
-    figure = _figure(5.0, 2.7)
+    figure = figure_of(5.0, 2.7)
     axes = figure.add_axes((0.11, 0.2, 0.86, 0.74))
     shift = change.errors.registration.vertical_m
     reach = max(3 * Z95 / 2 * change.errors.registration.after[2], abs(shift) * 1.2, 1e-3)
@@ -144,7 +178,7 @@ def draw_stable_histogram(change: Change, what: str) -> Markup:
     axes.set(xlabel="dz over stable ground (m); dashed: level of detection", yticks=[])
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    return _png(figure, what)
+    return png(figure, what)
 
 
 def draw_variogram(change: Change, what: str) -> Markup | None:
@@ -152,7 +186,7 @@ def draw_variogram(change: Change, what: str) -> Markup | None:
     variogram = change.errors.variogram
     if not variogram.lags_m:
         return None
-    figure = _figure(5.0, 2.7)
+    figure = figure_of(5.0, 2.7)
     axes = figure.add_axes((0.12, 0.2, 0.85, 0.74))
     lags = np.array(variogram.lags_m)
     line = np.geomspace(lags[0], lags[-1], 200)
@@ -164,7 +198,7 @@ def draw_variogram(change: Change, what: str) -> Markup | None:
     axes.set(xlabel="distance (m)", ylabel="semivariance over variance", ylim=(0, None))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, loc="lower right")
-    return _png(figure, what)
+    return png(figure, what)
 
 
 def draw_section(change: Change, row: int, what: str) -> Markup:
@@ -175,7 +209,7 @@ def draw_section(change: Change, row: int, what: str) -> Markup:
     later = earlier + change.dz[row]
     band = Z95 * change.errors.cell_sigma(slice(row, row + 1))[0]
     x = (np.arange(grid.columns) + 0.5) * grid.cell_m
-    figure = _figure(_INCHES, 2.5)
+    figure = figure_of(_INCHES, 2.5)
     axes = figure.add_axes((0.08, 0.22, 0.9, 0.73))
     axes.fill_between(x, later - band, later + band, color=HIGHER, alpha=0.25, linewidth=0)
     axes.plot(x, earlier, color=INK, linewidth=0.9, label=change.earlier.name)
@@ -183,10 +217,11 @@ def draw_section(change: Change, row: int, what: str) -> Markup:
     axes.set(xlabel="metres from the western edge", ylabel="height (m)", xlim=(x[0], x[-1]))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    return _png(figure, what)
+    return png(figure, what)
 
 
-def _figure(width: float, height: float) -> Figure:
+def figure_of(width: float, height: float) -> Figure:
+    """An empty figure in the style of the pages, inches."""
     with style.context(_STYLE):
         return Figure(figsize=(width, height), dpi=_DPI)
 
@@ -213,7 +248,7 @@ def _extent(grid: Grid) -> tuple[float, float, float, float]:
     return west, east, south, north
 
 
-def _png(figure: Figure, what: str) -> Markup:
+def png(figure: Figure, what: str) -> Markup:
     """An image element with the picture in it."""
     buffer = io.BytesIO()
     with style.context(_STYLE):

@@ -8,6 +8,8 @@ from pathlib import Path
 from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, write_surface
 from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface
 
+FILLED = "filled.tif"
+"""Of `tidefield map --fill`, next to the surface."""
 SURFACES = ("odm_dem/dsm.tif", "odm_dem/dtm.tif", "dsm.tif", "dtm.tif")
 ORTHOPHOTOS = ("odm_orthophoto/odm_orthophoto.tif", "orthophoto.tif", "ortho.tif")
 CLOUDS = tuple(
@@ -36,8 +38,15 @@ def open_survey(path: Path, date: str | None = None) -> Surface:
             f"{path} has no surface: expected one of {', '.join(SURFACES)}, as `tidefield map` and ODM write them; "
             "name a GeoTIFF of heights"
         )
-    found = open_surface(surface, date)
-    return replace(found, orthophoto=first_of(path, ORTHOPHOTOS), cloud=first_of(path, CLOUDS))
+    name = path.resolve().name
+    found = open_surface(surface, date or date_in(name))
+    return replace(
+        found,
+        filled=first_of(surface.parent, (FILLED,)),
+        orthophoto=first_of(path, ORTHOPHOTOS),
+        cloud=first_of(path, CLOUDS),
+        source=name,
+    )
 
 
 def is_cloud(path: Path) -> bool:

@@ -31,7 +31,7 @@ from tidefield.change.registration import (
     statistics,
 )
 from tidefield.change.shift import Shift, find_shift
-from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid
+from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_zeros, warped
 from tidefield.change.volumes import ErrorModel, Volume
 
 log = logging.getLogger(__name__)
@@ -121,14 +121,17 @@ def read_difference(
                     tick(rows.stop + (grid.rows if sign > 0 else 0), 2 * grid.rows)
         if sigma is not None:
             assert surface.sigma is not None
-            from tidefield.change.surfaces import open_surface
-
             raster = open_surface(surface.sigma)
             with raster.on_grid(grid, moved) as read:
                 for rows in grid.strips():
                     own = read(rows.start, rows.stop) * np.float32(surface.metres)
                     own[~(own > 0)] = np.nan
                     sigma[rows] = own if sign < 0 else np.hypot(sigma[rows], own)
+        if surface.filled is not None:
+            with warped(surface.filled, surface.crs, grid, moved) as marks:
+                for rows in grid.strips():
+                    # Between a filled cell and a measured one the value is between 0 and 1.
+                    dz[rows][marks(rows.start, rows.stop)[0] > 0] = np.nan
     if sigma is not None:
         dz[~np.isfinite(sigma)] = np.nan
         sigma[~np.isfinite(dz)] = np.nan
@@ -157,7 +160,7 @@ def measure(
     """
     options = options or Options()
     grid = common_grid([earlier, later], options.cell_m)
-    remarks = [*earlier.remarks, *later.remarks]
+    remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks, *other_zeros(earlier, later)])]
     shift = _shift(earlier, later, grid, options, remarks)
     moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
     dz, own = read_difference(earlier, later, grid, moved, tick=tick)

@@ -2,32 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
+from tidefield.change.cover import Cover
 from tidefield.change.figures import (
     HIGHER,
     LOWER,
     draw_change,
+    draw_cover,
     draw_section,
     draw_stable,
     draw_stable_histogram,
     draw_variogram,
+    draw_waterlines,
     thinned,
 )
 from tidefield.change.measure import Change
+from tidefield.change.pictures import difference, jpeg, side_by_side
+from tidefield.change.views import View
+from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
 
 MINUS = "\u2212"
 _SHOWN_OUTLINES = 12
 _SECTIONS = 2
+_SHOWN_VIEWS = 4
 
 
-def write_page(change: Change, numbers: dict[str, Any], path: Path) -> None:
+def write_page(
+    change: Change,
+    numbers: dict[str, Any],
+    path: Path,
+    cover: Cover | None = None,
+    water: Water | None = None,
+    views: Sequence[View] = (),
+) -> None:
     """Write the page, which needs no other file."""
     environment = Environment(
         loader=ChoiceLoader(
@@ -67,7 +82,18 @@ def write_page(change: Change, numbers: dict[str, Any], path: Path) -> None:
         more=len(rows) - _SHOWN_OUTLINES,
         colours={"lower": LOWER, "higher": HIGHER},
         regions=change.per_region,
-        limits=limits(change),
+        limits=limits(change, cover is not None and (water is None or water.waterline is None)),
+        cover=cover,
+        views=[
+            (view.name, jpeg(side_by_side(view, (earlier, later))), jpeg(difference(view)))
+            for view in views[:_SHOWN_VIEWS]
+        ],
+        cover_map=None if cover is None else draw_cover(cover, small, f"Map of plants gained and lost {named}"),
+        cover_words=cover_words(cover),
+        water_words=water_words(water),
+        water_map=None
+        if water is None or water.waterline is None
+        else draw_waterlines(water.waterline, small, (earlier, later), f"Map of the waterlines {named}"),
     )
     write_text(path, html)
 
@@ -98,6 +124,44 @@ def sentences(change: Change) -> list[str]:
     return [first, second, third]
 
 
+def cover_words(cover: Cover | None) -> list[str]:
+    """Plants gained and lost, in a sentence."""
+    if cover is None:
+        return []
+    of = cover.areas["all"]
+
+    def area(what: str) -> str:
+        return f"{cubic(of[what].value_m2)} m² ({cubic(of[what].low_m2)} to {cubic(of[what].high_m2)})"
+
+    return [
+        f"Plants covered {area('earlier')} of {cubic(cover.known_m2)} m² at the earlier date and {area('later')} at "
+        f"the later one; {area('gained')} were gained, {area('lost')} lost."
+    ]
+
+
+def water_words(water: Water | None) -> list[str]:
+    """The waterline's move and areas below levels, in sentences."""
+    if water is None:
+        return []
+    words = []
+    line = water.waterline
+    if line is not None and not all(line.lines):
+        words.append("There is no waterline at these heights of the water at both dates.")
+    elif line is not None:
+        move, low, high = line.move_m
+        words.append(
+            f"The waterline moved {number(abs(move), 1)} m {'seaward' if move > 0 else 'landward'} on average (95%, "
+            f"seaward: {number(low, 1)} to {number(high, 1)} m): {cubic(line.land_gained_m2)} m² fell dry, "
+            f"{cubic(line.land_lost_m2)} m² came under water."
+        )
+    for below in water.below:
+        words.append(
+            f"Below {number(below.level_m, 2)} m lay {cubic(below.earlier_m2)} m², then {cubic(below.later_m2)} m²: "
+            f"{cubic(below.change_m2)} m² (95%: {cubic(below.low_m2)} to {cubic(below.high_m2)})."
+        )
+    return words
+
+
 def section_rows(change: Change) -> list[int]:
     """Rows of the grid through the largest cut and the largest fill."""
     rows: list[int] = []
@@ -115,12 +179,14 @@ def _from_north(change: Change, row: int) -> str:
     return f"{(row + 0.5) * change.grid.cell_m:.0f} m south of the northern edge"
 
 
-def limits(change: Change) -> list[str]:
+def limits(change: Change, sea_may_be_green: bool = False) -> list[str]:
     """What the page does not tell."""
     found = [
         "Cut and fill are of the outlines. Narrow changes near the level of detection are in the net volume only.",
         "Plants and water are part of the surfaces: where they changed, the change is not of the ground.",
     ]
+    if sea_may_be_green:
+        found.append("Shallow water is green: it counts as plants, unless the water's heights are given (--water).")
     if change.errors.registration.shift_error_m == 0:
         found.append("The surveys were compared where they lie: no horizontal shift was estimated.")
     if change.errors.registration.model == "none":

@@ -28,6 +28,8 @@ STRIP_CELLS = 1 << 22
 """Cells read at once."""
 MOST_CELLS = 400_000_000
 """Of a common grid: what fits into 16 GB."""
+PLAIN = 'LOCAL_CS["metres",UNIT["metre",1]]'
+"""A system for files that need one, where surfaces have none."""
 _SAMPLE = 1000
 """Rows and columns that are read of a large surface to see what its values are."""
 _SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
@@ -110,9 +112,11 @@ class Surface:
         nodata: value of pixels without a height, declared or found; None if there is none.
         metres: length of one unit of the heights.
         sigma: raster of their standard errors, if there is one.
+        filled: raster that is 1 where heights were filled in, which are no measurements.
         orthophoto, cloud: of the same survey, if there are any.
-        source: name of the cloud that the surface was made of.
+        source: name of the cloud that the surface was made of, or of the folder.
         date: YYYY-MM-DD of the photographs, if the file or its name tells.
+        datum: zero of the heights in words, where the file tells it (`tidefield map`).
         remarks: what a user should know of how it was read.
     """
 
@@ -124,10 +128,12 @@ class Surface:
     nodata: float | None
     metres: float = 1.0
     sigma: Path | None = None
+    filled: Path | None = None
     orthophoto: Path | None = None
     cloud: Path | None = None
     source: str | None = None
     date: str | None = None
+    datum: str | None = None
     remarks: list[str] = field(default_factory=list)
 
     @property
@@ -176,9 +182,8 @@ def warped(
     from rasterio.windows import Window
 
     # Without a system on either side GDAL needs one all the same: any that is the same on both sides changes nothing.
-    plain = 'LOCAL_CS["metres",UNIT["metre",1]]'
-    source = plain if crs is None or grid.crs is None else crs.to_wkt()
-    target = plain if crs is None or grid.crs is None else grid.crs
+    source = PLAIN if crs is None or grid.crs is None else crs.to_wkt()
+    target = PLAIN if crs is None or grid.crs is None else grid.crs
     moved = replace(grid, west_m=grid.west_m - shift_m[0], north_m=grid.north_m - shift_m[1]).transform
     with opened(path) as dataset:
         own = dataset.transform
@@ -272,6 +277,11 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                     "it with gdal_edit.py -a_srs"
                 ) from error
             metres = _metres_per_height(crs)
+            if _is_local(crs):
+                crs = None
+                remarks.append(
+                    f"{path.name} lies in a local frame: that both surveys have the same one is taken for granted"
+                )
         else:
             remarks.append(f"{path.name} states no coordinate system; its lengths are taken as metres")
         nodata = dataset.nodata
@@ -281,7 +291,8 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                 remarks.append(
                     f"{path.name} declares no nodata, but has {nodata:g} where no height can be: read as such"
                 )
-        date = date or date_in(dataset.tags().get("TIFFTAG_DATETIME", "")) or date_in(path.stem)
+        tags = dataset.tags()
+        date = date or date_in(tags.get("TIFFTAG_DATETIME", "")) or date_in(path.stem)
         return Surface(
             path,
             crs,
@@ -292,6 +303,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
             metres,
             sigma_of(path),
             date=date,
+            datum=tags.get("VERTICAL_DATUM"),
             remarks=remarks,
         )
 
@@ -322,6 +334,11 @@ def date_in(text: str) -> str | None:
     return "{}{}-{}-{}".format(*found.groups()) if found else None
 
 
+def _is_local(crs: CRS) -> bool:
+    """Whether a system is that of a scene without a georeference, as `tidefield map` states it."""
+    return crs.type_name == "Engineering CRS"
+
+
 def _metres_per_height(crs: CRS) -> float:
     """Metres in one unit of the heights; 1 if the system does not tell."""
     vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None)
@@ -339,6 +356,15 @@ def _horizontal(crs: CRS) -> CRS:
 
 def _same_system(one: CRS, other: CRS) -> bool:
     return _horizontal(one).equals(_horizontal(other), ignore_axis_order=True)
+
+
+def other_zeros(earlier: Surface, later: Surface) -> list[str]:
+    """A remark where surfaces state zeros of their heights in words, and not the same or an unknown one."""
+    if earlier.datum is None or later.datum is None:
+        return []
+    if earlier.datum != later.datum:
+        return [f"heights are over other zeros: {earlier.datum} and {later.datum}; stable ground takes the difference"]
+    return []
 
 
 def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:

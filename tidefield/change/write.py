@@ -16,10 +16,12 @@ from jaxtyping import Bool
 from shapely.geometry.base import BaseGeometry
 
 from tidefield import __version__
+from tidefield.change.cover import LEAST_M2, Cover
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import ChangeError, Grid, require_rasterio
+from tidefield.change.surfaces import PLAIN, ChangeError, Grid, require_rasterio
 from tidefield.change.volumes import Volume
+from tidefield.change.water import Water, Waterline
 from tidefield.files import write_json, write_text
 
 BLOCK = 512
@@ -33,6 +35,7 @@ CHANGE_BANDS = (
     "sigma: one standard error of dz (m)",
     "p: two-sided p-value of dz",
 )
+COVER_BANDS = ("plants: 1 gained, -1 lost, 2 at both dates, 0 at none",)
 SIGNIFICANT_BANDS = (
     "cell by cell: -1 lower, 1 higher, 0 neither, at 95%",
     "outlined: -1 lower, 1 higher, 0 neither; by windows of cells",
@@ -161,11 +164,12 @@ def volume_rows(change: Change) -> list[dict[str, Any]]:
 
 def write_tables(change: Change, folder: Path) -> None:
     """Write volumes.csv and outlines.csv."""
-    _write_csv(folder / "volumes.csv", volume_rows(change))
-    _write_csv(folder / "outlines.csv", outline_rows(change))
+    write_csv(folder / "volumes.csv", volume_rows(change))
+    write_csv(folder / "outlines.csv", outline_rows(change))
 
 
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows with one set of keys; numbers are rounded to four decimals."""
     text = io.StringIO()
     if rows:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
@@ -180,8 +184,45 @@ def _plain(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
-def write_geopackage(change: Change, folder: Path) -> None:
-    """Write change.gpkg with the outlines, stable ground and the user's polygons."""
+def write_cover(cover: Cover, folder: Path) -> None:
+    """Write cover.tif and cover.csv."""
+    with cog(folder / "cover.tif", cover.grid, COVER_BANDS, "int8", UNKNOWN) as write:
+        for rows in cover.grid.strips():
+            write(rows, cover.classes[rows][None])
+    table = [
+        {"region": region, "cover": what, "area_m2": area.value_m2, "low_m2": area.low_m2, "high_m2": area.high_m2}
+        for region, of in cover.areas.items()
+        for what, area in of.items()
+    ]
+    write_csv(folder / "cover.csv", table)
+
+
+Layer = tuple[str, list[BaseGeometry], list[dict[str, Any]]]
+"""Name, geometries, and a row for each of them."""
+
+
+def _cover_layer(cover: Cover) -> Layer:
+    moved = (cover.classes == 1) | (cover.classes == -1)
+    shapes = [
+        (shape, {"cover": "gained" if value > 0 else "lost", "area_m2": shape.area})
+        for value, shape in polygons_of(cover.classes.astype(np.int16), cover.grid, moved)
+        if shape.area >= LEAST_M2
+    ]
+    shapes = sorted(shapes, key=lambda pair: -pair[0].area)[:MOST_OUTLINES]
+    return "cover", [shape for shape, _ in shapes], [row for _, row in shapes]
+
+
+def _water_layer(water: Waterline) -> Layer:
+    rows = [
+        (line, {"date": date, "level_m": level, "length_m": line.length})
+        for date, level, lines in zip(("earlier", "later"), water.levels_m, water.lines, strict=True)
+        for line in lines
+    ]
+    return "waterlines", [line for line, _ in rows], [row for _, row in rows]
+
+
+def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, water: Water | None = None) -> None:
+    """Write change.gpkg with the outlines, stable ground, the user's polygons, cover that moved, and waterlines."""
     from pyogrio import raw
 
     path = folder / "change.gpkg"
@@ -190,9 +231,7 @@ def write_geopackage(change: Change, folder: Path) -> None:
     for number, polygon in polygons_of(change.outlines.labels, change.grid, change.outlines.labels > 0):
         if number in rows:
             shapes.setdefault(number, []).append(polygon)
-    layers: list[tuple[str, list[BaseGeometry], list[dict[str, Any]]]] = [
-        ("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))
-    ]
+    layers: list[Layer] = [("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
     step = 1 + math.isqrt(change.stable.size // 4_000_000)
     thin = change.stable[::step, ::step]
     coarse = Grid(
@@ -227,24 +266,32 @@ def write_geopackage(change: Change, folder: Path) -> None:
             ],
         )
     )
+    if cover is not None:
+        layers.append(_cover_layer(cover))
+    if water is not None and water.waterline is not None:
+        layers.append(_water_layer(water.waterline))
     for name, geometries, table in layers:
         if not geometries:
             continue
         raw.write(
             path,
-            geometry=shapely.to_wkb(np.array([_multi(shape) for shape in geometries], dtype=object)),
+            geometry=shapely.to_wkb(np.array(_multi(geometries), dtype=object)),
             field_data=[np.array([row[key] for row in table]) for key in table[0]],
             fields=list(table[0]),
             layer=name.replace(" ", "_"),
             driver="GPKG",
-            geometry_type="MultiPolygon",
-            crs=change.grid.crs,
+            geometry_type="LineString" if name == "waterlines" else "MultiPolygon",
+            crs=change.grid.crs or PLAIN,
             append=path.exists(),
         )
 
 
-def _multi(shape: BaseGeometry) -> BaseGeometry:
-    """The polygons of a geometry."""
+def _multi(shapes: list[BaseGeometry]) -> list[BaseGeometry]:
+    """Lines as they are; of everything else the polygons."""
+    return [shape if shape.geom_type == "LineString" else _polygons(shape) for shape in shapes]
+
+
+def _polygons(shape: BaseGeometry) -> BaseGeometry:
     parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
     if shape.geom_type == "GeometryCollection":
         parts += [p for m in shapely.get_parts(shape) if m.geom_type == "MultiPolygon" for p in shapely.get_parts(m)]
@@ -325,11 +372,17 @@ def _survey(surface: Any) -> dict[str, Any]:
     }
 
 
-def write_all(change: Change, folder: Path, command: str) -> dict[str, Any]:
+def write_all(
+    change: Change, folder: Path, command: str, cover: Cover | None = None, water: Water | None = None
+) -> dict[str, Any]:
     """Write all files of a change but its page; returns the numbers."""
     write_rasters(change, folder)
     write_tables(change, folder)
-    write_geopackage(change, folder)
+    write_geopackage(change, folder, cover, water)
     numbers = summary(change, command)
+    numbers["cover"] = None if cover is None else cover.to_json()
+    numbers["water"] = None if water is None else water.to_json()
+    if cover is not None:
+        write_cover(cover, folder)
     write_json(folder / "change.json", numbers)
     return numbers

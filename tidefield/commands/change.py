@@ -6,6 +6,7 @@ import logging
 import os
 import shlex
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,12 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import Verbosity
+from tidefield.commands.common import Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from tidefield.change.cover import Cover
+    from tidefield.change.inputs import Pair
+    from tidefield.change.measure import Change as Measured
+    from tidefield.change.views import View
+    from tidefield.change.water import Water
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +37,8 @@ class Change:
     OUT is a new folder: change.html (the report), change.tif (difference, its standard error and p-value),
     significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have
     95% intervals from the random, the spatially correlated and the systematic part of the error, which are measured
-    over stable ground.
+    over stable ground. Where both surveys have orthophotos, plants gained and lost are told, too (cover.tif,
+    cover.csv); with --scenes the same places then and now are in views, as pictures, a page that swipes and a video.
     """
 
     earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
@@ -40,6 +48,9 @@ class Change:
     """The later survey, likewise."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """A new folder for the results."""
+    series: tuple[Path, ...] = ()
+    """Further surveys, in the order of time: OUT then has a folder for each step, and series.html, series.csv and
+    series.json with the volumes over time."""
     stable: Path | None = None
     """Ground that did not change: polygons or lines (GeoJSON, GeoPackage, shapefile). If not given, it is what is left
     when everything that stands out is outlined, and is shown."""
@@ -62,10 +73,24 @@ class Change:
     """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
     windows: tuple[int, ...] = (5, 11, 21)
     """Cells along each side of the windows in which change is tested, odd numbers."""
+    water: tuple[float, float] | None = None
+    """Heights of the water at both dates, in the earlier survey's heights: how far the waterline moved is told."""
+    levels: tuple[float, ...] = ()
+    """Heights: the ground below each is told at both dates."""
     m3c2: bool = False
     """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
-    dates: tuple[str, str] | None = None
-    """Dates of the surveys, if files and names do not tell: YYYY-MM-DD YYYY-MM-DD."""
+    scenes: tuple[Path, Path] | None = None
+    """Scenes or trained runs of both surveys: the same places then and now are rendered into OUT/views (scenes by the
+    trained weights that came with Tidefield)."""
+    cameras: tuple[str, ...] = ()
+    """Photographs of the earlier scene from whose cameras both are rendered; if not given, the one that looks at the
+    largest change."""
+    view_width: int = 960
+    """Width of these views in pixels."""
+    device: Device = "auto"
+    """Where they are rendered."""
+    dates: tuple[str, ...] | None = None
+    """Dates of the surveys, if files and names do not tell: YYYY-MM-DD for each."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
@@ -74,20 +99,87 @@ def change(options: Change, console: Console) -> None:
     refuse_existing(options.out, replaceable=False)
     _check(options)
     with TemporaryDirectory() as work:
-        _compare(options, console, Path(work))
+        (_series if options.series else _compare)(options, console, Path(work))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a comparison of two surveys found."""
+
+    pair: Pair
+    change: Measured
+    cover: Cover | None
+    water: Water | None
 
 
 def _compare(options: Change, console: Console, work: Path) -> None:
-    from tidefield.change.clouds import compare_clouds, write_distances
+    found = _measured(options, options.earlier, options.later, _dates(options, 2), work, console)
+    with completed_folder(options.out) as folder:
+        _write(found, options, folder, console)
+    _say(found, console)
+    console.print(str(options.out), soft_wrap=True)
+
+
+def _series(options: Change, console: Console, work: Path) -> None:
+    """Compare surveys step by step and each with the first."""
+    from tidefield.change.series import entries_of, in_order, write_series
+
+    paths = (options.earlier, options.later, *options.series)
+    dates = _dates(options, len(paths))
+    names: list[str] = [""] * len(paths)
+    entries, stated = [], list(dates)
+    with completed_folder(options.out) as folder:
+        for end in range(1, len(paths)):
+            for start in sorted({0, end - 1}):
+                own = work / f"{start}_{end}"
+                own.mkdir()
+                found = _measured(options, paths[start], paths[end], (dates[start], dates[end]), own, console)
+                for k, surface in ((start, found.change.earlier), (end, found.change.later)):
+                    names[k], stated[k] = surface.name, surface.date
+                if not in_order(stated):
+                    raise RunError(
+                        f"{paths[end]} is of {stated[end]}, before a survey that was named earlier: expected the order "
+                        "of time; exchange them, or state their --dates"
+                    )
+                if start == 0:
+                    entries += entries_of(found.change, "first", start, end)
+                if start == end - 1:
+                    entries += entries_of(found.change, "step", start, end)
+                    (folder / f"step_{end}").mkdir()
+                    _write(found, options, folder / f"step_{end}", console)
+                    console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
+                    _say(found, console)
+        write_series(entries, _distinct(names), folder, _command())
+    console.print(str(options.out), soft_wrap=True)
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Names, numbered where two surveys have one."""
+    return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
+
+
+def _dates(options: Change, count: int) -> tuple[str | None, ...]:
+    if options.dates is None:
+        return (None,) * count
+    if len(options.dates) != count:
+        raise RunError(f"--dates has {len(options.dates)} dates: expected {count}, one for each survey; state them all")
+    return options.dates
+
+
+def _measured(
+    options: Change, one: Path, other: Path, dates: tuple[str | None, ...], work: Path, console: Console
+) -> Found:
+    """Compare two surveys."""
+    import numpy as np
+
+    from tidefield.change.cover import measure_cover
     from tidefield.change.inputs import open_pair
     from tidefield.change.measure import Options, measure
-    from tidefield.change.page import write_page
     from tidefield.change.regions import read_regions
-    from tidefield.change.write import write_all
+    from tidefield.change.water import measure_water
     from tidefield.progress import ProgressBar
 
-    dates = options.dates or (None, None)
-    pair = open_pair(options.earlier, options.later, work, dates, options.cell, options.m3c2)
+    pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2)
     earlier, later = pair.earlier, pair.later
     if options.orthophotos is not None:
         earlier, later = (
@@ -96,8 +188,8 @@ def _compare(options: Change, console: Console, work: Path) -> None:
         )
     if earlier.date and later.date and earlier.date > later.date:
         raise RunError(
-            f"{options.earlier} is of {earlier.date}, {options.later} of {later.date}: expected the earlier survey "
-            "first; exchange them, or state their --dates"
+            f"{one} is of {earlier.date}, {other} of {later.date}: expected the earlier survey first; exchange them, "
+            "or state their --dates"
         )
     asked = Options(options.cell, options.register, options.shift, options.datum_error, options.windows)
     reads = [
@@ -106,19 +198,44 @@ def _compare(options: Change, console: Console, work: Path) -> None:
     ]
     with ProgressBar(console, "Reading surfaces") as bar:
         found = measure(earlier, later, asked, stable=reads[0], within=reads[1], regions=reads[2], tick=bar)
+    water = measure_water(found, options.water, options.levels) if options.water or options.levels else None
+    cover = None
+    if earlier.orthophoto is not None and later.orthophoto is not None:
+        regions = [region for region, *_ in found.per_region]
+        shift, known = found.errors.registration.shift_m, np.isfinite(found.dz)
+        if water is not None and water.waterline is not None:
+            known &= ~water.waterline.wet
+        cover = measure_cover(earlier.orthophoto, later.orthophoto, found.grid, shift, regions, known)
     for remark in found.remarks:
         log.warning(remark)
-    with completed_folder(options.out) as folder:
-        numbers = write_all(found, folder, _command())
-        write_page(found, numbers, folder / "change.html")
-        if pair.clouds is not None:
-            registration = found.errors.registration
-            with ProgressBar(console, "Measuring M3C2 distances") as bar:
-                distances = compare_clouds(
-                    *pair.clouds, found.grid.cell_m, registration.systematic_m, registration.vertical_m, bar
-                )
-            write_distances(distances, pair.clouds[0].crs, folder / "m3c2.laz")
-    for name, volume in (("net", found.net), ("cut", found.cut), ("fill", found.fill)):
+    return Found(pair, found, cover, water)
+
+
+def _write(found: Found, options: Change, folder: Path, console: Console) -> None:
+    """Write the files of one comparison."""
+    from tidefield.change.clouds import compare_clouds, write_distances
+    from tidefield.change.page import write_page
+    from tidefield.change.write import write_all
+    from tidefield.progress import ProgressBar
+
+    change, cover, water, clouds = found.change, found.cover, found.water, found.pair.clouds
+    numbers = write_all(change, folder, _command(), cover, water)
+    views = [] if options.scenes is None else _views(options, change, cover, folder, console)
+    write_page(change, numbers, folder / "change.html", cover, water, views)
+    if clouds is not None:
+        registration = change.errors.registration
+        with ProgressBar(console, "Measuring M3C2 distances") as bar:
+            distances = compare_clouds(
+                *clouds, change.grid.cell_m, registration.systematic_m, registration.vertical_m, bar
+            )
+        write_distances(distances, clouds[0].crs, folder / "m3c2.laz")
+
+
+def _say(found: Found, console: Console) -> None:
+    from tidefield.change.page import cover_words, water_words
+
+    change = found.change
+    for name, volume in (("net", change.net), ("cut", change.cut), ("fill", change.fill)):
         low, high = volume.interval_m3
         console.print(
             f"{name}: {volume.value_m3:+,.1f} m3 (95%: {low:+,.1f} to {high:+,.1f}) on {volume.area_m2:,.0f} m2; "
@@ -127,11 +244,44 @@ def _compare(options: Change, console: Console, work: Path) -> None:
             soft_wrap=True,
         )
     console.print(
-        f"a cell is significant beyond {found.detection_m[1]:.3f} m; {100 * found.false_alarms:.1f}% of stable cells "
+        f"a cell is significant beyond {change.detection_m[1]:.3f} m; {100 * change.false_alarms:.1f}% of stable cells "
         "are (5% expected)",
         soft_wrap=True,
     )
-    console.print(str(options.out), soft_wrap=True)
+    for line in [*cover_words(found.cover), *water_words(found.water)]:
+        console.print(line, soft_wrap=True)
+
+
+def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, console: Console) -> list[View]:
+    """Render both surveys from the cameras that were asked for, and write the pictures."""
+    from tidefield.change.pictures import write_views
+    from tidefield.change.views import Site, choose_camera, make_view
+    from tidefield.device import choose_device
+    from tidefield.progress import ProgressBar
+    from tidefield.train.checkpoint import RUN_FILE
+
+    assert options.scenes is not None
+    device, made = choose_device(options.device), []
+    with ExitStack() as stack:
+        sites = []
+        for path in options.scenes:
+            if (path / RUN_FILE).exists():
+                opened = open_trained(path, device, False, console, hold_out=False)
+                scene, render, _ = stack.enter_context(opened)
+            else:
+                scene = load(path, None, False, console, hold_out=False)
+                render, _ = open_zero_shot(ZeroShot(zero_shot=True), scene, device)
+            sites.append(Site.of(scene, render))
+        names = options.cameras or (choose_camera(found, sites[0]),)
+        with ProgressBar(console, "Rendering views") as bar:
+            for k, name in enumerate(names):
+                view = make_view(found, cover, sites[0], sites[1], name, options.view_width)
+                own = folder / "views" / Path(view.name).with_suffix("").as_posix().replace("/", "_")
+                own.mkdir(parents=True)
+                write_views(view, (found.earlier.name, found.later.name), own)
+                made.append(view)
+                bar(k + 1, len(names))
+    return made
 
 
 def _command() -> str:
@@ -147,6 +297,19 @@ def _check(options: Change) -> None:
     if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
         given = " ".join(map(str, options.windows))
         raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
+    if options.cameras and options.scenes is None:
+        raise RunError("--cameras was given without --scenes: expected the scenes of both surveys; name them")
+    given = {"--water": options.water, "--scenes": options.scenes, "--orthophotos": options.orthophotos}
+    for name, value in given.items():
+        if options.series and value is not None:
+            raise RunError(f"{name} was given with --series: it belongs to two surveys; leave it out")
+    if len(set(options.cameras)) < len(options.cameras):
+        raise RunError("--cameras names a photograph twice: expected each once; leave one out")
+    if not 64 <= options.view_width <= 8192:
+        raise RunError(f"--view-width {options.view_width} was asked for: expected 64 to 8192 pixels; choose another")
+    for level in (*(options.water or ()), *options.levels):
+        if not -12_000 < level < 9_000:
+            raise RunError(f"a level of {level} m was asked for: expected a height on the Earth; choose another")
     for date in options.dates or ():
         if len(date) != 10 or date[4] != "-" or date[7] != "-" or not date.replace("-", "").isdigit():
             raise RunError(f"--dates {date} was given: expected YYYY-MM-DD; write it so")

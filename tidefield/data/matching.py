@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import torch
 from jaxtyping import Float, Int
@@ -49,6 +49,9 @@ SMOOTH_PX = 3
 """Side of the window of the smoothing."""
 LEAST_COST = 0.02
 """Cost that perfect agreement counts as in the smoothing."""
+DILATIONS, EDGE = (1, 2), 0.3
+"""Of the last smoothing: the spacings of its passes in pixels, and the difference of depth, in steps, at which the
+weight of a pixel is a quarter."""
 HALF_PX, SPREADS, SPREAD_PX = 1.0, 4.0, 9
 """Half of the interval that is left to search: pixels of parallax, and standard deviations of the matched depths in a
 window of this side."""
@@ -115,7 +118,7 @@ class Matcher:
         Args:
             reach: how far around the start the first level searches, where that is more than usual.
         """
-        step, found = 0.0, start
+        step, found, known = 0.0, start, torch.ones_like(start)
         coarsest = _smaller(camera, LEVELS - 1)
         weight, views = self._views(coarsest, _resized(start, coarsest))
         if not len(views):
@@ -123,7 +126,9 @@ class Matcher:
         for level in reversed(range(LEVELS)):
             small, first = _smaller(camera, level), level == LEVELS - 1
             own = FIRST_STEPS if first else STEPS
-            found, step = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
+            found, known, step = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
+        for dilation in DILATIONS if step else ():
+            found = _smoothed_up_to_edges(found, known, EDGE * step, dilation)
         spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
         return found, HALF_PX * step + SPREADS * spread if step else torch.zeros_like(found)
 
@@ -159,8 +164,9 @@ class Matcher:
         views: Int[Tensor, " V"],
         steps: int,
         reach: float,
-    ) -> tuple[Float[Tensor, "H W"], float]:
-        """One level: the best of 2 `steps` + 1 depths of every pixel, and the step between them.
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"], float]:
+        """One level: the best of 2 `steps` + 1 depths of every pixel, how well it is determined, and the step between
+        them.
 
         Args:
             start: inverse depths to try others around.
@@ -170,7 +176,7 @@ class Matcher:
         looks = self._looks(camera, start, weight, views)
         parallax = sum(float((look.parallax_px * look.weight).sum()) for look in looks)
         if parallax <= 0:
-            return start, 0.0
+            return start, torch.ones_like(start), 0.0
         step = sum(float(look.weight.sum()) for look in looks) / parallax
         steps = max(steps, min(MOST_STEPS, math.ceil(reach / step)))
         total = torch.zeros_like(start)
@@ -193,7 +199,7 @@ class Matcher:
         curvature = (before - 2 * lowest + after).clamp(min=1e-6)
         offset = best[0] - steps + ((before - after) / (2 * curvature)).clamp(-1, 1)
         known = curvature / (lowest + LEAST_COST) + 1e-4
-        return _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX), step
+        return _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX), known, step
 
     def _looks(
         self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V a b"], views: Int[Tensor, " V"]
@@ -298,6 +304,28 @@ def _box(values: Tensor, side: int) -> Tensor:
         padding = (window[0] // 2, window[1] // 2)
         values = F.avg_pool2d(values, window, 1, padding, count_include_pad=False)
     return values.reshape(shape)
+
+
+def _smoothed_up_to_edges(
+    found: Float[Tensor, "H W"], known: Float[Tensor, "H W"], edge: float, dilation: int
+) -> Float[Tensor, "H W"]:
+    """Average inverse depths over 5 x 5 pixels `dilation` apart, those that differ by `edge` and more hardly: one pass
+    of an edge-avoiding à-trous filter (Dammertz et al., 2010).
+
+    Args:
+        known: how well each is determined, which is its weight.
+    """
+    height, width = found.shape
+    padded = F.pad(torch.stack([found, known])[None], (2 * dilation,) * 4, mode="replicate")[0]
+    kernel = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
+    total, weights = torch.zeros_like(found), torch.zeros_like(found)
+    for row, column in product(range(5), repeat=2):
+        top, left = row * dilation, column * dilation
+        other, weight = padded[:, top : top + height, left : left + width]
+        weight = kernel[row] * kernel[column] * weight / (1 + ((other - found) / edge).square()).square()
+        total += weight * other
+        weights += weight
+    return total / weights
 
 
 def _windowed(cost: Float[Tensor, "K H W"]) -> Float[Tensor, "K H W"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,15 +9,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import shapely
 from jaxtyping import Float
-from pyproj import CRS, Transformer
 from shapely.geometry import LineString
 
-from tidefield.files import completed_file, write_text
-from tidefield.geometry.geodesy import WGS84
+from tidefield.files import write_text
 from tidefield.maps.grid import Grid, MapFrame
 from tidefield.maps.rasters import need
+from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
 ABOUT = 20
 """Contours that a map has about, if no interval is given."""
@@ -74,8 +71,17 @@ def contours(
     return found
 
 
-def read_reduced(path: Path, grid: Grid) -> tuple[Float[np.ndarray, "h w"], Grid]:
-    """Read a raster in at most `MOST_CELLS` cells, each the mean of those that are known; NaN where none is."""
+def read_reduced(
+    path: Path, grid: Grid, band: int = 1, resampling: str = "average"
+) -> tuple[Float[np.ndarray, "h w"], Grid]:
+    """Read a raster in at most `MOST_CELLS` cells, each the mean of those that are known; NaN where none is.
+
+    Args:
+        path: of the raster.
+        grid: its cells.
+        band: number of the band.
+        resampling: rasterio's name of what a cell is of those that are known, "average" or "mode".
+    """
     from rasterio.enums import Resampling
 
     factor = max(1, math.ceil(math.sqrt(grid.rows * grid.columns / MOST_CELLS)))
@@ -85,45 +91,18 @@ def read_reduced(path: Path, grid: Grid) -> tuple[Float[np.ndarray, "h w"], Grid
     # Overviews would not lie on these cells where the raster's size is odd.
     with need("rasterio").open(path, OVERVIEW_LEVEL="NONE") as dataset:
         shape = (coarse.rows, coarse.columns)
-        values = dataset.read(1, window=window, out_shape=shape, resampling=Resampling.average, masked=True)
+        values = dataset.read(band, window=window, out_shape=shape, resampling=Resampling[resampling], masked=True)
     return values.astype(np.float32).filled(np.nan), coarse
 
 
 def write_contours(lines: Sequence[tuple[float, LineString]], frame: MapFrame, folder: Path) -> list[Path]:
     """Write contours.gpkg, contours.geojson (WGS 84; a local frame as it is) and contours.dxf into a folder."""
     paths = [folder / f"contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")]
-    with completed_file(paths[0], overwrite=True) as partial:
-        partial.unlink()  # GDAL makes its own
-        need("pyogrio").raw.write(
-            partial,
-            geometry=np.array([shapely.to_wkb(line) for _, line in lines], dtype=object),
-            field_data=[np.array([height for height, _ in lines], dtype=np.float64)],
-            fields=["height"],
-            geometry_type="LineString",
-            crs=frame.horizontal_wkt,
-            driver="GPKG",
-            layer=LAYER,
-        )
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"height": height},
-            "geometry": {"type": "LineString", "coordinates": np.round(_for_geojson(line, frame), 9).tolist()},
-        }
-        for height, line in lines
-    ]
-    write_text(paths[1], json.dumps({"type": "FeatureCollection", "features": features}) + "\n")
+    layer = Layer(LAYER, "LineString", [line for _, line in lines], {"height": [height for height, _ in lines]})
+    write_geopackage(paths[0], [layer], frame)
+    write_geojson(paths[1], layer, frame)
     write_text(paths[2], dxf(lines))
     return paths
-
-
-def _for_geojson(line: LineString, frame: MapFrame) -> np.ndarray:
-    xy = np.asarray(line.coords)
-    if frame.frame is None:
-        return xy
-    return np.column_stack(
-        Transformer.from_crs(CRS.from_wkt(frame.horizontal_wkt), WGS84, always_xy=True).transform(*xy.T)
-    )
 
 
 def dxf(lines: Sequence[tuple[float, LineString]]) -> str:

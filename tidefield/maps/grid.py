@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float64
 from pyproj import CRS
 from pyproj.crs import CompoundCRS
@@ -32,6 +33,10 @@ UNKNOWN_HEIGHTS = "unknown"
 FINEST = 0.9
 """Finest cells, as a share of the photographs' ground sampling distance: finer ones would show no more."""
 MOST_CELLS = 4_000_000_000
+STEEPEST_DEG = 55.0
+"""Largest angle from the vertical at which a photograph sees a cell."""
+SAMPLES = 128
+"""Places along a side, at which level ground is tested for photographs that see it."""
 UPRIGHT_DEG = 45.0
 """A local frame is upright if photographs look down its third axis, on average, to this angle."""
 
@@ -270,18 +275,35 @@ def _rounded_up(value: float) -> float:
 
 
 def _seen_bounds(frame: MapFrame, scene: Scene) -> tuple[float, float, float, float, float]:
-    """West, south, east and north of the sparse points that at least two photographs see, and their median height.
+    """West, south, east and north of what at least two photographs see, and the points' median height.
 
-    A hundredth of the points may lie outside on each side: they are outliers, or seen against the horizon. The
-    photographs' rims beyond the points are covered by a margin.
+    That is of the sparse points and, because water has none, of level ground at their median height. A hundredth of the
+    points may lie outside on each side: they are outliers, or seen against the horizon. The photographs' rims beyond
+    the points are covered by a margin.
     """
     assert scene.points is not None
     xyz = frame.to_map(scene.points.xyz_world.double().numpy())
     low, high = np.percentile(xyz[:, :2], [0.5, 99.5], axis=0)
     margin = 0.02 * (high - low) + 1e-9
-    west, south = low - margin
-    east, north = high + margin
-    return float(west), float(south), float(east), float(north), float(np.median(xyz[:, 2]))
+    low, high = low - margin, high + margin
+    height = float(np.median(xyz[:, 2]))
+    position = frame.to_map(scene.cameras.position_world.double().numpy())
+    above = float(np.median(position[:, 2])) - height
+    reach = max(above, 0.0) * math.tan(math.radians(STEEPEST_DEG))
+    corners = np.stack([position[:, :2].min(0) - reach, position[:, :2].max(0) + reach])
+    east, north = (corners[0, k] + (np.arange(SAMPLES) + 0.5) / SAMPLES * np.ptp(corners[:, k]) for k in (0, 1))
+    places = np.stack([*np.meshgrid(east, north), np.full((SAMPLES, SAMPLES), height)], -1).reshape(-1, 3)
+    ground = torch.from_numpy(frame.to_scene(places)).float()
+    count = np.zeros(len(places), int)
+    for index in range(len(scene.names)):
+        camera = scene.cameras[index]
+        uv, z = camera.project(ground)
+        inside = ((z[0] > 0) & (uv[0] > 0).all(-1) & (uv[0] < camera.size_px[0]).all(-1)).numpy()
+        count += inside & (np.linalg.norm(places[:, :2] - position[index, :2], axis=1) <= reach)
+    seen = places[count >= 2, :2]
+    if len(seen):
+        low, high = np.minimum(low, seen.min(0)), np.maximum(high, seen.max(0))
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1]), height
 
 
 @dataclass(frozen=True)

@@ -25,15 +25,16 @@ from tidefield.files import completed_file, delete_partials, read_json, write_js
 from tidefield.machine import cores
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
-from tidefield.maps.cloud import UNCLASSIFIED, cloud_writer
+from tidefield.maps.cloud import GROUND, VEGETATION, WATER, cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
+from tidefield.maps.masks import Body, read_water, write_classes, write_masks
 from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
-from tidefield.maps.terrain import write_hillshade, write_terrain
+from tidefield.maps.terrain import blocks, write_hillshade, write_terrain
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
 
@@ -47,7 +48,8 @@ MAIN = "odm_orthophoto/photograph.tif"
 DSM, SIGMA, FILLED = "odm_dem/dsm.tif", "odm_dem/dsm_sigma.tif", "odm_dem/filled.tif"
 DTM = "odm_dem/dtm.tif"
 DSM_HILLSHADE, DTM_HILLSHADE = "odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif"
-CONTOURS, SECTIONS = "contours", "sections"
+CLASSES, AGREEMENT = "odm_dem/classes.tif", "odm_dem/agreement.tif"
+CONTOURS, SECTIONS, MASKS = "contours", "sections", "masks"
 """Folders."""
 CLOUD = "odm_georeferencing/odm_georeferenced_model.laz"
 MARGIN = 16
@@ -55,7 +57,7 @@ MARGIN = 16
 LARGEST_TILE, SMALLEST_TILE = 480, 96
 FEWEST_VIEWS = 2
 """Photographs that must see a cell: what one alone shows has no height."""
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -244,6 +246,7 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
         ),
         "dsm": Raster(out / DSM, ("height of the surface",), unit=unit),
         "sigma": Raster(out / SIGMA, ("standard error of the height",), unit=unit),
+        "agreement": Raster(out / AGREEMENT, ("mean correlation of the photographs, per cent",), "uint8", 255.0),
     }  # fmt: skip
     if job.fill:
         rasters["filled"] = Raster(out / FILLED, ("1 where the map is filled",), "uint8", 255.0, average=False)
@@ -252,7 +255,6 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
         writers: dict[str, RasterWriter] = {
             name: stack.enter_context(raster_writer(raster, grid)) for name, raster in rasters.items()
         }
-        cloud = stack.enter_context(cloud_writer(out / CLOUD, grid))
         for strip in strips(job, out):
             bytes_ = np.round(np.nan_to_num(strip.colour).clip(0, 1) * 255).astype(np.uint8)
             alpha = (strip.shown * np.uint8(255))[None]
@@ -262,26 +264,22 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
                 "main": strip.main[None],
                 "dsm": np.where(strip.shown, strip.height, NODATA)[None],
                 "sigma": np.where(strip.shown, strip.sigma, NODATA)[None],
+                "agreement": np.where(strip.shown, np.round(100 * np.nan_to_num(strip.score).clip(0, 1)), 255)[None],
                 "filled": np.where(strip.shown, ~strip.seen, 255)[None],
             }
             for name, writer in writers.items():
                 writer.write(strip.row, bands[name])
-            height = np.where(strip.seen, strip.height, np.nan)
-            classes = np.full(height.shape, UNCLASSIFIED)
-            cloud.write(strip.row, height, strip.sigma, bytes_, strip.count, classes)
             totals["cells"] += int(strip.shown.sum())
             totals["seen"] += int(strip.seen.sum())
             some = strip.sigma[strip.seen][::97]
             totals["sigma"].append(some)
             totals["views"].append(strip.count[strip.seen][::97])
-            progress(strip.row + height.shape[0], grid.rows)
-        points = cloud.count
+            progress(strip.row + strip.height.shape[0], grid.rows)
     sigma, views = (np.concatenate(totals[name]) for name in ("sigma", "views"))
     return {
         "cells": totals["cells"],
         "cells_seen": totals["seen"],
         "area": totals["seen"] * grid.cell**2,
-        "points": points,
         "sigma_median": float(np.median(sigma)) if len(sigma) else None,
         "sigma_95": float(np.percentile(sigma, 95)) if len(sigma) else None,
         "views_median": float(np.median(views)) if len(views) else None,
@@ -289,22 +287,61 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
 
 
 def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Write what follows from the surface: terrain, hillshades, contours and sections; returns figures of them."""
+    """Write what follows from surface and orthophoto: terrain, hillshades, classes, points, contours and sections.
+
+    Returns:
+        Figures of them.
+    """
     grid, unit = job.grid, job.grid.frame.unit
     write_terrain(out / DSM, out / SIGMA, Raster(out / DTM, ("height of the ground",), unit=unit), grid)
-    progress(1, 4)
+    progress(1, 6)
     for heights, shaded in ((DSM, DSM_HILLSHADE), (DTM, DTM_HILLSHADE)):
         write_hillshade(out / heights, Raster(out / shaded, ("hillshade",), "uint8", 0.0), grid)
-    progress(2, 4)
+    progress(2, 6)
+    water = read_water(out / DSM, out / AGREEMENT, out / ORTHOPHOTO, grid)
+    classes = Raster(
+        out / CLASSES, ("class",), "uint8", 0.0, tags={"VALUES": "2 ground, 3 vegetation, 9 water"}, average=False
+    )
+    write_classes(classes, out / DSM, out / ORTHOPHOTO, water, grid)
+    write_masks(out / CLASSES, water, grid, out / MASKS)
+    progress(3, 6)
+    points, found = write_cloud(out, grid)
+    progress(4, 6)
     height, coarse = read_reduced(out / DTM, grid)
     interval = job.interval or interval_of(height)
     lines = contours(height, coarse, interval)
     write_contours(lines, grid.frame, out / CONTOURS)
-    progress(3, 4)
+    progress(5, 6)
     if job.sections:
         write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, unit)
-    progress(4, 4)
-    return {"contours": {"interval": interval, "lines": len(lines)}, "sections": len(job.sections)}
+    progress(6, 6)
+    return {
+        "points": points,
+        "classes": found,
+        "water": [_described(body) for body in water[1]],
+        "contours": {"interval": interval, "lines": len(lines)},
+        "sections": len(job.sections),
+    }
+
+
+def _described(body: Body) -> dict[str, float]:
+    return {"height": body.level, "sigma": body.sigma, "area": body.area}
+
+
+def write_cloud(out: Path, grid: Grid) -> tuple[int, dict[str, float]]:
+    """Write a point of each cell that two photographs see; returns their number, and the share of each class."""
+    bands = [(ORTHOPHOTO, 1), (ORTHOPHOTO, 2), (ORTHOPHOTO, 3), (DSM, 1), (SIGMA, 1), (VIEWS, 1), (CLASSES, 1)]
+    number = {GROUND: 0, VEGETATION: 0, WATER: 0}
+    with cloud_writer(out / CLOUD, grid) as cloud:
+        for rows in zip(*(blocks(out / name, 0, band) for name, band in bands), strict=True):
+            red, green, blue, height, sigma, views, classes = (np.nan_to_num(part[2], nan=-1) for part in rows)
+            seen = (views >= FEWEST_VIEWS) & (classes > 0)
+            colour = np.stack([red, green, blue]).clip(0).astype(np.uint8)
+            cloud.write(rows[0][0], np.where(seen, height, np.nan), sigma, colour, views.clip(0), classes.clip(0))
+            for value in number:
+                number[value] += int((seen & (classes == value)).sum())
+    names = {"ground": GROUND, "vegetation": VEGETATION, "water": WATER}
+    return cloud.count, {name: number[value] / max(cloud.count, 1) for name, value in names.items()}
 
 
 def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
@@ -347,7 +384,7 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
         },
         **found,
     }  # fmt: skip
-    shown = {"orthophoto": ORTHOPHOTO, "hillshade": DSM_HILLSHADE, "sigma": SIGMA, "views": VIEWS}
+    shown = {"orthophoto": ORTHOPHOTO, "hillshade": DSM_HILLSHADE, "sigma": SIGMA, "views": VIEWS, "classes": CLASSES}
     write_report(result, out, shown, job.fill)
     write_json(out / MAP_FILE, result)
     return result

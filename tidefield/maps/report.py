@@ -16,6 +16,7 @@ from PIL import Image
 
 from tidefield import __version__
 from tidefield.files import write_text
+from tidefield.maps.cloud import GROUND, VEGETATION, WATER
 from tidefield.maps.rasters import need
 
 WIDEST = 900
@@ -28,7 +29,7 @@ def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fil
     Args:
         result: what map.json holds.
         out: folder of the map.
-        rasters: paths in it of the orthophoto, hillshade, sigma and views.
+        rasters: paths in it of the orthophoto, hillshade, sigma, views and classes.
         fill: whether empty cells were filled.
     """
     sigma, views = _read(out / rasters["sigma"])[0], _read(out / rasters["views"])[0]
@@ -42,6 +43,7 @@ def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fil
             _uri(_coloured(views, float(np.nanmax(views, initial=1.0)), "viridis")),
             f"How many see each cell: dark few, pale {np.nanmax(views, initial=1.0):.0f}.",
         ),
+        ("Classes", _uri(_classes(_read(out / rasters["classes"])[0])), "Ground brown, vegetation green, water blue."),
     ]
     environment = Environment(
         loader=PackageLoader("tidefield.maps", "templates"),
@@ -76,6 +78,13 @@ def _coloured(values: np.ndarray, most: float, name: str) -> UInt8[np.ndarray, "
     colours = np.asarray(colormaps[name](np.nan_to_num(np.clip(values / max(most, 1e-9), 0, 1)), bytes=True))
     colours = colours.copy()
     colours[..., 3] = np.where(np.isfinite(values), 255, 0)
+    return colours
+
+
+def _classes(values: np.ndarray) -> UInt8[np.ndarray, "h w 4"]:
+    colours = np.zeros((*values.shape, 4), np.uint8)
+    for value, colour in ((GROUND, "#a07855"), (VEGETATION, "#3f9b4f"), (WATER, "#2f6fc4")):
+        colours[values == value] = [*bytes.fromhex(colour[1:]), 255]
     return colours
 
 

@@ -1,11 +1,12 @@
 """Measure the height of every cell of a map by matching the photographs that see it, and its standard error.
 
-Heights are searched from coarse cells to fine ones, from the surface of the sparse points. At every height that is
-tried the photographs are projected onto the surface at that height, and each is compared with the mean of the others by
-windowed normalised cross-correlation, and on fine cells with their median by colour. Where the photographs agree best
-is the surface (the vertical line locus of photogrammetry; Collins, A space-sweep approach to true multi-image matching,
+Pairs of photographs are matched semi-globally first (`stereo`), which keeps the rims of plants. Then heights around
+that surface are tried: the photographs are projected onto the surface at each height, and each is compared with the
+mean of the others by windowed normalised cross-correlation, and with their median by colour. Where they agree best is
+the surface (the vertical line locus of photogrammetry; Collins, A space-sweep approach to true multi-image matching,
 1996, with windows that follow the surface found so far). A parabola through the best score and its neighbours places it
-between the heights that were tried.
+between the heights that were tried. Where that is not determined, as on blank and mirroring water, the surface of the
+pairs stays.
 
 The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
 score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
@@ -31,41 +32,41 @@ from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER
 from tidefield.data.scene import Scene
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
-from tidefield.maps.grid import Grid, Tile
+from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
+from tidefield.maps.stereo import choose_pairs, fill_from_nearest, stereo_heights
 
 COARSEST = 8
-"""Cells, along a side, of the coarsest cells."""
-PAD = 64
-"""Cells around a tile in which coarser surfaces are searched: windows of coarse cells reach beyond the tile."""
+"""Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
+PAD = 32
+"""Cells around a tile that are matched with it: windows and the paths of semi-global matching reach beyond the tile."""
 VIEWS = 8
 """Photographs that are compared with each other; more add little and take as long each."""
-STEEPEST_DEG = 55.0
-"""Largest angle from the vertical at which a photograph sees a cell."""
 BORDER_PX = 4.0
 """Pixels along a photograph's border that are not used."""
 STEP_PX = 0.7
 """Parallax between heights that are tried, of the photographs farthest apart, in cells."""
-HALF_STEPS = {8: (24, 7), 4: (5,), 2: (6,), 1: (7, 3)}
-"""Heights that are tried above and below the surface found so far, in each sweep, by the size of the cells; the second
-sweep has half the step. The first one finds trees without any sparse point."""
-EDGE_CELLS, EDGE_STEPS, EDGE_HALF = 6, 4.0, 3
-"""Where the surface within so many cells differs by more than so many steps, the heights on both sides of the edge are
-tried, too, with so many steps above and below: coarse windows widen plants."""
-SIGMA_CELLS = {8: 1.5, 4: 1.6, 2: 1.4, 1: 1.4}
+SWEEPS = ((1.0, 3), (0.5, 3))
+"""Share of the step, and heights that are tried above and below the surface found so far, in each sweep."""
+ABOVE, BELOW = 0.15, 0.05
+"""How far above and below the sparse points the surface is searched, as a share of the flight's height: that is how
+tall a tree without any point may be."""
+SIGMA_CELLS = 1.4
 """Standard deviation of the windows in which photographs are normalised, in cells."""
 SHARP, WIDE = 1.0, 2.5
-"""Standard deviations of the two windows, in cells, over whose mean fine scores are summed: one peak keeps the edges of
+"""Standard deviations of the two windows, in cells, over whose mean scores are summed: one peak keeps the edges of
 plants, the other bridges bare ground."""
-FINE = 2
-"""Largest cells, in the map's, that differences of colours are compared on, too."""
+UNDETERMINED, BRIDGED_CELLS = 0.8, 3.0
+"""Standard error of a sweep's height, in its steps, at which half of it counts; the rest is a weighted mean over
+windows of so many cells."""
 DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 """Grey values of 255 beyond which a photograph's difference from the median of all is an occlusion, and the weight of
 the mean difference, as a share of that, against the correlation."""
-SHARE_MATCHING, SHARES_ROUGHNESS = 0.1, ((1.6, 3.0), (0.5, 6.0), (0.2, 12.0))
-"""Shares of the standard error: of that of single cells' matching, which the windows and the filter reduce, and of the
-roughness within windows of so many cells, found on three built-in flats with trees and marsh."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
 """Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
+SHARE_MATCHING, SHARE_ROUGHNESS, ROUGHNESS_CELLS = 0.2, 1.35, 6.0
+"""Shares of the standard error: of that of single cells' matching, and of the roughness within windows of so many
+cells. Found on three built-in flats of other seeds than those of `python -m benchmarks maps`, at two sizes: windows
+narrower than that, or of a fixed size on the ground, state too small errors at one of them."""
 FLOOR = 3.0
 """Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
 PULL = 0.02
@@ -135,27 +136,19 @@ class Start:
     Attributes:
         grid: of coarse cells.
         height: of the points, interpolated linearly.
-        reach: how far the points around differ in height.
-        gap: distance to the nearest point, horizontal units.
     """
 
     grid: Grid
     height: Height
-    reach: Height
-    gap: Height
 
-    def on(self, tile: Tile, pad: int, step: int) -> tuple[Height, Height]:
-        """Height and reach at the centres of a tile's cells, which are `step` times as large."""
-        east, north = tile.offsets(pad, step)
+    def on(self, tile: Tile, pad: int) -> Height:
+        """Height at the centres of a tile's cells and of `pad` cells around it."""
+        east, north = tile.offsets(pad)
         middle = tile.centre
         u = (middle[0] + east.astype(np.float64) - self.grid.west) / self.grid.cell - 0.5
         v = (self.grid.north - middle[1] - north.astype(np.float64)) / self.grid.cell - 0.5
         u, v = np.broadcast_arrays(u.astype(np.float32), v.astype(np.float32))
-        height, reach = (
-            cv2.remap(part, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for part in (self.height, self.reach)
-        )
-        return height, reach
+        return cv2.remap(self.height, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:
@@ -171,21 +164,15 @@ def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:
     inside = ((uv > -50) & (uv < [grid.columns + 50, grid.rows + 50])).all(1)
     if inside.sum() >= 3:
         uv, xyz = uv[inside], xyz[inside]
-    tree = KDTree(uv)
     low = np.minimum(uv.min(0), 0) - 1.0
     high = np.maximum(uv.max(0), [grid.columns, grid.rows]) + 1.0
     along = np.linspace(0, 1, 9)
     frame = np.array([(a, b) for a in along for b in along if a in (0, 1) or b in (0, 1)]) * (high - low) + low
-    count = min(around, len(uv))
-    near = np.asarray(tree.query(frame, k=count)[1]).reshape(len(frame), -1)
+    near = np.asarray(KDTree(uv).query(frame, k=min(around, len(uv)))[1]).reshape(len(frame), -1)
     heights = np.concatenate([xyz[:, 2], np.median(xyz[near, 2], axis=1)])
     # Rounded positions may coincide, which Delaunay's triangles leave out.
     height = interpolate_on_pixels(np.concatenate([uv, frame]), heights - grid.height, grid.columns, grid.rows)
-    cells = np.stack(np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5), -1).reshape(-1, 2)
-    distance, near = (np.asarray(x).reshape(len(cells), -1) for x in tree.query(cells, k=count))
-    reach = np.ptp(xyz[near, 2], axis=1).reshape(grid.rows, grid.columns)
-    gap = distance[:, 0].reshape(grid.rows, grid.columns) * grid.cell
-    return Start(grid, (height + grid.height).astype(np.float32), reach.astype(np.float32), gap.astype(np.float32))
+    return Start(grid, (height + grid.height).astype(np.float32))
 
 
 def _agree(xyz: Float[np.ndarray, "N 3"], neighbours: int = 16, spreads: float = 12.0) -> Bool[np.ndarray, " N"]:
@@ -269,20 +256,33 @@ class View:
         return np.exp(-angle / ANGLE_SCALE_RAD) * np.clip(inner / (BORDER * self.size[0]), 0, 1)
 
 
-def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> tuple[list[View], list[int], list[int]]:
+@dataclass(frozen=True)
+class Choice:
+    """The photographs of a tile.
+
+    Attributes:
+        views: projections of all that see some of it.
+        indices: their numbers in the scene.
+        chosen: of `views`, those to compare with each other.
+        pairs: of `views`, those to match semi-globally.
+    """
+
+    views: list[View]
+    indices: list[int]
+    chosen: list[int]
+    pairs: list[tuple[int, int]]
+
+
+def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> Choice:
     """Choose photographs to compare on a tile.
 
     Each time the photograph that adds most at a few places of the tile: where few photographs were chosen, not too far
     from the vertical, and from another direction than those chosen.
-
-    Returns:
-        The projections of all photographs that see some of the tile, their indices, and which of them were chosen.
     """
-    cells = np.linspace(0.5, tile.side - 0.5, 7).astype(np.float32) - tile.side / 2
-    east, north = np.meshgrid(cells * tile.grid.cell, -cells * tile.grid.cell)
-    rows, columns = start.on(tile, 0, 1)[0].shape
-    at = np.linspace(0, rows - 1, 7).round().astype(int)
-    height = start.on(tile, 0, 1)[0][np.ix_(at, np.linspace(0, columns - 1, 7).round().astype(int))] - tile.grid.height
+    at = np.linspace(0, tile.side - 1, 7).round().astype(int)
+    along = (at + 0.5).astype(np.float32) - tile.side / 2
+    east, north = np.meshgrid(along * tile.grid.cell, -along * tile.grid.cell)
+    height = start.on(tile, 0)[np.ix_(at, at)] - np.float32(tile.grid.height)
     views, indices, seen, direction = [], [], [], []
     for index in range(len(scene.names)):
         view = View(scene.cameras[index], tile)
@@ -295,7 +295,7 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
             to = view.position[:, None, None] - np.stack([east, north, height])
             direction.append(to / np.linalg.norm(to, axis=0))
     if not views:
-        return [], [], []
+        return Choice([], [], [], [])
     sees, to = np.stack(seen), np.stack(direction)
     angle = np.degrees(np.arccos(np.clip(to[:, 2], -1, 1)))
     quality = sees * np.exp(-((angle / 35.0) ** 2))
@@ -316,7 +316,9 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
         nearest = np.where(sees[best], np.minimum(nearest, apart), nearest)
         if len(chosen) == most and most < 2 * count and (covered[sees.sum(0) >= 4] < 4).any():
             most += 1
-    return views, indices, chosen
+    places = (len(views), -1)
+    pairs = choose_pairs(views, sees.reshape(places), angle.reshape(places), float(np.median(height)))
+    return Choice(views, indices, chosen, pairs)
 
 
 def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: float) -> Matched | None:
@@ -332,35 +334,30 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     Returns:
         None where no two photographs see any of the tile.
     """
-    views, indices, chosen = choose_views(tile, scene, start)
+    choice = choose_views(tile, scene, start)
+    views, indices = choice.views, choice.indices
     if len(views) < 2:
         return None
-    used = [(views[k], indices[k]) for k in chosen]
-    ratio = _parallax(views, chosen)
-    height = sigma = score = None
-    step = 0.0
-    for level in (8, 4, 2, 1):
-        cell = tile.grid.cell * level
-        east, north = tile.offsets(PAD, level)
-        if height is None:
-            height, reach = start.on(tile, PAD, level)
-            height = height - tile.grid.height
-            step = max(STEP_PX * cell / ratio, 0.6 * float(np.percentile(reach, 75)) / HALF_STEPS[level][0])
-        else:
-            size = (height.shape[1] * 2, height.shape[0] * 2)
-            height = cv2.resize(height, size, interpolation=cv2.INTER_LINEAR)
-            step = STEP_PX * cell / ratio
-        factor = max(1, round(level * tile.grid.cell / gsd))
-        for sweep, half in enumerate(HALF_STEPS[level]):
-            offsets = step / (1 + sweep) * np.arange(-half, half + 1, dtype=np.float32)
-            found = _sweep(used, grey, factor, east, north, height, offsets, level)
-            if level <= FINE and sweep == 0:
-                found = _with_both_sides(found, used, grey, factor, east, north, height, step, level)
-            height, sigma, score = _cleaned(*found[:3], height, level, step)
-    assert height is not None
-    assert sigma is not None
-    assert score is not None
-    sigma = standard_error(height, sigma)
+    factor = max(1, round(tile.grid.cell / gsd))
+    expected = start.on(tile, PAD) - np.float32(tile.grid.height)
+    above = float(np.median([view.position[2] for view in views]) - np.median(expected))
+    low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
+    height = stereo_heights(choice.pairs, views, indices, grey, factor, tile, PAD, low, high)
+    unmatched = np.isnan(height).all()
+    height = expected if unmatched else fill_from_nearest(height)
+    matching = score = np.zeros_like(height)
+    used = [(views[k], indices[k]) for k in choice.chosen]
+    east, north = tile.offsets(PAD)
+    step = STEP_PX * tile.grid.cell / _parallax(views, choice.chosen)
+    for share, half in SWEEPS:
+        offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
+        found, matching, score = _sweep(used, grey, factor, east, north, height, offsets)
+        height = _cleaned(found, matching, height, step * share)
+    matching = np.nan_to_num(matching, nan=10 * step).astype(np.float32)
+    score = np.nan_to_num(score).astype(np.float32)
+    sigma = standard_error(height, matching)
+    if unmatched:
+        sigma += np.float32((high - low) / 4)
     inner = slice(PAD, PAD + tile.side)
     height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
     east, north = tile.offsets()
@@ -377,17 +374,15 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
 
 
 def standard_error(height: Height, matching: Height) -> Height:
-    """Estimate the standard error of heights from that of their matching and from the roughness around them.
+    """Estimate the standard error of heights from that of the matching of single cells, and the roughness around them.
 
     Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. Its
     standard deviation there is that of the heights within a window. The shares are such that on built-in flats 95% of
     the cells lie within 1.96 standard errors (`python -m benchmarks maps`).
     """
-    parts = [SHARE_MATCHING * _blur(matching, 2.0)]
-    for share, cells in SHARES_ROUGHNESS:
-        mean = _blur(height, cells)
-        parts.append(share * np.sqrt(np.maximum(_blur((height - mean) ** 2, cells), 0)))
-    return np.sqrt(sum(part**2 for part in parts)).astype(np.float32)
+    mean = _blur(height, ROUGHNESS_CELLS)
+    roughness = np.sqrt(np.maximum(_blur((height - mean) ** 2, ROUGHNESS_CELLS), 0))
+    return np.hypot(SHARE_MATCHING * _blur(matching, 2.0), SHARE_ROUGHNESS * roughness).astype(np.float32)
 
 
 def _parallax(views: list[View], chosen: Sequence[int]) -> float:
@@ -405,9 +400,8 @@ def _sweep(
     north: np.ndarray,
     height: np.ndarray,
     offsets: np.ndarray,
-    level: int,
-) -> tuple[np.ndarray, ...]:
-    """Try heights; returns the best one, its standard error, correlation and score; NaN where less than two see it."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Try heights; returns the best one, its standard error and the correlation; NaN where less than two see it."""
     views = []
     for view, index in used:
         picture = grey.read(index, factor)
@@ -420,7 +414,6 @@ def _sweep(
     sees = np.stack([v[3] for v in views])
     number = sees.sum(0)
     gains = [view.gain for view, *_ in views]
-    sigma_cells = SIGMA_CELLS[level]
     each = np.empty((len(offsets), len(views), *height.shape), np.float32)
     joint = np.empty((len(offsets), *height.shape), np.float32)
     for k, offset in enumerate(offsets):
@@ -435,47 +428,19 @@ def _sweep(
                 picture, u * scale[0] - 0.5, v * scale[1] - 0.5, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
             ).astype(np.float32)
             raw.append(shown)
-            shown = shown - _blur(shown, sigma_cells)
-            shown /= np.sqrt(_blur(shown * shown, sigma_cells) + FLOOR**2)
+            shown = shown - _blur(shown, SIGMA_CELLS)
+            shown /= np.sqrt(_blur(shown * shown, SIGMA_CELLS) + FLOOR**2)
             normal.append(shown * mask)
         total = np.sum(normal, axis=0)
         score = np.zeros(height.shape, np.float32)
         for i, shown in enumerate(normal):
             own = shown * (total - shown) / np.maximum(number - sees[i], 1)
-            each[k, i] = _blur(own, sigma_cells)
+            each[k, i] = _blur(own, SIGMA_CELLS)
             score += own * sees[i]
         score /= np.maximum(number, 1)
-        if level <= FINE:
-            score -= DIFFERENCE_WEIGHT * _difference([r / g for r, g in zip(raw, gains, strict=True)], sees, number)
-            joint[k] = 0.5 * (_blur(score, SHARP) + _blur(score, WIDE))
-        else:
-            joint[k] = _blur(score, sigma_cells)
+        score -= DIFFERENCE_WEIGHT * _difference([r / g for r, g in zip(raw, gains, strict=True)], sees, number)
+        joint[k] = 0.5 * (_blur(score, SHARP) + _blur(score, WIDE))
     return _best(joint, each, sees, offsets, height)
-
-
-def _with_both_sides(
-    found: tuple[np.ndarray, ...],
-    used: list[tuple[View, int]],
-    grey: GreyPhotographs,
-    factor: int,
-    east: np.ndarray,
-    north: np.ndarray,
-    height: np.ndarray,
-    step: float,
-    level: int,
-) -> tuple[np.ndarray, ...]:
-    """Near edges, try the surface of either side in each cell; returns what scores best."""
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE_CELLS + 1,) * 2)
-    low, high = cv2.erode(height, disk), cv2.dilate(height, disk)
-    edge = high - low > EDGE_STEPS * step
-    if not edge.any():
-        return found
-    offsets = step * np.arange(-EDGE_HALF, EDGE_HALF + 1, dtype=np.float32)
-    for side in (low, high):
-        other = _sweep(used, grey, factor, east, north, _blur(side, 2.0), offsets, level)
-        better = edge & (other[3] > np.nan_to_num(found[3], nan=-np.inf))
-        found = tuple(np.where(better, a, b) for a, b in zip(other, found, strict=True))
-    return found
 
 
 def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
@@ -508,8 +473,8 @@ def _best(
     sees: Float32[np.ndarray, "V H W"],
     offsets: np.ndarray,
     height: np.ndarray,
-) -> tuple[np.ndarray, ...]:
-    """Find the height of the best score, its standard error, the mean correlation there, and the score."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the height of the best score, its standard error, and the mean correlation there."""
     number = sees.sum(0)
     step = float(offsets[1] - offsets[0])
     pulled = joint - PULL * (offsets / offsets[-1])[:, None, None] ** 2
@@ -529,24 +494,22 @@ def _best(
     blank = 0.3 * np.sqrt(np.maximum(1 - correlation, 0.02) / (curvature * np.maximum(number, 1)))
     valid = number >= 2
     found = height + offsets[best] + shift * step
-    parts = (found, np.hypot(error, blank) * step, correlation, mid)
-    return tuple(np.where(valid, part, np.nan).astype(np.float32) for part in parts)
+    parts = (found, np.hypot(error, blank) * step, correlation)
+    found, error, correlation = (np.where(valid, part, np.nan).astype(np.float32) for part in parts)
+    return found, error, correlation
 
 
-def _cleaned(
-    found: np.ndarray, sigma: np.ndarray, score: np.ndarray, before: np.ndarray, level: int, step: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fill cells without a match from their surroundings and the surface before, and remove single outliers."""
-    valid = np.isfinite(found)
-    height = np.where(valid, found, before).astype(np.float32)
+def _cleaned(found: np.ndarray, sigma: np.ndarray, before: np.ndarray, step: float) -> Height:
+    """Keep of a sweep what it determines, and remove single outliers and noise.
+
+    Of cells with a large standard error the shift is a weighted mean over their surroundings, and counts the less.
+    """
+    shift = np.nan_to_num(found - before)
+    sigma = np.nan_to_num(sigma, nan=10 * step)
+    weight = (1 / (sigma**2 + (0.05 * step) ** 2)).astype(np.float32)
+    around = _blur((shift * weight).astype(np.float32), BRIDGED_CELLS) / _blur(weight, BRIDGED_CELLS)
+    share = 1 / (1 + (sigma / (UNDETERMINED * step)) ** 4)
+    height = (before + share * (share * shift + (1 - share) * around)).astype(np.float32)
     median = cv2.medianBlur(height, 5)
-    height = np.where(np.abs(height - median) > 3 * step, median, height)
-    sigma = np.nan_to_num(sigma, nan=10 * step).astype(np.float32)
-    score = np.nan_to_num(score).astype(np.float32)
-    if level > FINE:
-        weight = np.where(valid, np.clip(score, 0.02, 1) ** 2 / (sigma**2 + (0.05 * step) ** 2), 1e-6)
-        weight = weight.astype(np.float32)
-        height = _blur(height * weight, 1.0) / np.maximum(_blur(weight, 1.0), 1e-12)
-    elif level == 1:
-        height = cv2.bilateralFilter(height, 9, BILATERAL_STEPS * step, BILATERAL_CELLS)
-    return height.astype(np.float32), sigma, score
+    height = np.where(np.abs(height - median) > 3 * step, median, height).astype(np.float32)
+    return cv2.bilateralFilter(height, 9, float(BILATERAL_STEPS * step), BILATERAL_CELLS)

@@ -36,19 +36,20 @@ ROWS = 512
 """Of a raster that are read at once."""
 
 
-def blocks(path: Path, around: int = 0) -> Iterator[tuple[int, int, Float32[np.ndarray, "h w"]]]:
+def blocks(path: Path, around: int = 0, band: int = 1) -> Iterator[tuple[int, int, Float32[np.ndarray, "h w"]]]:
     """Read a band by whole rows: the first row, rows without their surroundings, and values with them.
 
     Args:
         path: of the raster.
         around: rows above and below that are read, too; outside of the raster the nearest row is repeated.
+        band: number of the band.
     """
     rasterio = need("rasterio")
     with rasterio.open(path) as dataset:
         for row in range(0, dataset.height, ROWS):
             count = min(ROWS, dataset.height - row)
             first, last = max(0, row - around), min(dataset.height, row + count + around)
-            values = dataset.read(1, window=((first, last), (0, dataset.width))).astype(np.float32)
+            values = dataset.read(band, window=((first, last), (0, dataset.width))).astype(np.float32)
             if dataset.nodata is not None:
                 values[values == np.float32(dataset.nodata)] = np.nan
             pad = (around - (row - first), around - (last - row - count))

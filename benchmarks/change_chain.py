@@ -1,0 +1,243 @@
+"""The whole chain once: photographs of a built-in flat at two dates -> prepare -> map -> change, against the truth.
+
+The photographs have positions of a consumer receiver and marks of surveyed control points, nothing else of the truth.
+Every step is compared with it, so that it shows where what is lost gets lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from benchmarks.change_pairs import compared
+from tidefield.change.inputs import open_survey
+from tidefield.change.measure import Change, dilated, measure
+from tidefield.change.regions import Region
+from tidefield.change.surfaces import Grid
+from tidefield.change.write import polygons_of
+from tidefield.data.load import load_scene
+from tidefield.files import completed_folder, read_json, write_text
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.maps.make import MAP_FILE
+from tidefield.synthetic.grids import Extent, Raster
+from tidefield.synthetic.two_dates import Difference, Pair, make_pair
+
+CRS, ORIGIN = "EPSG:32631", (500_000.0, 5_800_000.0, 0.0)
+CATEGORY, SEED = "river_mouths", 11
+CHANGE_M = 0.2
+CONTROL_POINTS = 8
+CONTROL_M, MARK_PX, GPS_M = 0.01, 0.3, 1.5
+"""Deviations of surveyed control, of its marks in photographs, and of the receiver's positions."""
+DATES = ("2023-05-01", "2024-05-01")
+BARE = 0.02
+"""Density of plants below which ground counts as bare."""
+_CELL_M = 0.15
+_LAYERS = ("bed", "surface", "marsh")
+
+
+def frame() -> LocalFrame:
+    return LocalFrame.at(CRS, ORIGIN)
+
+
+def write_photographs(pair: Pair, folder: Path) -> None:
+    """Write both surveys' photographs, positions and control as a pilot has them, and the truth beside them."""
+    changed = pair.ground_change
+    for k, (survey, date) in enumerate(zip((pair.earlier, pair.later), DATES, strict=True)):
+        random = np.random.default_rng([SEED, 20290, k])
+        photographs = folder / date / "photographs"
+        photographs.mkdir(parents=True)
+        names = [f"IMG_{k}{i:03d}.jpg" for i in range(len(survey.cameras))]
+        for name, picture in zip(names, survey.photographs.numpy(), strict=True):
+            bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+            assert cv2.imwrite(str(photographs / name), bgr, [cv2.IMWRITE_JPEG_QUALITY, 96])
+        position = survey.cameras.position_world.double().numpy()
+        noisy = frame().to_geographic(position + random.normal(0, GPS_M, position.shape))
+        rows = [f"{n},{p[1]:.8f},{p[0]:.8f},{p[2]:.2f}" for n, p in zip(names, noisy, strict=True)]
+        write_text(photographs / "gps.csv", "\n".join(["image_name,lat,lon,gps_height", *rows]) + "\n")
+        points = _control(pair, changed)
+        points[:, 2] = survey.flat.bed.sample(torch.from_numpy(points[:, :2].T).float())[0].numpy()
+        uv, depth = survey.cameras.project(torch.from_numpy(points).float())
+        surveyed = frame().to_crs(points + random.normal(0, CONTROL_M, points.shape))
+        lines = [CRS]
+        width, height = survey.cameras.width, survey.cameras.height
+        for i, name in enumerate(names):
+            for p, place in enumerate(surveyed):
+                u, v = uv[i, p].tolist()
+                if depth[i, p] > 0 and 5 < u < width - 5 and 5 < v < height - 5:
+                    u, v = u + random.normal(0, MARK_PX), v + random.normal(0, MARK_PX)
+                    lines.append(f"{place[0]:.4f} {place[1]:.4f} {place[2]:.4f} {u:.2f} {v:.2f} {name} P{p}")
+        write_text(photographs / "gcp_list.txt", "\n".join(lines) + "\n")
+    layers = {
+        f"{layer}{k}": getattr(survey.flat, layer).values[0].numpy()
+        for k, survey in enumerate((pair.earlier, pair.later))
+        for layer in _LAYERS
+    }
+    extent = pair.ground_change.extent
+    with (folder / "truth.npz").open("wb") as file:
+        np.savez(
+            file,
+            allow_pickle=False,
+            extent=np.array([extent.west_m, extent.south_m, extent.columns, extent.rows, extent.cell_m]),
+            positions0=pair.earlier.cameras.position_world.numpy(),
+            positions1=pair.later.cameras.position_world.numpy(),
+            **layers,
+        )
+
+
+def _control(pair: Pair, changed: Raster) -> np.ndarray:
+    """Places of control: bare, dry, unchanged, seen by three photographs of both dates, and far from each other."""
+    candidates = np.random.default_rng([SEED, 20291]).uniform(-45, 45, (4000, 2))
+    xy = torch.from_numpy(candidates.T).float()
+    good = np.abs(changed.sample(xy)[0].numpy()) < 1e-6
+    for survey in (pair.earlier, pair.later):
+        bed, surface = (raster.sample(xy)[0].numpy() for raster in (survey.flat.bed, survey.flat.surface))
+        good &= (surface - bed < 1e-3) & (survey.flat.marsh.sample(xy)[0].numpy() < BARE)
+        points = torch.from_numpy(np.column_stack([candidates, bed])).float()
+        uv, depth = survey.cameras.project(points)
+        size = survey.cameras.size_px[:, None].float()
+        seen = ((uv > 8) & (uv < size - 8)).all(-1) & (depth > 0)
+        good &= (seen.sum(0) >= 3).numpy()
+    left = candidates[good]
+    assert len(left) >= CONTROL_POINTS, "the flat has no room for control"
+    chosen = [left[np.argmin(left.sum(axis=1))]]
+    while len(chosen) < CONTROL_POINTS:
+        away = np.min([np.hypot(*(left - one).T) for one in chosen], axis=0)
+        chosen.append(left[np.argmax(away)])
+    return np.column_stack([np.array(chosen), np.zeros(CONTROL_POINTS)])
+
+
+class Truth:
+    """What is true of the flat at the cells of a grid, row 0 in the north."""
+
+    def __init__(self, file: Path, grid: Grid) -> None:
+        x = grid.west_m + (np.arange(grid.columns) + 0.5) * grid.cell_m
+        y = grid.north_m - (np.arange(grid.rows) + 0.5) * grid.cell_m
+        east, north = (axis.ravel() for axis in np.meshgrid(x, y))
+        world = frame().from_crs(np.column_stack([east, north, np.zeros(len(east))]))
+        xy = torch.from_numpy(world[:, :2].T.copy()).float()
+        with np.load(file, allow_pickle=False) as values:
+            west, south, columns, rows, cell = values["extent"].tolist()
+            extent = Extent(west, south, int(columns), int(rows), cell)
+            self.of = {
+                name: Raster(extent, torch.from_numpy(values[name])[None]).sample(xy)[0].numpy().reshape(grid.shape)
+                for name in (f"{layer}{k}" for layer in _LAYERS for k in (0, 1))
+            }
+
+    def bare(self, *dates: int) -> np.ndarray:
+        """Ground that is neither under water nor under plants at these dates."""
+        return np.logical_and.reduce(
+            [(self.of[f"surface{k}"] - self.of[f"bed{k}"] < 1e-3) & (self.of[f"marsh{k}"] < BARE) for k in dates]
+        )
+
+    @property
+    def change(self) -> np.ndarray:
+        return self.of["bed1"] - self.of["bed0"]
+
+
+def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) -> dict[str, Any]:
+    """Make the photographs, prepare and map both surveys, compare them, and compare each step with the truth.
+
+    Args:
+        work: folder for all of it; what is there is not made again.
+        views: photographs of each survey.
+        width: of a photograph, pixels.
+    """
+    from rich.console import Console
+
+    from tidefield.commands.common import ZeroShot
+    from tidefield.commands.map_ import Map, map_
+    from tidefield.commands.prepare import Prepare, prepare
+
+    console = Console(quiet=True)
+    surveys = work / "surveys"
+    if not surveys.exists():
+        say(f"photographs: {views} of {width} px at each date")
+        pair = make_pair(CATEGORY, SEED, Difference(change_m=CHANGE_M), views=views, width=width)
+        with completed_folder(surveys) as partial:
+            write_photographs(pair, partial)
+    record: dict[str, Any] = {"photographs": views, "width_px": width, "change_m": CHANGE_M, "steps": {}}
+    for k, date in enumerate(DATES):
+        photographs, scene, out = surveys / date / "photographs", work / f"scene-{date}", work / f"map-{date}"
+        if not (scene / "report.html").exists():
+            say(f"{date}: prepare")
+            prepare(Prepare(photographs, scene), console)
+        if not (read_json(out / MAP_FILE) or {}).get("complete"):
+            say(f"{date}: map")
+            map_(Map(scene, out, ZeroShot(zero_shot=True), gsd=_CELL_M), console)
+        record["steps"][date] = {**_poses(scene, surveys, k), **_heights(out, surveys, k)}
+        say(f"{date}: {record['steps'][date]}")
+    say("change")
+    earlier, later = (open_survey(work / f"map-{date}", date) for date in DATES)
+    for name, stable in (("found", None), ("given", lambda grid: _stable(surveys, grid))):
+        found = measure(earlier, later, stable=stable, within=lambda grid: _bare(surveys, grid))
+        record["steps"][f"change, stable ground {name}"] = _against_truth(found, surveys)
+        say(f"stable ground {name}: {record['steps'][f'change, stable ground {name}']}")
+    return record
+
+
+def _poses(scene: Path, surveys: Path, k: int) -> dict[str, float]:
+    """How far the cameras are from where they were, metres."""
+    from tidefield.data.georeference import read_georeference
+
+    loaded, georeference = load_scene(scene, hold_out=False), read_georeference(scene)
+    assert georeference is not None
+    assert georeference.frame is not None
+    with np.load(surveys / "truth.npz", allow_pickle=False) as values:
+        true = values[f"positions{k}"].astype(np.float64)
+    number = [int(Path(name).stem[-3:]) for name in loaded.names]
+    world = loaded.cameras.position_world.double().numpy() + loaded.origin_world.double().numpy()
+    error = frame().from_crs(georeference.frame.to_crs(world)) - true[number]
+    return {
+        "placed": len(loaded.names),
+        "positions_horizontal_rms_m": float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
+        "positions_vertical_rms_m": float(np.sqrt((error[:, 2] ** 2).mean())),
+    }
+
+
+def _heights(out: Path, surveys: Path, k: int) -> dict[str, float]:
+    """The map's heights on bare, dry ground against the truth."""
+    from tidefield.change.surfaces import common_grid, open_surface
+
+    surface = open_survey(out)
+    grid = common_grid([surface])
+    with surface.on_grid(grid) as read:
+        heights = read(0, grid.rows)
+    assert surface.sigma is not None
+    with open_surface(surface.sigma).on_grid(grid) as read:
+        sigma = read(0, grid.rows)
+    truth = Truth(surveys / "truth.npz", grid)
+    error = heights - truth.of[f"bed{k}"]
+    some = truth.bare(k) & np.isfinite(error)
+    middle = float(np.median(error[some]))
+    return {
+        "cells": int(some.sum()),
+        "median_m": middle,
+        "nmad_m": float(1.4826 * np.median(np.abs(error[some] - middle))),
+        "within_95": float((np.abs(error) < 1.96 * sigma)[some].mean()),
+    }
+
+
+def _bare(surveys: Path, grid: Grid) -> list[Region]:
+    return _regions(Truth(surveys / "truth.npz", grid).bare(0, 1), grid)
+
+
+def _stable(surveys: Path, grid: Grid) -> list[Region]:
+    """Bare ground well away from what changed."""
+    truth = Truth(surveys / "truth.npz", grid)
+    same = truth.bare(0, 1) & ~dilated(np.abs(truth.change) > 1e-6, 8)
+    return _regions(same, grid)
+
+
+def _regions(cells: np.ndarray, grid: Grid) -> list[Region]:
+    return [Region("ground", polygon) for _, polygon in polygons_of(cells.astype(np.uint8), grid, cells)]
+
+
+def _against_truth(change: Change, surveys: Path) -> dict[str, Any]:
+    truth = Truth(surveys / "truth.npz", change.grid).change
+    truth[~np.isfinite(change.dz)] = 0
+    return compared(change, truth, change.grid)

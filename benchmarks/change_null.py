@@ -1,0 +1,150 @@
+"""Nothing changed: two flights over the same ground, 27 minutes apart, prepared and mapped as two surveys.
+
+The river and what is wet changes, and so do vehicles and people; dry ground does not. Stable ground for shift and
+errors is a half of the dry ground, squares like the black ones of a chessboard; false alarms are counted on the other
+half, which nothing was measured on.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from tidefield.change.errors import Z95
+from tidefield.change.inputs import open_survey
+from tidefield.change.measure import Options, dilated, measure
+from tidefield.change.regions import Region, rasterised
+from tidefield.change.shift import picture_grid, read_picture
+from tidefield.change.surfaces import Grid, Surface, common_grid
+from tidefield.change.write import polygons_of
+from tidefield.files import completed_folder, read_json, write_text
+from tidefield.maps.make import MAP_FILE
+
+FLIGHTS = {"first": (1414, 1481), "third": (1548, 1618)}
+CELL_M = 0.15
+SQUARE_M = 20.0
+"""Side of the squares of the chessboard: longer than errors of matching are correlated."""
+DARK, GLARING = 60.0, 205.0
+"""Grey values of 255 outside of which ground is water, or so wet or so light that it may be."""
+_MARGIN_CELLS = 7
+_LISTS = ("gps.csv", "gcp_list.txt")
+
+
+def copy_flight(photographs: Path, flight: tuple[int, int], folder: Path) -> None:
+    """Copy the photographs of one flight with what the pilot's lists say about them."""
+    with completed_folder(folder) as partial_:
+        for path in sorted(photographs.glob("IMG_*.jpg")):
+            if flight[0] <= int(path.stem.removeprefix("IMG_")) <= flight[1]:
+                shutil.copyfile(path, partial_ / path.name)
+        names = {path.name for path in partial_.iterdir()}
+        shutil.copyfile(photographs / "gps.csv", partial_ / "gps.csv")
+        first, *lines = (photographs / "gcp_list.txt").read_text().splitlines()
+        kept = [line for line in lines if len(line.split()) > 5 and line.split()[5] in names]
+        write_text(partial_ / "gcp_list.txt", "\n".join([first, *kept]) + "\n")
+
+
+def measure_null(photographs: Path, work: Path, say: Callable[[str], object]) -> dict[str, Any]:
+    """Prepare, map and compare both flights.
+
+    Args:
+        photographs: swindale, as `shared/data/photographs` has it.
+        work: folder for all of it; what is there is not made again.
+    """
+    from rich.console import Console
+
+    from tidefield.commands.common import ZeroShot
+    from tidefield.commands.map_ import Map, map_
+    from tidefield.commands.prepare import Prepare, prepare
+
+    console = Console(quiet=True)
+    record: dict[str, Any] = {}
+    for name, flight in FLIGHTS.items():
+        own = work / name
+        if not (own / "photographs").exists():
+            copy_flight(photographs, flight, own / "photographs")
+        if not (own / "scene" / "report.html").exists():
+            say(f"{name}: prepare")
+            prepare(Prepare(own / "photographs", own / "scene"), console)
+        if not (read_json(own / "map" / MAP_FILE) or {}).get("complete"):
+            say(f"{name}: map")
+            map_(Map(own / "scene", own / "map", ZeroShot(zero_shot=True), gsd=CELL_M), console)
+        made = read_json(own / "map" / MAP_FILE)
+        record[name] = {key: made[key] for key in ("area", "sigma_median", "views_median")}
+    return {**record, **compare(work, say)}
+
+
+def compare(work: Path, say: Callable[[str], object]) -> dict[str, Any]:
+    """Compare the maps of both flights over dry ground."""
+    earlier, later = (open_survey(work / name / "map") for name in FLIGHTS)
+    grid = common_grid([earlier, later])
+    dry = dry_ground(earlier, later, grid)
+    board = chessboard(grid)
+    halves = [_regions(dry & (board == k), grid) for k in (0, 1)]
+    record: dict[str, Any] = {"dry_m2": float(dry.sum()) * grid.cell_area_m2}
+    for model in ("vertical", "tilt"):
+        change = measure(
+            earlier,
+            later,
+            Options(register=model),
+            stable=partial(_given, halves[0]),
+            within=partial(_given, _regions(dry, grid)),
+        )
+        assert change.grid == grid
+        other = rasterised(halves[1], grid) & np.isfinite(change.dz)
+        sigma = np.concatenate([change.errors.cell_sigma(rows) for rows in grid.strips()])
+        registration = change.errors.registration
+        record[model] = {
+            "significant_share_of_other_half": float((np.abs(change.dz) > Z95 * sigma)[other].mean()),
+            "other_cells": int(other.sum()),
+            "vertical_m": registration.vertical_m,
+            "shift_m": list(registration.shift_m),
+            "before": list(registration.before),
+            "after": list(registration.after),
+            "detection_m": list(change.detection_m),
+            "ranges_m": list(change.errors.variogram.ranges_m),
+            "sills": list(change.errors.variogram.sills),
+            "net": change.net.to_json(),
+            "other_net": change.errors.volume(change.dz, other).to_json(),
+            "outlined_share": float((change.outlines.labels[np.isfinite(change.dz)] > 0).mean()),
+            "remarks": change.remarks,
+        }
+        say(f"{model}: {record[model]}")
+    return record
+
+
+def _given(regions: list[Region], grid: Grid) -> list[Region]:
+    return regions
+
+
+def chessboard(grid: Grid) -> np.ndarray:
+    """0 and 1 in squares."""
+    rows, columns = (np.floor(np.arange(n) * grid.cell_m / SQUARE_M).astype(int) for n in grid.shape)
+    return (rows[:, None] + columns[None]) % 2
+
+
+def dry_ground(earlier: Surface, later: Surface, grid: Grid) -> np.ndarray:
+    """Cells that both surveys show neither dark nor glaring, a metre away from what is.
+
+    Brightness alone decides: heights, which are what is tested, do not.
+    """
+    assert earlier.orthophoto is not None
+    assert later.orthophoto is not None
+    small = picture_grid((earlier.orthophoto, later.orthophoto), grid)
+    dry = np.ones(grid.shape, bool)
+    for path in (earlier.orthophoto, later.orthophoto):
+        picture, known = read_picture(path, small)
+        assert small.shape == grid.shape
+        grey = picture.mean(axis=2)
+        dry &= ~dilated(~known | (grey < DARK) | (grey > GLARING), _MARGIN_CELLS)
+    return dry
+
+
+def _regions(cells: np.ndarray, grid: Grid) -> list[Region]:
+    polygons = [polygon for _, polygon in polygons_of(cells.astype(np.uint8), grid, cells)]
+    return [Region("ground", polygon) for polygon in polygons if shapely.area(polygon) > grid.cell_area_m2]

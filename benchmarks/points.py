@@ -1,0 +1,153 @@
+"""Zero-shot views of scenes with COLMAP's sparse points, and of the same without any, which are then found on opening.
+
+A scene without a COLMAP model (NeRF's synthetic ones) gets one first: its photographs on white instead of transparent,
+COLMAP's features and exhaustive matches, its triangulation with the poses held.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.scales import METRICS, Run
+from tidefield.compare.tables import Table
+from tidefield.data.load import read_posed
+from tidefield.data.readers.colmap import find_colmap
+from tidefield.files import completed_folder, read_json, write_json
+from tidefield.machine import describe
+from tidefield.survey.sfm.features import set_up_pycolmap
+
+POINTS_FILE = "points.json"
+WAYS = ("with", "without")
+MODELS = ("sparse/0", "sparse")
+
+
+def measure_points(
+    scenes: Sequence[Path], runs: Path, widths: Iterable[int], device: str, run: Run, say: Callable[[str], object]
+) -> dict[str, Any]:
+    """Evaluate scenes with and without their points; what was measured is kept.
+
+    Args:
+        scenes: folders of scenes.
+        runs: folder for the scenes without points, and points.json.
+        widths: of the pictures.
+        device: to render on.
+        run: runs a command of Tidefield's, given without "tidefield".
+        say: reports progress.
+    """
+    record = read_json(runs / POINTS_FILE) or {"figures": {}}
+    for scene in scenes:
+        name = scene.resolve().name
+        folders = {"with": scene, "without": runs / "scenes" / name}
+        if find_colmap(scene, *MODELS) is None:
+            folders["with"] = runs / "scenes" / f"{name}_colmap"
+            if not folders["with"].exists():
+                say(f"{name}: points of COLMAP")
+                with completed_folder(folders["with"]) as partial:
+                    write_colmap(scene, partial)
+        if not folders["without"].exists():
+            with completed_folder(folders["without"]) as partial:
+                write_without_points(folders["with"], partial)
+        for width in widths:
+            for way in WAYS:
+                place = record["figures"].setdefault(name, {}).setdefault(str(width), {})
+                if way in place:
+                    continue
+                say(f"{name}, {width} px, {way} points")
+                with TemporaryDirectory() as temporary:
+                    out = Path(temporary) / "out"
+                    words = ["evaluate", str(folders[way]), str(out), "--zero-shot", "--width", str(width)]
+                    run([*words, "--device", device])
+                    found = read_json(out / "evaluation.json")
+                place[way] = {metric: found["mean"][metric] for metric in METRICS}
+                write_json(
+                    runs / POINTS_FILE, {**record, **describe(), "command": "python -m benchmarks points SCENE..."}
+                )
+    return record
+
+
+def write_without_points(scene: Path, folder: Path) -> None:
+    """Copy a COLMAP scene without its points."""
+    import pycolmap
+
+    model_folder = find_colmap(scene, *MODELS)
+    assert model_folder is not None
+    model = pycolmap.Reconstruction(model_folder)
+    for point in list(model.point3D_ids()):
+        model.delete_point3D(point)
+    shutil.copytree(scene / "images", folder / "images")
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(folder / "sparse" / "0")
+
+
+def write_colmap(scene: Path, folder: Path) -> None:
+    """Make a COLMAP scene of a posed one, on white, with the points of COLMAP's own features and exhaustive matches."""
+    import pycolmap
+
+    set_up_pycolmap()
+    posed = read_posed(scene, True)
+    used = range(len(posed.names))
+    if posed.split is not None:
+        used = [i for i in used if posed.names[i] in posed.split[0]]
+    (folder / "images").mkdir(parents=True)
+    names = [f"{k:04d}.png" for k in range(len(used))]
+    for name, i in zip(names, used, strict=True):
+        with Image.open(posed.paths[i]) as picture:
+            rgba = picture.convert("RGBA")
+        white = Image.new("RGBA", rgba.size, "white")
+        Image.alpha_composite(white, rgba).convert("RGB").save(folder / "images" / name)
+    with TemporaryDirectory() as temporary:
+        database = Path(temporary) / "database.db"
+        pycolmap.extract_features(
+            database, folder / "images", image_names=names, camera_mode=pycolmap.CameraMode.PER_IMAGE
+        )
+        pycolmap.match_exhaustive(database)
+        with pycolmap.Database.open(database) as db:
+            images = {image.name: image for image in db.read_all_images()}
+            keypoints = {name: db.read_keypoints(image.image_id)[:, :2] for name, image in images.items()}
+            cameras = {}
+            for name, i in zip(names, used, strict=True):
+                lens = posed.lenses[i]
+                parameters = [lens.fx, lens.fy, lens.cx, lens.cy]
+                size = {"width": lens.width, "height": lens.height}
+                number = images[name].camera_id
+                cameras[name] = pycolmap.Camera(camera_id=number, model="PINHOLE", params=parameters, **size)
+                db.update_camera(cameras[name])
+        model = pycolmap.Reconstruction()
+        for name, i in zip(names, used, strict=True):
+            pose, image = posed.T_world_camera[i], images[name]
+            model.add_camera_with_trivial_rig(cameras[name])
+            inverse = pycolmap.Rigid3d(np.column_stack([pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]]))
+            shown = pycolmap.Image(
+                name=name, keypoints=keypoints[name], camera_id=image.camera_id, image_id=image.image_id
+            )
+            model.add_image_with_trivial_frame(shown, inverse)
+        (folder / "sparse" / "0").mkdir(parents=True)
+        model = pycolmap.triangulate_points(model, database, folder / "images", folder / "sparse" / "0")
+        model.write_binary(folder / "sparse" / "0")
+
+
+def tables(record: dict[str, Any]) -> list[Table]:
+    """With, without, and the difference."""
+    columns = ["scene", "width, px", "with points", "without", "difference", "SSIM with", "SSIM without"]
+    rows = []
+    for name, widths in record["figures"].items():
+        for width, ways in widths.items():
+            first, second = (ways[way] for way in WAYS)
+            psnr = first["psnr_seen_cc"], second["psnr_seen_cc"]
+            rows.append(
+                (
+                    name,
+                    width,
+                    *(f"{value:.2f}" for value in psnr),
+                    f"{psnr[1] - psnr[0]:+.2f}",
+                    *(f"{of['ssim_seen']:.3f}" for of in (first, second)),
+                )
+            )
+    return [Table("PSNR, dB, of doubly seen pixels after the colour fit", columns, rows)]

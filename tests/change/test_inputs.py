@@ -1,0 +1,118 @@
+"""Folders of `tidefield map` as inputs, written by the map's own writers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from surveys_of_two_dates import pair
+
+from tidefield import cli
+from tidefield.change.inputs import open_pair, open_survey
+from tidefield.change.surfaces import ChangeError
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.maps.cloud import GROUND, cloud_writer
+from tidefield.maps.grid import LOCAL_NAME, LOCAL_WKT, Grid, MapFrame
+from tidefield.maps.make import CLOUD, DSM, FILLED, ORTHOPHOTO, SIGMA
+from tidefield.maps.rasters import NODATA, Raster, raster_writer
+
+rasterio = pytest.importorskip("rasterio")
+SIGMA_M = 0.02
+
+
+def frame(georeferenced: bool) -> MapFrame:
+    if not georeferenced:
+        return MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local, without a datum")
+    local = LocalFrame.at("EPSG:32630", (400_000.0, 5_700_000.0, 0.0))
+    from pyproj import CRS
+
+    wkt = CRS("EPSG:32630").to_wkt()
+    return MapFrame(local, np.zeros(3), np.eye(3), wkt, wkt, local.vertical_datum)
+
+
+def write_map(folder: Path, heights: np.ndarray, georeferenced: bool, filled: np.ndarray | None = None) -> Path:
+    """The files of a map that change reads, as `tidefield.maps.make.join` writes them."""
+    of = frame(georeferenced)
+    west, north = (400_000.0, 5_700_000.0) if georeferenced else (-60.0, 50.0)
+    grid = Grid(of, west, north, 0.5, heights.shape[1], heights.shape[0], 3.0)
+    shown = np.isfinite(heights)
+    colour = np.full((3, *heights.shape), 120, np.uint8)
+    rasters = [
+        (Raster(folder / ORTHOPHOTO, ("red", "green", "blue", "alpha"), "uint8", None), [*colour, shown * 255]),
+        (Raster(folder / DSM, ("height of the surface",), unit="m"), [np.where(shown, heights, NODATA)]),
+        (Raster(folder / SIGMA, ("standard error of the height",), unit="m"), [np.where(shown, SIGMA_M, NODATA)]),
+    ]
+    if filled is not None:
+        raster = Raster(folder / FILLED, ("1 where the map is filled",), "uint8", 255.0, average=False)
+        rasters.append((raster, [filled]))
+    for raster, bands in rasters:
+        raster.path.parent.mkdir(parents=True, exist_ok=True)
+        with raster_writer(raster, grid) as writer:
+            writer.write(0, np.stack(bands))
+    with cloud_writer(folder / CLOUD, grid) as cloud:
+        sigma, count = np.full(heights.shape, SIGMA_M), np.full(heights.shape, 5)
+        cloud.write(0, heights, sigma, colour, count, np.full(heights.shape, GROUND))
+    return folder
+
+
+def surfaces(tmp_path: Path, depth: float = 0.2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    paths = pair(tmp_path, 3, depth)
+    earlier, later = (rasterio.open(path).read(1) for path in paths[:2])
+    earlier[:20, :20] = np.nan
+    return earlier, later, paths[2]
+
+
+def test_two_folders_of_maps_are_compared(tmp_path: Path):
+    earlier, later, truth = surfaces(tmp_path)
+    filled = np.where(np.isfinite(later), np.uint8(0), np.uint8(255))
+    filled[100:120, 100:120] = 1
+    one = write_map(tmp_path / "map-2023-05-01", earlier, False)
+    two = write_map(tmp_path / "map-2024-05-01", later, False, filled)
+    cli._run(["change", str(one), str(two), str(tmp_path / "out"), "-q"])
+    numbers = json.loads((tmp_path / "out" / "change.json").read_text())
+    assert (numbers["earlier"]["date"], numbers["later"]["date"]) == ("2023-05-01", "2024-05-01")
+    assert numbers["earlier"]["file"] == "map-2023-05-01"
+    assert numbers["earlier"]["sigma"] == numbers["later"]["sigma"] == "dsm_sigma.tif"
+    cut = numbers["volumes"]["cut"]
+    assert cut["low_m3"] < -truth[truth < 0].sum() * 0.25 < cut["high_m3"]
+    assert any("local frame" in remark for remark in numbers["remarks"])
+    # Neither what the map left empty nor what it filled in is compared.
+    assert numbers["cells"] == truth.size - 400 - 400
+    with rasterio.open(tmp_path / "out" / "change.tif") as file:
+        assert np.isnan(file.read(1)[100:120, 100:120]).all()
+
+
+def test_maps_in_a_known_system_bring_it_and_their_clouds(tmp_path: Path):
+    earlier, later, _ = surfaces(tmp_path)
+    one, two = (write_map(tmp_path / name, heights, True) for name, heights in (("a", earlier), ("b", later)))
+    found = open_pair(one, two, tmp_path, with_clouds=True)
+    assert found.earlier.crs is not None
+    assert found.earlier.crs.to_epsg() == 32630
+    assert found.clouds is not None
+    assert len(found.clouds[0].xyz) == np.isfinite(earlier).sum()
+    assert found.clouds[0].sigma is not None
+    assert found.clouds[0].sigma.max() == pytest.approx(SIGMA_M)
+
+
+def test_a_map_finds_its_files_and_states_its_frame(tmp_path: Path):
+    heights = surfaces(tmp_path)[0]
+    found = open_survey(write_map(tmp_path / "map", heights, False))
+    assert found.path == tmp_path / "map" / DSM
+    assert found.sigma == tmp_path / "map" / SIGMA
+    assert found.orthophoto == tmp_path / "map" / ORTHOPHOTO
+    assert found.cloud == tmp_path / "map" / CLOUD
+    assert found.crs is None
+    assert found.nodata == NODATA
+    with rasterio.open(found.path) as dataset:
+        assert LOCAL_NAME in dataset.crs.to_wkt()
+
+
+def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
+    from tidefield.change.measure import measure
+
+    heights = surfaces(tmp_path)[0]
+    one, two = (open_survey(write_map(tmp_path / str(g), heights, g)) for g in (True, False))
+    with pytest.raises(ChangeError, match="has a coordinate system"):
+        measure(one, two)

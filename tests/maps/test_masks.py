@@ -1,0 +1,113 @@
+"""Plants and water of maps whose shapes are known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from tidefield.maps import contours, masks
+from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
+from tidefield.maps.masks import excess_green, find_water, read_water, write_classes, write_masks
+from tidefield.maps.rasters import Raster, raster_writer, read_raster
+
+pytest.importorskip("rasterio")
+LOCAL = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
+GRID = Grid(LOCAL, 10.0, 90.0, 0.05, 300, 240, 2.0)
+LEVEL = 2.1
+NOISE = 0.006
+
+
+def flat() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A basin, of which water fills what lies below `LEVEL`: heights, agreement, and where water is."""
+    y, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    ground = 2.0 + 0.02 * ((x - 7) ** 2 + (y - 6) ** 2)
+    random = np.random.default_rng(3)
+    wet = ground < LEVEL
+    height = np.maximum(ground, LEVEL) + NOISE * random.standard_normal(ground.shape)
+    return height.astype(np.float32), np.where(wet, 0.05, 0.4).astype(np.float32), wet
+
+
+def test_water_and_its_level_are_found():
+    height, agreement, wet = flat()
+    plants = np.zeros(wet.shape, bool)
+    labels, [body] = find_water(height, agreement, plants, GRID)
+    assert ((labels > 0) & wet).sum() / ((labels > 0) | wet).sum() > 0.85
+    assert abs(body.level - LEVEL) < 0.004
+    assert 0 < body.sigma < NOISE
+    # Photographs that agree, or no level surface, are no water.
+    assert not find_water(height, np.full_like(agreement, 0.4), plants, GRID)[1]
+    _, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    assert not find_water((height + 0.1 * x).astype(np.float32), agreement, plants, GRID)[1]
+
+
+def test_level_ground_with_lower_ground_beside_it_is_no_water():
+    height, agreement, wet = flat()
+    _, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    height = np.where(x < 7, height, LEVEL - 0.5 * np.maximum(x - 7, 0)).astype(np.float32)
+    assert not find_water(height, agreement, ~wet & (x < 7), GRID)[1]
+
+
+def test_plants_are_green_and_black_is_not():
+    colour = np.zeros((3, 20, 20), np.uint8)
+    colour[:, :, 10:] = np.array([70, 110, 50], np.uint8)[:, None, None]
+    green = excess_green(colour)
+    assert (green[:, :5] == 0).all()
+    np.testing.assert_allclose(green[:, 15:], 100 / 230, atol=1e-3)
+
+
+@pytest.mark.parametrize("most", [4_000_000, 5_000])
+def test_classes_polygons_and_waterline_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int):
+    pyogrio = pytest.importorskip("pyogrio")
+    monkeypatch.setattr(contours, "MOST_CELLS", most)
+    height, agreement, wet = flat()
+    height[:20, :30] = np.nan
+    plants = np.zeros(wet.shape, bool)
+    plants[200:220, 200:230] = True
+    colour = np.where(plants, np.array([70, 110, 50])[:, None, None], np.array([120, 110, 90])[:, None, None])
+    known = np.isfinite(height)
+    for name, kind, nodata, bands in (
+        ("dsm", "float32", -9999.0, np.where(known, height, -9999)[None]),
+        ("agreement", "uint8", 255.0, np.where(known, 100 * agreement, 255)[None]),
+        ("colour", "uint8", None, np.concatenate([colour, 255 * known[None]])),
+    ):
+        names = ("red", "green", "blue", "alpha") if nodata is None else (name,)
+        with raster_writer(Raster(tmp_path / f"{name}.tif", names, kind, nodata), GRID) as writer:
+            writer.write(0, bands)
+    water = read_water(tmp_path / "dsm.tif", tmp_path / "agreement.tif", tmp_path / "colour.tif", GRID)
+    out = Raster(tmp_path / "classes.tif", ("class",), "uint8", 0.0, average=False)
+    write_classes(out, tmp_path / "dsm.tif", tmp_path / "colour.tif", water, GRID)
+    classes = read_raster(tmp_path / "classes.tif")[0]
+    assert np.isnan(classes[:20, :30]).all()
+    for value, true in ((GROUND, ~wet & ~plants & known), (VEGETATION, plants), (WATER, wet & ~plants)):
+        assert ((classes == value) & true).sum() / ((classes == value) | true).sum() > 0.7
+    write_masks(tmp_path / "classes.tif", water, GRID, tmp_path / "masks")
+    assert {name for name, _ in pyogrio.list_layers(tmp_path / "masks" / "masks.gpkg")} == {
+        "vegetation",
+        "water",
+        "waterline",
+    }
+    for name, area in (("vegetation", plants.sum()), ("water", (wet & ~plants).sum())):
+        features = json.loads((tmp_path / "masks" / f"{name}.geojson").read_text())["features"]
+        found = sum(shapely.geometry.shape(f["geometry"]).area for f in features)
+        assert found == pytest.approx(area * GRID.cell**2, rel=0.15)
+    [line] = json.loads((tmp_path / "masks" / "waterline.geojson").read_text())["features"]
+    assert line["properties"]["height"] == pytest.approx(LEVEL, abs=0.005)
+    assert 0 < line["properties"]["sigma"] < 0.01
+    # A circle of radius sqrt(0.1 / 0.02), the staircase of the cells included.
+    assert shapely.geometry.shape(line["geometry"]).length == pytest.approx(2 * np.pi * np.sqrt(5), rel=0.35)
+
+
+def test_a_waterline_ends_where_the_map_ends():
+    grid = replace(GRID, columns=100)
+    body = masks.Body(1.0, 0.01, 0.03, 10.0)
+    west, south, east, north = grid.bounds
+    lake = shapely.box(west, south, (west + east) / 2, north)
+    layer = masks._waterline([(lake, body)], grid)
+    [line] = layer.shapes
+    assert line.length == pytest.approx(north - south, rel=0.05)

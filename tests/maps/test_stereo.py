@@ -1,0 +1,80 @@
+"""Semi-global matching of pairs finds the surface of a built-in flat, whatever the headings of the photographs."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tidefield.data.load import load_scene
+from tidefield.maps.grid import Grid, map_frame
+from tidefield.maps.stereo import Rectified, choose_pairs, fill_from_nearest, stereo_heights
+from tidefield.maps.surface import COARSEST, GreyPhotographs, choose_views, sparse_surface
+from tidefield.synthetic import make_survey, write_survey
+
+pytest.importorskip("rasterio")
+CELL = 0.2
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("stereo")
+    survey = make_survey("ground_textures", seed=4, views=9, width=320)
+    write_survey(survey, folder / "scene")
+    return load_scene(folder / "scene", hold_out=False, cache=folder / "cache"), survey
+
+
+def test_rows_of_both_pictures_show_the_same_points(scene):
+    loaded, _ = scene
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    choice = choose_views(tile, loaded, sparse_surface(loaded, grid.coarser(COARSEST)))
+    headings = [loaded.cameras.T_world_camera[i, :, 0].numpy() for i in choice.indices]
+    turned = [float(headings[i] @ headings[j]) for i, j in choice.pairs]
+    assert len(choice.pairs) == 12
+    assert min(turned) < -0.9 < 0.9 < max(turned)  # strips are flown to and fro
+    points = np.array([[1.0, 2.0, 0.3], [-3.0, 4.0, -0.4], [5.0, -2.0, 0.0]])
+    for i, j in choice.pairs:
+        left, right = choice.views[i], choice.views[j]
+        pair = Rectified(left, right, tile, 64 * CELL, -1.0, 1.0)
+        local = (points - pair.centre) @ pair.rotation.T
+        other = (points - right.position) @ pair.rotation.T
+        np.testing.assert_allclose(local[:, 1] / local[:, 2], other[:, 1] / other[:, 2], atol=1e-9)
+        disparity = pair.focal * (local[:, 0] / local[:, 2] - other[:, 0] / other[:, 2]) - pair.least
+        assert ((disparity >= 0) & (disparity < pair.count)).all()
+        # What the left picture has at a point is what the photograph has there.
+        ramp = np.broadcast_to(np.arange(left.size[0], dtype=np.float32), (left.size[1], left.size[0])).copy()
+        shown, inside = pair.resample(left, ramp, 0.0)
+        uv = pair.focal * local[:, :2] / local[:, 2:] - pair.origin
+        columns, rows = uv.T.astype(np.float32)[:, None] - 0.5
+        seen = cv2.remap(shown, columns, rows, cv2.INTER_LINEAR)[0]
+        true = left.pixels(*points.T.astype(np.float32))[0] - 0.5
+        kept = cv2.remap(inside.astype(np.float32), columns, rows, cv2.INTER_LINEAR)[0] == 1
+        np.testing.assert_allclose(seen[kept], true[kept], atol=0.05)
+
+
+def test_heights_are_those_of_the_flat(scene):
+    loaded, survey = scene
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    choice = choose_views(tile, loaded, sparse_surface(loaded, grid.coarser(COARSEST)))
+    grey = GreyPhotographs(loaded)
+    found = stereo_heights(choice.pairs, choice.views, choice.indices, grey, 1, tile, 0, -2.0, 3.0)
+    east, north = (part.ravel() for part in np.broadcast_arrays(*tile.offsets()))
+    places = torch.from_numpy(np.stack([east + tile.centre[0], north + tile.centre[1]])).float()
+    true = survey.flat.surface.sample(places)[0].reshape(64, 64).numpy()
+    error = found - true
+    assert np.isfinite(error).mean() > 0.95
+    nmad = 1.4826 * np.nanmedian(np.abs(error - np.nanmedian(error)))
+    assert nmad < 0.5 * CELL
+    assert abs(np.nanmedian(error)) < 0.25 * CELL
+    # A pair whose base rises too much, or is too long, is not matched.
+    assert not choose_pairs(
+        choice.views[:2], np.ones((2, 4), bool), np.zeros((2, 4)), choice.views[0].position[2] - 1e-3
+    )
+
+
+def test_holes_have_the_nearest_height():
+    height = np.array([[1.0, np.nan, np.nan, 4.0]], np.float32)
+    assert fill_from_nearest(height).tolist() == [[1.0, 1.0, 4.0, 4.0]]

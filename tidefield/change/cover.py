@@ -1,0 +1,189 @@
+"""Plants gained and lost, from the orthophotos of both surveys after evening their light.
+
+A place is covered where its mean colour over half a metre is greener than bare ground's by a margin. Bare ground is
+the lowest of the common values of greenness. Areas come with the range that they have when the margin is moved by what
+greenness scatters from date to date over ground that is bare at both; what changed by less than that did
+not change.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8
+from scipy.ndimage import label
+
+from tidefield.change.errors import nmad
+from tidefield.change.light import greenness, light_gains, smoothed, with_light
+from tidefield.change.regions import Region, rasterised
+from tidefield.change.shift import picture_grid, read_picture
+from tidefield.change.surfaces import Grid
+
+MARGIN = 0.035
+"""Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""
+WINDOW_M = 0.4
+"""Deviation of the Gaussian window in which colours are averaged: tufts and the mud between them are one cover."""
+LEAST_M2 = 1.0
+"""Smaller patches that were gained or lost are left out."""
+_BIN = 0.004
+"""Of the histogram of greenness."""
+_COMMON = 0.4
+"""A peak of the histogram as high as this share of the highest is common."""
+_UNKNOWN = np.int8(-128)
+
+
+@dataclass(frozen=True)
+class Area:
+    """An area in square metres, and the range it has when the margin is moved."""
+
+    value_m2: float
+    low_m2: float
+    high_m2: float
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Where plants are at two dates.
+
+    Attributes:
+        classes: 0 bare at both dates, 1 gained, -1 lost, 2 covered at both, -128 unknown.
+        gains: what the later picture's red, green and blue were multiplied by.
+        bare: greenness of bare ground.
+        scatter: one sigma of greenness between the dates over bare ground.
+        areas: earlier, later, gained and lost, in all and in each of the user's polygons.
+    """
+
+    grid: Grid
+    classes: Int8[np.ndarray, "rows columns"]
+    gains: tuple[float, float, float]
+    bare: float
+    scatter: float
+    known_m2: float
+    areas: dict[str, dict[str, Area]]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "light_gains": list(self.gains),
+            "bare_greenness": self.bare,
+            "margin": MARGIN,
+            "scatter": self.scatter,
+            "area_m2": self.known_m2,
+            "regions": {
+                region: {
+                    what: {"value_m2": a.value_m2, "low_m2": a.low_m2, "high_m2": a.high_m2} for what, a in of.items()
+                }
+                for region, of in self.areas.items()
+            },
+        }
+
+
+def measure_cover(
+    earlier: Path,
+    later: Path,
+    grid: Grid,
+    shift_m: tuple[float, float] = (0.0, 0.0),
+    regions: list[Region] | None = None,
+    known: Bool[np.ndarray, "rows columns"] | None = None,
+) -> Cover:
+    """Compare the plant cover of two orthophotos.
+
+    Args:
+        grid: ground that is looked at; pixels are the orthophotos' own.
+        shift_m: of the later survey, as co-registration found it.
+        regions: polygons whose areas are given one by one.
+        known: cells of the grid that are compared; None for all.
+
+    Raises:
+        ChangeError: one of the files is no orthophoto.
+    """
+    small = picture_grid((earlier, later), grid)
+    one, inside = read_picture(earlier, small)
+    other, also = read_picture(later, small, shift_m)
+    inside &= also
+    if known is not None:
+        inside &= _resampled(known, grid, small)
+    return compare_cover(one, other, inside, small, regions)
+
+
+def compare_cover(
+    earlier: np.ndarray,
+    later: np.ndarray,
+    known: Bool[np.ndarray, "rows columns"],
+    grid: Grid,
+    regions: list[Region] | None = None,
+) -> Cover:
+    """Compare the plant cover of two pictures (8-bit RGB) on one grid."""
+    sigma = max(0.8, WINDOW_M / grid.cell_m)
+    first = greenness(smoothed(earlier, known, sigma))
+    second = greenness(smoothed(later, known, sigma))
+    # Each date has its own white balance at first, so its own bare ground.
+    bare_ground = known & (first < _bare(first[known]) + MARGIN) & (second < _bare(second[known]) + MARGIN)
+    gains = light_gains(earlier, later, bare_ground if bare_ground.any() else known)
+    second = greenness(smoothed(with_light(later, gains), known, sigma))
+    bare = _bare(np.concatenate([first[known], second[known]]))
+    bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
+    difference = (second - first)[bare_ground]
+    scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
+    scatter /= math.sqrt(2)
+    cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
+    inside = {"all": known} | {region.name: rasterised([region], grid) & known for region in regions or []}
+    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, least, grid) for k in (-1, 0, 1)}
+    for name, where in inside.items():
+        areas[name] = {}
+        for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
+            low, value, high = sorted(float(np.isin(classes[k][where], codes).sum()) * cell for k in (-1, 0, 1))
+            value = float(np.isin(classes[0][where], codes).sum()) * cell
+            areas[name][what] = Area(value, low, high)
+    red, green, blue = (float(gain) for gain in gains)
+    return Cover(grid, classes[0], (red, green, blue), bare, float(scatter), float(known.sum()) * cell, areas)
+
+
+def _classes(
+    first: Float32[np.ndarray, "rows columns"],
+    second: Float32[np.ndarray, "rows columns"],
+    known: Bool[np.ndarray, "rows columns"],
+    threshold: float,
+    least: float,
+    grid: Grid,
+) -> Int8[np.ndarray, "rows columns"]:
+    """Classes as `Cover` has them; what changed too little, and patches that are too small, keep what they were."""
+    before, after = first > threshold, second > threshold
+    after = np.where(np.abs(second - first) > least, after, before)
+    for moved in (after & ~before, before & ~after):
+        after = np.where(small_patches(moved, grid, LEAST_M2), before, after)
+    classes = np.where(after, np.where(before, 2, 1), np.where(before, -1, 0)).astype(np.int8)
+    return np.where(known, classes, _UNKNOWN)
+
+
+def small_patches(
+    region: Bool[np.ndarray, "rows columns"], grid: Grid, least_m2: float
+) -> Bool[np.ndarray, "rows columns"]:
+    """The connected parts of a region that are smaller than an area."""
+    numbers = np.empty(region.shape, np.int32)
+    label(region, output=numbers)
+    small = np.bincount(numbers.ravel()) * grid.cell_area_m2 < least_m2
+    small[0] = False
+    return small[numbers]
+
+
+def _bare(values: Float32[np.ndarray, " N"]) -> float:
+    """Greenness of bare ground: the lowest of the common values, from a smoothed histogram."""
+    if not len(values):
+        return 0.0
+    low, high = np.quantile(values, (0.001, 0.999))
+    edges = np.arange(low - 2 * _BIN, max(high, low + _BIN) + 3 * _BIN, _BIN)
+    counts = np.convolve(np.histogram(values, edges)[0], np.ones(5), "same")
+    peak = (counts[1:-1] >= counts[:-2]) & (counts[1:-1] >= counts[2:]) & (counts[1:-1] >= _COMMON * counts.max())
+    at = int(np.argmax(peak)) + 1
+    return float(edges[at] + edges[at + 1]) / 2
+
+
+def _resampled(cells: Bool[np.ndarray, "rows columns"], grid: Grid, to: Grid) -> Bool[np.ndarray, "rows columns"]:
+    """Cells of another grid whose centres are in cells of this one."""
+    rows = ((grid.north_m - (to.north_m - (np.arange(to.rows) + 0.5) * to.cell_m)) / grid.cell_m).astype(int)
+    columns = ((to.west_m + (np.arange(to.columns) + 0.5) * to.cell_m - grid.west_m) / grid.cell_m).astype(int)
+    return cells[np.clip(rows, 0, grid.rows - 1)[:, None], np.clip(columns, 0, grid.columns - 1)[None]]

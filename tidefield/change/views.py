@@ -1,0 +1,273 @@
+"""The same place then and now: views of both surveys from one camera, and what differs between them but the light.
+
+The earlier photograph's camera is carried into the later survey through map coordinates and co-registration, so that
+both views show the same ground at the same pixel.
+
+What only light changes is told from what changed on the ground: light makes a place brighter or darker and moves its
+colour along the line from blue to yellow, which shade and other times of the day share. Along that line log(R B / G^2)
+is constant (after Finlayson, Drew and Lu, Entropy minimization for shadow removal, 2009, doi
+10.1007/s11263-008-0171-3, with the line of a camera whose channels are sRGB's). Heights and plants come from the
+change itself. Ground that became wet is darker, too: pictures cannot tell it from shade.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from pyproj import CRS, Transformer
+
+from tidefield.change.cover import Cover
+from tidefield.change.errors import nmad
+from tidefield.change.light import light_gains, with_light
+from tidefield.change.measure import Change
+from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.data.georeference import read_georeference
+from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.maps.grid import MapFrame, map_frame
+from tidefield.model.rendering import Render, Rendering
+from tidefield.render.stills import MIN_OPACITY, colour_picture
+
+SAME, LIGHT, COLOUR, LOWER, HIGHER, GAINED, LOST, UNKNOWN = range(8)
+"""Kinds of difference: none, light only, colour of the ground, height, plants; not seen or not compared."""
+_DARK = 6.0
+_SMOOTH_PX = 2.0
+_STANDS_OUT = 3.0
+_LEAST_LIGHT, _LEAST_COLOUR = 0.15, 0.12
+"""Differences of log values that are worth showing."""
+_ARM = 10.0
+"""Length of the axes by which a camera's attitude is carried over, in scene units."""
+_HIDDEN = 0.05
+"""Share of the depth by which the dates' depths may differ before one of the views shows something in front."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """A survey's scene, how it is rendered, and its map coordinates."""
+
+    scene: Scene
+    render: Render
+    frame: MapFrame
+
+    @classmethod
+    def of(cls, scene: Scene, render: Render) -> Site:
+        return cls(scene, render, map_frame(scene, read_georeference(scene.root)))
+
+
+@dataclass(frozen=True)
+class View:
+    """Views of both dates from one camera, the later one in the earlier one's light.
+
+    Attributes:
+        name: of the earlier photograph.
+        kinds: of difference at each pixel.
+    """
+
+    name: str
+    earlier: UInt8[np.ndarray, "H W 3"]
+    later: UInt8[np.ndarray, "H W 3"]
+    kinds: UInt8[np.ndarray, "H W"]
+
+    def share(self, kind: int) -> float:
+        """Of the pixels that are seen and compared at both dates."""
+        seen = self.kinds != UNKNOWN
+        return float((self.kinds[seen] == kind).mean()) if seen.any() else 0.0
+
+
+def carried(
+    camera: Cameras, earlier: Site, later: Site, shift_m: tuple[float, float] = (0.0, 0.0), lift_m: float = 0.0
+) -> Cameras:
+    """A camera of the earlier scene in the later one, where it sees the same ground.
+
+    Args:
+        shift_m: by which the later survey is moved east and north to lie on the earlier one.
+        lift_m: what is taken from the later heights.
+
+    Raises:
+        ChangeError: one of the scenes has a georeference and the other none, or their systems do not fit together.
+    """
+    pose = camera.T_world_camera[0].double().numpy()
+    points = np.vstack([pose[:, 3], pose[:, 3] + _ARM * pose[:, :3].T])
+    one, other = earlier.frame, later.frame
+    on_map = _between(one, other)(one.to_map(points))
+    on_map -= [shift_m[0] * other.metre, shift_m[1] * other.metre, -lift_m * other.metre_up]
+    moved = other.to_scene(on_map)
+    u, _, vt = np.linalg.svd(((moved[1:] - moved[0]) / _ARM).T)
+    made = torch.from_numpy(np.column_stack([u @ vt, moved[0]])).float()[None]
+    return replace(camera, T_world_camera=made, names=())
+
+
+def _between(one: MapFrame, other: MapFrame) -> Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, "N 3"]]:
+    """Conversion of easting, northing and height from one map's system to another's."""
+    if (one.frame is None) != (other.frame is None):
+        raise ChangeError(
+            "one of the scenes is georeferenced, the other is not: expected both in one system; prepare both with "
+            "positions or ground control"
+        )
+    if one.frame is None or one.horizontal_wkt == other.horizontal_wkt:
+        return lambda points: points.copy()
+    to = Transformer.from_crs(CRS.from_wkt(one.horizontal_wkt), CRS.from_wkt(other.horizontal_wkt), always_xy=True)
+    return lambda points: np.column_stack([*to.transform(points[:, 0], points[:, 1], errcheck=True), points[:, 2]])
+
+
+def choose_camera(change: Change, site: Site) -> str:
+    """Name of the photograph that looks at the largest outlined volume, or at the middle where there is none."""
+    grid = change.grid
+    if change.each:
+        number = max(change.each, key=lambda each: each[1].value_m3)[0]
+        rows, columns = change.outlines.boxes[number - 1]
+    else:
+        rows, columns = slice(0, grid.rows), slice(0, grid.columns)
+    middle = [
+        grid.west_m + (columns.start + columns.stop) / 2 * grid.cell_m,
+        grid.north_m - (rows.start + rows.stop) / 2 * grid.cell_m,
+    ]
+    cameras = site.scene.cameras
+    depth = cameras.near_far.mean(1, keepdim=True)
+    aim = (cameras.position_world + depth * cameras.forward_world).double().numpy()
+    on_map = _to_grid(site.frame, grid)(aim)
+    return site.scene.names[int(np.hypot(*(on_map[:, :2] - middle).T).argmin())]
+
+
+def _to_grid(frame: MapFrame, grid: Grid) -> Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, "N 3"]]:
+    """Conversion of scene coordinates to a change's grid coordinates.
+
+    Raises:
+        ChangeError: the scene has a place on the Earth and the surfaces have none, or the other way round.
+    """
+    if (frame.frame is None) != (grid.crs is None):
+        placed, bare = (
+            ("the earlier scene", "the surfaces") if grid.crs is None else ("the surfaces", "the earlier scene")
+        )
+        raise ChangeError(
+            f"{placed} lie in a coordinate system, {bare} in none: expected maps of these scenes; make them with "
+            "`tidefield map`"
+        )
+    if frame.frame is None or grid.crs is None:
+        return frame.to_map
+    system, target = CRS.from_wkt(frame.horizontal_wkt), CRS.from_wkt(grid.crs)
+    if system.equals(target, ignore_axis_order=True):
+        return frame.to_map
+    to = Transformer.from_crs(system, target, always_xy=True)
+
+    def convert(points: np.ndarray) -> np.ndarray:
+        own = frame.to_map(points)
+        return np.column_stack([*to.transform(own[:, 0], own[:, 1], errcheck=True), own[:, 2]])
+
+    return convert
+
+
+def make_view(
+    change: Change, cover: Cover | None, earlier: Site, later: Site, name: str, width: int | None = None
+) -> View:
+    """Render both dates from an earlier photograph's camera, and tell what differs.
+
+    Raises:
+        SceneError: the earlier scene has no photograph of this name.
+    """
+    index = earlier.scene.index(name)
+    camera = earlier.scene.cameras[index]
+    if width is not None:
+        camera = camera.resized(width, max(16, round(width * camera.height / camera.width)))
+    camera = replace(camera, gain=torch.ones_like(camera.gain), shading=None)
+    registration = change.errors.registration
+    other = carried(camera, earlier, later, registration.shift_m, registration.vertical_m)
+    first, second = earlier.render(camera), later.render(other)
+    place = _cells(camera, first, earlier.frame, change.grid)
+    return _compared(earlier.scene.names[index], first, second, place, change, cover)
+
+
+def _cells(camera: Cameras, view: Rendering, frame: MapFrame, grid: Grid) -> Float64[np.ndarray, "P 2"]:
+    """Easting and northing of what each pixel shows, in the grid's coordinates."""
+    rays = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
+    points = camera.position_world + rays * view.depth.reshape(-1, 1).cpu()
+    points = points.double().numpy()
+    # Over a view the map is affine to millimetres: it is fitted to some of its points.
+    finite = np.isfinite(points).all(axis=1)
+    some = points[finite][:: max(1, int(finite.sum()) // 500)]
+    if len(some) < 4:
+        return np.full((len(points), 2), np.nan)
+    middle = some.mean(axis=0)
+    design = np.column_stack([some - middle, np.ones(len(some))])
+    on_map = _to_grid(frame, grid)(some)[:, :2]
+    start = on_map.mean(axis=0)
+    solved = np.linalg.lstsq(design, on_map - start, rcond=None)[0]
+    return np.column_stack([points - middle, np.ones(len(points))]) @ solved + start
+
+
+def _compared(
+    name: str,
+    first: Rendering,
+    second: Rendering,
+    place: Float64[np.ndarray, "P 2"],
+    change: Change,
+    cover: Cover | None,
+) -> View:
+    shape = first.depth.shape
+    one, other = colour_picture(first), colour_picture(second)
+    depths = [view.depth.detach().float().cpu().numpy() for view in (first, second)]
+    seen = np.logical_and.reduce([(v.opacity >= MIN_OPACITY).cpu().numpy() for v in (first, second)])
+    with np.errstate(invalid="ignore"):
+        seen &= np.abs(depths[1] - depths[0]) < _HIDDEN * depths[0]
+    outlined = np.concatenate([[0], change.outlines.signs])[change.outlines.labels]
+    known = _sampled(np.isfinite(change.dz), change.grid, place, 0).reshape(shape) > 0
+    sign = _sampled(outlined, change.grid, place, 0).reshape(shape)
+    planted = np.zeros(shape, int) if cover is None else _sampled(cover.classes, cover.grid, place, 0).reshape(shape)
+    steady = seen & known & (sign == 0) & (planted != 1) & (planted != -1)
+    gains = light_gains(one, other, steady if steady.any() else seen)
+    evened = with_light(other, gains)
+    kinds = colour_kinds(one, evened, steady)
+    for where, kind in (
+        (planted == -1, LOST),
+        (planted == 1, GAINED),
+        (sign < 0, LOWER),
+        (sign > 0, HIGHER),
+        (~seen | ~known, UNKNOWN),
+    ):
+        kinds[where] = kind
+    return View(name, one, evened, kinds)
+
+
+def colour_kinds(
+    earlier: UInt8[np.ndarray, "H W 3"], later: UInt8[np.ndarray, "H W 3"], steady: np.ndarray
+) -> UInt8[np.ndarray, "H W"]:
+    """Where pictures differ by light only, and where by the colour of the ground.
+
+    Args:
+        earlier, later: in one light, but for shadows.
+        steady: pixels that noise is measured on.
+    """
+    logs = [
+        np.log(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX) + np.float32(_DARK))
+        for picture in (earlier, later)
+    ]
+    difference = logs[1] - logs[0]
+    bright = difference.mean(axis=2)
+    across = difference[..., 0] + difference[..., 2] - 2 * difference[..., 1]
+    kinds = np.full(bright.shape, SAME, np.uint8)
+    if not steady.any():
+        return kinds
+    limits = [
+        max(least, _STANDS_OUT * nmad(values[steady]))
+        for values, least in ((bright, _LEAST_LIGHT), (across, _LEAST_COLOUR))
+    ]
+    kinds[np.abs(bright - np.median(bright[steady])) > limits[0]] = LIGHT
+    kinds[np.abs(across - np.median(across[steady])) > limits[1]] = COLOUR
+    return kinds
+
+
+def _sampled(values: np.ndarray, grid: Grid, place: Float64[np.ndarray, "P 2"], outside: int) -> np.ndarray:
+    """Values of the cells that points are in."""
+    known = np.isfinite(place).all(axis=1)
+    column, row = np.full(len(place), -1), np.full(len(place), -1)
+    column[known] = np.floor((place[known, 0] - grid.west_m) / grid.cell_m).astype(int)
+    row[known] = np.floor((grid.north_m - place[known, 1]) / grid.cell_m).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < grid.columns) & (row < grid.rows)
+    found = np.full(len(place), outside, int)
+    found[inside] = values[row[inside], column[inside]]
+    return found

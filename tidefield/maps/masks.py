@@ -1,0 +1,266 @@
+"""Find plants and water on a map: a raster of classes, polygons, and the waterline with its height.
+
+Plants are green: their excess green (Woebbecke and others, Color indices for weed identification under various soil,
+residue, and lighting conditions, 1995) is above a threshold. Water is where photographs do not agree, for its surface
+mirrors and has no marks of its own, and where the surface is level. From such places a body of water reaches as far as
+the heights are its level. It is none if its heights are spread, or if lower ground begins at its shore.
+
+The thresholds were found on built-in flats of other seeds than those of `python -m benchmarks maps`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
+from shapely.geometry.base import BaseGeometry
+
+from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.contours import read_reduced
+from tidefield.maps.grid import Grid
+from tidefield.maps.rasters import Raster, need, raster_writer
+from tidefield.maps.terrain import blocks
+from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
+
+GREEN = 0.13
+"""Excess green, of colours that sum to 1, from which a cell shows a plant."""
+LEAST_AGREEMENT, SHORE_AGREEMENT = 0.15, 0.3
+"""Mean correlation of the photographs below which a cell may begin a body of water, and may belong to one."""
+LEVEL_M, AGREEMENT_M = 0.15, 0.2
+"""Standard deviations of the windows in which the surface is level, and in which the agreement is a mean, metres."""
+SLOPE, ROUGHNESS_M = 0.02, 0.02
+"""Slope of, and deviation of heights in, windows of level water, at most."""
+TOLERANCE_M = 0.03
+"""Heights of water differ from its level by so much, or twice their spread, at most."""
+SPREAD_M, SPREAD_CELLS = 0.01, 0.15
+"""Largest spread of the smoothed heights of a body of water, in metres or in cells of the map."""
+LOWER_M, LOWER_SHARE = 0.01, 0.15
+"""A body is none if more than such a share of its shore is lower by so much."""
+SMALLEST_M2 = 1.0
+"""Smallest body of water."""
+BLOCK_M = 2.0
+"""Side of the squares whose medians are taken for independent in the standard error of a level."""
+SMALLEST_CELLS = 12
+"""Smaller polygons are left out."""
+SIMPLIFIED_CELLS = 0.7
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body of water.
+
+    Attributes:
+        level: its height, vertical units.
+        sigma: standard error of the level, without that of the map's datum.
+        tolerance: by which heights of its cells may differ.
+        area: square horizontal units.
+    """
+
+    level: float
+    sigma: float
+    tolerance: float
+    area: float
+
+
+def excess_green(colour: UInt8[np.ndarray, "3 h w"]) -> Float[np.ndarray, "h w"]:
+    """Excess green 2 g - r - b of colours that sum to 1, of slightly blurred colours; 0 for black."""
+    red, green, blue = (cv2.GaussianBlur(band.astype(np.float32), (0, 0), 1.0) for band in colour)
+    return (2 * green - red - blue) / np.maximum(red + green + blue, 1.0)
+
+
+def find_water(
+    height: Float[np.ndarray, "h w"], agreement: Float[np.ndarray, "h w"], plants: Bool[np.ndarray, "h w"], grid: Grid
+) -> tuple[Int[np.ndarray, "h w"], list[Body]]:
+    """Find bodies of water.
+
+    Args:
+        height: of cells, NaN where there are none.
+        agreement: mean correlation of the photographs there.
+        plants: cells that show plants.
+        grid: the cells.
+
+    Returns:
+        The number of the body in each cell, from 1, 0 for none; and the bodies.
+    """
+    cell, up = grid.cell / grid.frame.metre, grid.frame.metre_up
+    known = np.isfinite(height) & ~plants
+    labels, bodies = np.zeros(height.shape, np.int32), []
+    if not known.any():
+        return labels, bodies
+    base = float(np.median(height[known]))
+    above = (np.where(known, height - base, 0) / up).astype(np.float32)
+    mean = _smooth(above, known, LEVEL_M / cell)
+    rough = np.sqrt(np.maximum(_smooth(above**2, known, LEVEL_M / cell) - mean**2, 0))
+    south, east = np.gradient(mean, cell)
+    agree = _smooth(np.nan_to_num(agreement), known, AGREEMENT_M / cell)
+    seed = known & (agree < LEAST_AGREEMENT) & (np.hypot(south, east) < SLOPE) & (rough < ROUGHNESS_M)
+    count, seeds = _components(_closed(seed))
+    areas = np.bincount(seeds.ravel(), minlength=count) * cell**2
+    places = ndimage.find_objects(seeds)
+    for k in sorted(range(1, count), key=lambda k: -areas[k]):
+        if areas[k] < SMALLEST_M2:
+            break
+        inside = seeds[places[k - 1]] == k
+        if (labels[places[k - 1]][inside] > 0).mean() > 0.5:
+            continue
+        heights = above[places[k - 1]][inside & known[places[k - 1]]]
+        level = float(np.median(heights))
+        tolerance = max(TOLERANCE_M, 2 * _spread(heights - level))
+        mine = known & (np.abs(mean - level) <= tolerance) & (agree < SHORE_AGREEMENT)
+        mine &= np.abs(above - level) <= 3 * tolerance
+        mine[places[k - 1]] |= inside
+        parts = _components(mine)[1]
+        touched = np.unique(parts[places[k - 1]][inside])
+        body = ndimage.binary_opening(_closed(np.isin(parts, touched[touched > 0])), iterations=2) & (labels == 0)
+        wet = body & known
+        side = 2 * math.ceil(LEVEL_M / cell) + 1
+        shore = cv2.dilate(body.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        shore &= known & ~body
+        if not wet.any() or _spread(mean[wet] - level) > max(SPREAD_M, SPREAD_CELLS * cell):
+            continue
+        if shore.any() and (mean[shore] < level - LOWER_M).mean() > LOWER_SHARE:
+            continue
+        error = _level_error(above, wet, level, max(1, round(BLOCK_M / cell)))
+        labels[body] = len(bodies) + 1
+        bodies.append(Body(base + level * up, error * up, tolerance * up, float(body.sum()) * grid.cell**2))
+    return labels, bodies
+
+
+def _smooth(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
+    """Mean of known values in Gaussian windows of at least a cell."""
+    sigma = max(sigma, 1.0)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma)
+    return cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), sigma) / np.maximum(weight, 1e-6)
+
+
+def _closed(mask: np.ndarray) -> np.ndarray:
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+def _components(mask: np.ndarray) -> tuple[int, np.ndarray]:
+    """Number of connected parts, the background included, and the part of each cell."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return count, np.asarray(labels)
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(1.4826 * np.median(np.abs(values)))
+
+
+def _level_error(height: np.ndarray, wet: np.ndarray, level: float, side: int) -> float:
+    """Standard error of a level: that of the mean of squares' medians; the cells' spread with fewer than four."""
+    medians = []
+    for row in range(0, height.shape[0], side):
+        for column in range(0, height.shape[1], side):
+            square = slice(row, row + side), slice(column, column + side)
+            if wet[square].sum() > side * side / 8:
+                medians.append(np.median(height[square][wet[square]]))
+    if len(medians) < 4:
+        return _spread(height[wet] - level)
+    return float(np.std(medians, ddof=1) / math.sqrt(len(medians)))
+
+
+def read_water(dsm: Path, agreement: Path, orthophoto: Path, grid: Grid) -> tuple[np.ndarray, list[Body], Grid]:
+    """Find water on a finished map, in cells that are as much larger as memory asks; returns those cells, too.
+
+    Args:
+        dsm, agreement, orthophoto: of the map; agreement in per cent.
+        grid: of the map.
+    """
+    height, coarse = read_reduced(dsm, grid)
+    colour = np.stack([np.nan_to_num(read_reduced(orthophoto, grid, band)[0]) for band in (1, 2, 3)])
+    plants = excess_green(colour.round().astype(np.uint8)) > GREEN
+    labels, bodies = find_water(height, read_reduced(agreement, grid)[0] / 100, plants, coarse)
+    return labels, bodies, coarse
+
+
+def write_classes(
+    out: Raster, dsm: Path, orthophoto: Path, water: tuple[np.ndarray, Sequence[Body], Grid], grid: Grid
+) -> None:
+    """Write the class of each cell: ground, vegetation or water, as LAS numbers them; 0 where there is no surface.
+
+    Args:
+        out: what to write.
+        dsm, orthophoto: of the map.
+        water: number of the body in coarse cells, the bodies, and those cells.
+        grid: of the map.
+    """
+    labels, bodies, coarse = water
+    factor = round(coarse.cell / grid.cell)
+    if factor > 1:  # the shore within a coarse cell is found by its height
+        labels = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+    level = np.array([np.nan, *(body.level for body in bodies)], np.float32)
+    tolerance = np.array([0, *(body.tolerance for body in bodies)], np.float32)
+    with raster_writer(out, grid) as writer:
+        for (row, count, height), colour in zip(blocks(dsm), _colours(orthophoto, around=4), strict=True):
+            rows = np.minimum(np.arange(row, row + count) // factor, labels.shape[0] - 1)
+            columns = np.minimum(np.arange(grid.columns) // factor, labels.shape[1] - 1)
+            body = labels[np.ix_(rows, columns)]
+            wet = body > 0
+            if factor > 1:
+                wet &= height <= level[body] + tolerance[body]
+            green = excess_green(colour)[4 : 4 + count] > GREEN
+            classes = np.where(green, VEGETATION, np.where(wet, WATER, GROUND))
+            writer.write(row, np.where(np.isfinite(height), classes, 0)[None])
+
+
+def _colours(path: Path, around: int) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
+    bands = [blocks(path, around, band) for band in (1, 2, 3)]
+    for red, green, blue in zip(*bands, strict=True):
+        yield np.stack([np.nan_to_num(band[2]).astype(np.uint8) for band in (red, green, blue)])
+
+
+def write_masks(classes: Path, water: tuple[np.ndarray, Sequence[Body], Grid], grid: Grid, folder: Path) -> None:
+    """Write masks.gpkg with the layers vegetation, water and waterline, and a GeoJSON of each, into a folder.
+
+    Plants are outlined in cells that are as much larger as memory asks.
+    """
+    labels, bodies, coarse = water
+    values, reduced = read_reduced(classes, grid, resampling="mode")
+    plants = _outlines(values == VEGETATION, reduced)
+    wet = [(shape, body) for k, body in enumerate(bodies) for shape in _outlines(labels == k + 1, coarse)]
+    fields = {
+        "height": [body.level for _, body in wet],
+        "sigma": [body.sigma for _, body in wet],
+        "area": [shape.area for shape, _ in wet],
+    }
+    layers = [
+        Layer("vegetation", "Polygon", plants, {"area": [shape.area for shape in plants]}),
+        Layer("water", "Polygon", [shape for shape, _ in wet], fields),
+        _waterline(wet, grid),
+    ]
+    write_geopackage(folder / "masks.gpkg", layers, grid.frame)
+    for layer in layers:
+        write_geojson(folder / f"{layer.name}.geojson", layer, grid.frame)
+
+
+def _outlines(mask: Bool[np.ndarray, "h w"], grid: Grid) -> list[BaseGeometry]:
+    """Polygons of a mask, in map coordinates."""
+    from rasterio.transform import Affine
+
+    features = need("rasterio.features")
+    found = features.shapes(mask.astype(np.uint8), mask=mask, transform=Affine(*grid.transform))
+    shapes = [shapely.geometry.shape(shape).simplify(SIMPLIFIED_CELLS * grid.cell) for shape, _ in found]
+    return [shape for shape in shapes if shape.area >= SMALLEST_CELLS * grid.cell**2]
+
+
+def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], grid: Grid) -> Layer:
+    """The shores of water, without those stretches where the map ends."""
+    rim = shapely.box(*grid.bounds).buffer(-3 * grid.cell)
+    lines, bodies = [], []
+    for shape, body in wet:
+        cut = shape.boundary.intersection(rim)
+        merged = shapely.line_merge(cut) if cut.geom_type == "MultiLineString" else cut
+        for line in getattr(merged, "geoms", [merged]):
+            if line.geom_type == "LineString" and line.length > 0:
+                lines.append(line)
+                bodies.append(body)
+    fields = {"height": [body.level for body in bodies], "sigma": [body.sigma for body in bodies]}
+    return Layer("waterline", "LineString", lines, fields)

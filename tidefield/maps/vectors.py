@@ -1,0 +1,74 @@
+"""Write shapes of a map as GeoPackage and GeoJSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from pyproj import CRS, Transformer
+from shapely.geometry.base import BaseGeometry
+
+from tidefield.files import completed_file, write_text
+from tidefield.geometry.geodesy import WGS84
+from tidefield.maps.grid import MapFrame
+from tidefield.maps.rasters import need
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Shapes of one kind.
+
+    Attributes:
+        name: of the layer.
+        kind: of the shapes, such as "Polygon".
+        shapes: in map coordinates.
+        fields: numbers of each shape.
+    """
+
+    name: str
+    kind: str
+    shapes: Sequence[BaseGeometry]
+    fields: Mapping[str, Sequence[float]]
+
+
+def write_geopackage(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
+    """Write layers in map coordinates into one GeoPackage."""
+    with completed_file(path, overwrite=True) as partial:
+        partial.unlink()  # GDAL makes its own
+        for number, layer in enumerate(layers):
+            need("pyogrio").raw.write(
+                partial,
+                geometry=np.array([shapely.to_wkb(shape) for shape in layer.shapes], dtype=object),
+                field_data=[np.array(values, dtype=np.float64) for values in layer.fields.values()],
+                fields=list(layer.fields),
+                geometry_type=layer.kind,
+                crs=frame.horizontal_wkt,
+                driver="GPKG",
+                layer=layer.name,
+                append=number > 0,
+            )
+
+
+def write_geojson(path: Path, layer: Layer, frame: MapFrame) -> None:
+    """Write a layer as GeoJSON, in longitude and latitude (RFC 7946); in a local frame as it is."""
+    move = None
+    if frame.frame is not None:
+        move = Transformer.from_crs(CRS.from_wkt(frame.horizontal_wkt), WGS84, always_xy=True)
+
+    def moved(xy: np.ndarray) -> np.ndarray:
+        return np.round(xy if move is None else np.column_stack(move.transform(*xy.T)), 9)
+
+    features: list[dict[str, Any]] = [
+        {
+            "type": "Feature",
+            "properties": {name: values[k] for name, values in layer.fields.items()},
+            "geometry": shapely.geometry.mapping(shapely.transform(shape, moved)),
+        }
+        for k, shape in enumerate(layer.shapes)
+    ]
+    write_text(path, json.dumps({"type": "FeatureCollection", "features": features}) + "\n")
