@@ -45,7 +45,7 @@ BORDER_PX = 4.0
 """Pixels along a photograph's border that are not used."""
 STEP_PX = 0.7
 """Parallax between heights that are tried, of the photographs farthest apart, in cells."""
-SWEEPS = ((1.0, 3), (0.5, 3))
+SWEEPS = ((1.0, 3), (0.5, 3), (0.35, 3))
 """Share of the step, and heights that are tried above and below the surface found so far, in each sweep."""
 ABOVE, BELOW = 0.15, 0.05
 """How far above and below the sparse points the surface is searched, as a share of the flight's height: that is how
