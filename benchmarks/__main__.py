@@ -285,6 +285,28 @@ def map_control(
     write_json(runs / "map_control.json", record)
 
 
+def map_memory(
+    scene: tyro.conf.Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
+) -> None:
+    """Peak memory of a map of a square kilometre, simulated by repeating a scene (an hour, 20 GB of disk).
+
+    Args:
+        scene: A scene in metres, such as one of those that maps makes.
+        runs: Folder for the map, which is deleted afterwards, and for map_memory.json.
+        metres: Side of the square.
+        cell: Side of a cell, metres.
+    """
+    tune_process()
+    from benchmarks.map_memory import measure_memory
+
+    found = measure_memory(scene, runs, metres, cell, partial(print, flush=True))
+    print(
+        f"{found['square_metres']:,.0f} m2, {found['cells']:,} cells of {100 * cell:g} cm, {found['points']:,} points: "
+        f"peak memory {found['peak_memory_bytes'] / 1e9:.2f} GB, {found['seconds']:.0f} s after the tiles, "
+        f"{found['tile_seconds']:.0f} s a tile, {found['disk_bytes'] / 1e9:.1f} GB of files"
+    )
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -369,6 +391,7 @@ def main(words: Sequence[str] | None = None) -> None:
         surveys,
         maps,
         map_control,
+        map_memory,
         change,
         kills,
         fuzz,
