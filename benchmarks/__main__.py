@@ -285,6 +285,20 @@ def map_control(
     write_json(runs / "map_control.json", record)
 
 
+def map_views(scene: tyro.conf.Positional[Path], runs: Path = Path("runs/map_views"), half: float = 6.0) -> None:
+    """A photograph of a built-in flat that took no part in its map, against the orthophoto warped into it (minutes).
+
+    Args:
+        scene: A built-in flat, such as one of those that maps makes.
+        runs: Folder for the map and map_views.json.
+        half: Half the side of the square that is mapped, metres.
+    """
+    tune_process()
+    from benchmarks.map_views import measure_views, table
+
+    print(table(measure_views(scene, runs, half, partial(print, flush=True))).markdown())
+
+
 def map_memory(
     scene: tyro.conf.Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
 ) -> None:
@@ -392,6 +406,7 @@ def main(words: Sequence[str] | None = None) -> None:
         maps,
         map_control,
         map_memory,
+        map_views,
         change,
         kills,
         fuzz,
