@@ -77,3 +77,29 @@ def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: 
     assert found["peak_memory_bytes"] >= found["peak_memory_tiles_bytes"] > 1e8
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {"map_memory.json"}
     assert "16 tiles" in said[1]
+
+
+def test_an_orthophoto_is_warped_to_where_the_photograph_shows_it(tmp_path: Path):
+    from benchmarks.map_views import warp
+    from tidefield.maps.grid import Tile
+    from tidefield.maps.surface import View
+
+    survey = make_survey("ground_textures", seed=4, views=6, width=320)
+    write_survey(survey, tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", hold_out=False, cache=tmp_path / "cache")
+    grid = Grid(map_frame(scene, None), -6.0, 6.0, 0.1, 120, 120, 0.0)
+    height, colour, _ = _truth(tmp_path / "scene", grid)
+    position = (scene.cameras.position_world + scene.origin_world).numpy()
+    index = int(np.linalg.norm(position[:, :2], axis=1).argmin())
+    view = View(scene.cameras[index], Tile(grid, 0, 0, 120, 0))
+    truth = scene.photographs[index].numpy().astype(float)
+
+    def error(heights: np.ndarray) -> float:
+        shown, known = warp(colour.astype(np.uint8), heights.astype(np.float32), view, grid)
+        assert 1000 < known.sum() < known.size
+        away = shown[known] - truth[known]
+        return float(away.std())
+
+    assert error(height) < 0.8 * error(height + 3.0)  # 3 m shift pixels by one or more
+    height[:60] = np.nan
+    assert error(height) > 0
