@@ -61,6 +61,7 @@ def test_overlaps_are_intersections_over_unions():
     assert overlaps(np.array([2]), np.array([2]))["water"]["iou"] is None
 
 
+@pytest.mark.slow
 def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from benchmarks.map_memory import measure_memory
     from tidefield.maps import make
