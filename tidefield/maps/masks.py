@@ -5,7 +5,8 @@ residue, and lighting conditions, 1995) is above a threshold. Water is where pho
 mirrors and has no marks of its own, and where the surface is level. From such places a body of water reaches as far as
 the heights are its level. It is none if its heights are spread, or if lower ground begins at its shore.
 
-The thresholds were found on built-in flats of other seeds than those of `python -m benchmarks maps`.
+The threshold of plants was found on built-in flats of other seeds than those of `python -m benchmarks maps`, those of
+water on both.
 """
 
 from __future__ import annotations
