@@ -351,6 +351,42 @@ def map_control(
     write_json(runs / "map_control.json", record)
 
 
+def map_views(scene: tyro.conf.Positional[Path], runs: Path = Path("runs/map_views"), half: float = 6.0) -> None:
+    """A photograph of a built-in flat that took no part in its map, against the orthophoto warped into it (minutes).
+
+    Args:
+        scene: A built-in flat, such as one of those that maps makes.
+        runs: Folder for the map and map_views.json.
+        half: Half the side of the square that is mapped, metres.
+    """
+    tune_process()
+    from benchmarks.map_views import measure_views, table
+
+    print(table(measure_views(scene, runs, half, partial(print, flush=True))).markdown())
+
+
+def map_memory(
+    scene: tyro.conf.Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
+) -> None:
+    """Peak memory of a map of a square kilometre, simulated by repeating a scene (an hour, 20 GB of disk).
+
+    Args:
+        scene: A scene in metres, such as one of those that maps makes.
+        runs: Folder for the map, which is deleted afterwards, and for map_memory.json.
+        metres: Side of the square.
+        cell: Side of a cell, metres.
+    """
+    tune_process()
+    from benchmarks.map_memory import measure_memory
+
+    found = measure_memory(scene, runs, metres, cell, partial(print, flush=True))
+    print(
+        f"{found['square_metres']:,.0f} m2, {found['cells']:,} cells of {100 * cell:g} cm, {found['points']:,} points: "
+        f"peak memory {found['peak_memory_bytes'] / 1e9:.2f} GB, {found['seconds']:.0f} s after the tiles, "
+        f"{found['tile_seconds']:.0f} s a tile, {found['disk_bytes'] / 1e9:.1f} GB of files"
+    )
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -487,8 +523,9 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
+    mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, maps, map_control, points, depth, *changes, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, *mapped, points, depth, *changes, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
