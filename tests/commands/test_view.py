@@ -27,7 +27,7 @@ def scene(tmp_path: Path) -> Path:
 
 def refused(message: str, source: Path, **options) -> None:
     with pytest.raises(TidefieldError, match=message):
-        view(View(source, port=0, no_browser=True, device="cpu", **options), QUIET)
+        view(View((source,), port=0, no_browser=True, device="cpu", **options), QUIET)
 
 
 def test_a_scene_without_zero_shot_is_one_clear_error(scene: Path):
@@ -46,6 +46,17 @@ def test_a_scene_whose_photographs_went_is_one_clear_error(scene: Path):
     pytest.importorskip("viser")
     shutil.rmtree(scene / "images")
     refused("9 of the 9 photographs .* are missing", scene, zero=ZeroShot(zero_shot=True))
+
+
+def test_a_scene_among_maps_and_nothing_at_all_are_one_clear_error(scene: Path, tmp_path: Path):
+    pytest.importorskip("rasterio")
+    from map_folders import write_map
+
+    folder = write_map(tmp_path / "map", (1, 2, 3))
+    with pytest.raises(TidefieldError, match=r"scene is no folder of .* expected several of these, or one run or"):
+        view(View((folder, scene), port=0, no_browser=True), QUIET)
+    with pytest.raises(TidefieldError, match="nothing to look at was named"):
+        view(View((), port=0, no_browser=True), QUIET)
 
 
 def test_a_width_out_of_range_is_one_clear_error(scene: Path):

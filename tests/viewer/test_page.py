@@ -21,7 +21,8 @@ from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
 from tidefield.render.camera_paths import make_trajectory
-from tidefield.viewer.page import ScenePage, require_port
+from tidefield.viewer.page import ScenePage
+from tidefield.viewer.ports import require_port
 
 pytest.importorskip("viser", reason="needs viser, which is not installed")
 SCREENSHOTS = os.environ.get("TIDEFIELD_SCREENSHOTS")

@@ -1,4 +1,4 @@
-"""`tidefield view`: look at a run or a scene in a browser."""
+"""`tidefield view`: look at a run, a scene or maps in a browser."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class View:
-    """Look at a run, or with --zero-shot at a scene, in a browser: a free camera, photographs, points, camera paths.
+    """Look at a run, a scene or maps in a browser.
 
-    A coarse picture is there at once, a sharp one when the camera rests. Only this machine can see the page, unless
-    --host says otherwise. Ctrl-C ends it.
+    Of a run, or with --zero-shot of a scene: a free camera, photographs, points and camera paths. A coarse picture is
+    there at once, a sharp one when the camera rests. Of maps and changes: layers, heights with their errors, ruler,
+    areas with volumes, sections, and two dates side by side. Only this machine can see the page, unless --host says
+    otherwise. Ctrl-C ends it.
     """
 
-    source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
-    """A trained run, or with --zero-shot a scene."""
+    sources: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SCENE|MAP ...")]
+    """A trained run; with --zero-shot a scene; or folders of `tidefield map`, ODM and `tidefield change`, which are
+    shown together from straight above."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     width: int = 800
     """Width of sharp pictures in pixels, at most."""
@@ -50,30 +53,69 @@ class View:
 def view(options: View, console: Console) -> None:
     """Run `tidefield view`."""
     from tidefield.device import choose_device
-    from tidefield.viewer.page import ScenePage, need_viser, require_port
+    from tidefield.viewer.ports import require_port
 
     if not 64 <= options.width <= 4096:
         raise RunError(f"--width {options.width} was asked for: expected 64 to 4096 pixels; choose another")
-    need_viser()
     require_port(options.host, options.port)
+    if not options.sources:
+        raise RunError("nothing to look at was named: expected a run, a scene with --zero-shot, or maps; name one")
+    if not options.zero.zero_shot and _are_maps(options.sources):
+        _view_maps(options, console)
+        return
+    from tidefield.viewer.page import ScenePage, need_viser
+
+    need_viser()
+    source = options.sources[0]
+    if len(options.sources) > 1:
+        raise RunError(f"{len(options.sources)} scenes were named: expected one at a time; leave the others out")
     device = choose_device(options.device)
     with ExitStack() as stack:
         if options.zero.zero_shot:
-            scene = load(options.source, None, options.allow_missing, console)
+            scene = load(source, None, options.allow_missing, console)
             render, _ = open_zero_shot(options.zero, scene, device)
         else:
-            _require_trained(options.source)
-            opened = open_trained(options.source, device, options.allow_missing, console)
+            _require_trained(source)
+            opened = open_trained(source, device, options.allow_missing, console)
             scene, render, _ = stack.enter_context(opened)
-        name = options.source.resolve().name
+        name = source.resolve().name
         page = ScenePage(scene, render, name, options.host, options.port, options.width)
         stack.callback(page.close)
         serve(page.address, options.host, options.no_browser, console)
 
 
+def _are_maps(sources: tuple[Path, ...]) -> bool:
+    """Whether maps are to be shown, rather than a run or a scene.
+
+    Raises:
+        RunError: there are several sources, and one of them is no map.
+    """
+    from tidefield.viewer.atlas import is_sheet
+
+    maps = [is_sheet(source) for source in sources]
+    if len(sources) == 1 or all(maps):
+        return maps[0]
+    other = sources[maps.index(False)]
+    raise RunError(
+        f"{other} is no folder of `tidefield map`, ODM or `tidefield change`: expected several of these, or one run or "
+        "scene; leave it out"
+    )
+
+
+def _view_maps(options: View, console: Console) -> None:
+    from tidefield.viewer.atlas import Atlas
+    from tidefield.viewer.map_page import MapPage
+
+    page = MapPage(Atlas(options.sources), options.host, options.port)
+    try:
+        serve(page.address, options.host, options.no_browser, console)
+    finally:
+        page.close()
+
+
 def serve(address: str, host: str, no_browser: bool, console: Console) -> None:
     """Print where a page is, open a browser, and wait for Ctrl-C."""
-    from tidefield.viewer.page import LOCAL_HOSTS
+    from tidefield.viewer.ports import LOCAL_HOSTS
 
     console.print(f"{address}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
     if host not in LOCAL_HOSTS:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import socket
 import time
 from contextlib import redirect_stdout
 from io import StringIO
@@ -27,6 +26,7 @@ from tidefield.render.camera_paths import layout_of, path_cameras
 from tidefield.render.stills import colour_picture, depth_picture, depth_range
 from tidefield.viewer.frames import Frame, FrameServer
 from tidefield.viewer.key_frames import KeyFrame, PathEditor
+from tidefield.viewer.ports import require_port
 from tidefield.viewer.preview import Preview
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ MOST_FRUSTUMS = 1000
 MOST_POINTS = 100_000
 THUMBNAIL_PX = 96
 LAYERS = ("Colour", "Depth")
-LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
 def need_viser() -> Any:
@@ -63,26 +62,6 @@ def need_viser() -> Any:
             "`pip install 'tidefield[view]'`"
         ) from error
     return viser
-
-
-def require_port(host: str, port: int) -> None:
-    """Raise now what a server on a port that cannot be had would not say: viser silently takes the next one.
-
-    Raises:
-        RunError: the port is in use, not allowed, or the host is not this machine's.
-    """
-    if not 0 <= port <= 65535:
-        raise RunError(f"--port {port} was asked for: expected 0 to 65535; choose another")
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        raise RunError(
-            f"port {port} of {host} cannot be listened on ({error.strerror or error}): expected a free port of this "
-            "machine; choose another with --port, or --port 0 for any that is free"
-        ) from error
 
 
 class ScenePage:
