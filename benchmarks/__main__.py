@@ -299,6 +299,21 @@ def change(
     print(out)
 
 
+def view(scene: Path, runs: Path | None = None, moves: int = 100, rests: int = 5) -> None:
+    """How soon `tidefield view` shows pictures after moves of the camera, and what memory they take (minutes).
+
+    Args:
+        scene: Measure on this scene, with the installed weights of swift.
+        runs: Store the figures in this folder's view.json.
+        moves: Without rest, one after another.
+        rests: Moves after which the sharp picture is waited for.
+    """
+    tune_process()
+    from benchmarks.view import lines, measure_view
+
+    print("\n".join(lines(measure_view(scene, runs, moves=moves, rests=rests))))
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -338,7 +353,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, kills, fuzz)
+    functions = (speed, frames, memory, scales, table, robustness, card, surveys, maps, change, view, kills, fuzz)
     commands = {function.__name__: function for function in functions}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", description=DESCRIPTION, args=words)

@@ -156,6 +156,8 @@ def test_a_viewer_that_leaves_frees_its_work():
         server.leave("a")
         assert server.viewers == 0
         method.may_go.set()
+        eventually(lambda: not server.busy)
+        assert method.finished == 0
         other = Shown()
         server.ask("b", camera(), other)
         other.wait_for(2)

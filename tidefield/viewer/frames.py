@@ -86,7 +86,7 @@ class FrameServer:
         self._may_prepare = True
         self._viewers: dict[Hashable, _Viewer] = {}
         self._changed = threading.Condition()
-        self._closed, self._making_coarse = False, False
+        self._closed, self._making_coarse, self._making_sharp = False, False, False
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._run_coarse, self._run_sharp)]
         for thread in self._threads:
             thread.start()
@@ -123,6 +123,11 @@ class FrameServer:
     def viewers(self) -> int:
         """How many viewers have pictures made."""
         return len(self._viewers)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a picture is being made."""
+        return self._making_coarse or self._making_sharp
 
     def close(self) -> None:
         """Cancel what is being made and end the threads."""
@@ -173,7 +178,7 @@ class FrameServer:
                 if found is None or self._closed:
                     return
                 who, viewer = found
-                viewer.wants_sharp = False
+                viewer.wants_sharp, self._making_sharp = False, True
                 serial, camera, asked, render = viewer.serial, viewer.camera, viewer.asked, self._render
 
             def check(who: Hashable = who, viewer: _Viewer = viewer, serial: int = serial) -> None:
@@ -193,6 +198,8 @@ class FrameServer:
                 check()
             except Cancelled:
                 continue
+            finally:
+                self._making_sharp = False
             if frame.rendering is not None:
                 viewer.seen = points_of(frame.rendering, camera)
             viewer.last_sharp = time.monotonic()
