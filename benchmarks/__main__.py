@@ -484,6 +484,21 @@ def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEA
     store(runs, "chain", run_chain(work, views, width, partial(print, flush=True)))
 
 
+def view(scene: Path, runs: Path | None = None, moves: int = 100, rests: int = 5) -> None:
+    """How soon `tidefield view` shows pictures after moves of the camera, and what memory they take (minutes).
+
+    Args:
+        scene: Measure on this scene, with the installed weights of swift.
+        runs: Store the figures in this folder's view.json.
+        moves: Without rest, one after another.
+        rests: Moves after which the sharp picture is waited for.
+    """
+    tune_process()
+    from benchmarks.view import lines, measure_view
+
+    print("\n".join(lines(measure_view(scene, runs, moves=moves, rests=rests))))
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -525,7 +540,7 @@ def main(words: Sequence[str] | None = None) -> None:
         words = ["speed", *words]
     mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, *mapped, points, depth, *changes, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, *mapped, points, depth, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:
