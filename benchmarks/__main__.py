@@ -267,7 +267,8 @@ def maps(
 
 def points(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
-    runs: Path = Path("runs/points"),
+    work: Path = Path("runs/points"),
+    runs: Path = MEASURED,
     widths: tuple[int, ...] = (400,),
     device: str = "auto",
 ) -> None:
@@ -275,7 +276,8 @@ def points(
 
     Args:
         scenes: With COLMAP models, or posed photographs only, which get COLMAP's points first.
-        runs: Folder for the scenes without points, and points.json; what it holds is not measured again.
+        work: Folder for the scenes without points.
+        runs: Store the figures in this folder's points.json; what it holds is not measured again.
         widths: Of the pictures in pixels.
         device: auto, cpu, cuda, cuda:N or mps.
     """
@@ -285,12 +287,13 @@ def points(
     def run(words: list[str]) -> None:
         run_measured(tidefield(*words), {})
 
-    for table in tables(measure_points(scenes, runs, widths, device, run, partial(print, flush=True))):
+    for table in tables(measure_points(scenes, work, runs, widths, device, run, partial(print, flush=True))):
         print(table.markdown(), end="\n\n")
 
 
 def depth(
-    runs: Path = Path("runs/depth"),
+    work: Path = Path("runs/depth"),
+    runs: Path = MEASURED,
     categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
     width: int = 800,
     views: int = 24,
@@ -301,7 +304,8 @@ def depth(
     """Depths of held-out views of built-in flats against the exact truth and the triangulated points (minutes).
 
     Args:
-        runs: Folder for flats and depth.json; what it holds is not measured again.
+        work: Folder for the flats.
+        runs: Store the figures in this folder's depth.json; what it holds is not measured again.
         categories: Of flats.
         width: Of the photographs in pixels.
         views: Photographs of each survey.
@@ -318,6 +322,7 @@ def depth(
 
     where, file = choose_device(device), given_or_shipped(weights, "swift")
     record = measure_depth(
+        work,
         runs,
         categories,
         width,
@@ -512,7 +517,7 @@ def table(
         comparison: Files of `tidefield compare`; of a result in several files the last one counts.
         ablation: Files of `tidefield ablate`, likewise.
         lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
-        runs: Folder of speed, frames and memory.
+        runs: Folder of speed, frames, memory, depth and points.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
