@@ -267,7 +267,8 @@ def maps(
 
 def points(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
-    runs: Path = Path("runs/points"),
+    work: Path = Path("runs/points"),
+    runs: Path = MEASURED,
     widths: tuple[int, ...] = (400,),
     device: str = "auto",
 ) -> None:
@@ -275,7 +276,8 @@ def points(
 
     Args:
         scenes: With COLMAP models, or posed photographs only, which get COLMAP's points first.
-        runs: Folder for the scenes without points, and points.json; what it holds is not measured again.
+        work: Folder for the scenes without points.
+        runs: Store the figures in this folder's points.json; what it holds is not measured again.
         widths: Of the pictures in pixels.
         device: auto, cpu, cuda, cuda:N or mps.
     """
@@ -285,12 +287,13 @@ def points(
     def run(words: list[str]) -> None:
         run_measured(tidefield(*words), {})
 
-    for table in tables(measure_points(scenes, runs, widths, device, run, partial(print, flush=True))):
+    for table in tables(measure_points(scenes, work, runs, widths, device, run, partial(print, flush=True))):
         print(table.markdown(), end="\n\n")
 
 
 def depth(
-    runs: Path = Path("runs/depth"),
+    work: Path = Path("runs/depth"),
+    runs: Path = MEASURED,
     categories: tuple[str, ...] = ("tidal_trees", "river_mouths", "ground_textures", "vegetation", "deep_water"),
     width: int = 800,
     views: int = 24,
@@ -301,7 +304,8 @@ def depth(
     """Depths of held-out views of built-in flats against the exact truth and the triangulated points (minutes).
 
     Args:
-        runs: Folder for flats and depth.json; what it holds is not measured again.
+        work: Folder for the flats.
+        runs: Store the figures in this folder's depth.json; what it holds is not measured again.
         categories: Of flats.
         width: Of the photographs in pixels.
         views: Photographs of each survey.
@@ -318,6 +322,7 @@ def depth(
 
     where, file = choose_device(device), given_or_shipped(weights, "swift")
     record = measure_depth(
+        work,
         runs,
         categories,
         width,
@@ -349,6 +354,42 @@ def map_control(
     for table in tables(record):
         print(table.markdown(), end="\n\n")
     write_json(runs / "map_control.json", record)
+
+
+def map_views(scene: tyro.conf.Positional[Path], runs: Path = Path("runs/map_views"), half: float = 6.0) -> None:
+    """A photograph of a built-in flat that took no part in its map, against the orthophoto warped into it (minutes).
+
+    Args:
+        scene: A built-in flat, such as one of those that maps makes.
+        runs: Folder for the map and map_views.json.
+        half: Half the side of the square that is mapped, metres.
+    """
+    tune_process()
+    from benchmarks.map_views import measure_views, table
+
+    print(table(measure_views(scene, runs, half, partial(print, flush=True))).markdown())
+
+
+def map_memory(
+    scene: tyro.conf.Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
+) -> None:
+    """Peak memory of a map of a square kilometre, simulated by repeating a scene (an hour, 20 GB of disk).
+
+    Args:
+        scene: A scene in metres, such as one of those that maps makes.
+        runs: Folder for the map, which is deleted afterwards, and for map_memory.json.
+        metres: Side of the square.
+        cell: Side of a cell, metres.
+    """
+    tune_process()
+    from benchmarks.map_memory import measure_memory
+
+    found = measure_memory(scene, runs, metres, cell, partial(print, flush=True))
+    print(
+        f"{found['square_metres']:,.0f} m2, {found['cells']:,} cells of {100 * cell:g} cm, {found['points']:,} points: "
+        f"peak memory {found['peak_memory_bytes'] / 1e9:.2f} GB, {found['seconds']:.0f} s after the tiles, "
+        f"{found['tile_seconds']:.0f} s a tile, {found['disk_bytes'] / 1e9:.1f} GB of files"
+    )
 
 
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
@@ -448,6 +489,21 @@ def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEA
     store(runs, "chain", run_chain(work, views, width, partial(print, flush=True)))
 
 
+def view(scene: Path, runs: Path | None = None, moves: int = 100, rests: int = 5) -> None:
+    """How soon `tidefield view` shows pictures after moves of the camera, and what memory they take (minutes).
+
+    Args:
+        scene: Measure on this scene, with the installed weights of swift.
+        runs: Store the figures in this folder's view.json.
+        moves: Without rest, one after another.
+        rests: Moves after which the sharp picture is waited for.
+    """
+    tune_process()
+    from benchmarks.view import lines, measure_view
+
+    print("\n".join(lines(measure_view(scene, runs, moves=moves, rests=rests))))
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -461,7 +517,7 @@ def table(
         comparison: Files of `tidefield compare`; of a result in several files the last one counts.
         ablation: Files of `tidefield ablate`, likewise.
         lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
-        runs: Folder of speed, frames and memory.
+        runs: Folder of speed, frames, memory, depth and points.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
@@ -487,8 +543,9 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
+    mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, maps, map_control, points, depth, *changes, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, *mapped, points, depth, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:

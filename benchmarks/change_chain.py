@@ -21,7 +21,7 @@ from tidefield.change.regions import Region
 from tidefield.change.surfaces import Grid
 from tidefield.change.write import polygons_of
 from tidefield.data.load import load_scene
-from tidefield.files import completed_folder, read_json, write_text
+from tidefield.files import completed_folder, read_json, write_json, write_text
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.maps.make import MAP_FILE
 from tidefield.synthetic.grids import Extent, Raster
@@ -37,6 +37,8 @@ DATES = ("2023-05-01", "2024-05-01")
 BARE = 0.02
 """Density of plants below which ground counts as bare."""
 _CELL_M = 0.15
+AREA_M = (-8.0, -14.0, 38.0, 14.0)
+"""West, south, east and north of what is mapped, in the flat's coordinates: a bank, the bar, and ground that stays."""
 _LAYERS = ("bed", "surface", "marsh")
 
 
@@ -168,7 +170,7 @@ def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) 
             prepare(Prepare(photographs, scene), console)
         if not (read_json(out / MAP_FILE) or {}).get("complete"):
             say(f"{date}: map")
-            map_(Map(scene, out, ZeroShot(zero_shot=True), gsd=_CELL_M), console)
+            map_(Map(scene, out, ZeroShot(zero_shot=True), gsd=_CELL_M, area=_area(work)), console)
         record["steps"][date] = {**_poses(scene, surveys, k), **_heights(out, surveys, k)}
         say(f"{date}: {record['steps'][date]}")
     say("change")
@@ -178,6 +180,16 @@ def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) 
         record["steps"][f"change, stable ground {name}"] = _against_truth(found, surveys)
         say(f"stable ground {name}: {record['steps'][f'change, stable ground {name}']}")
     return record
+
+
+def _area(work: Path) -> Path:
+    """Write the ground that is mapped as GeoJSON."""
+    west, south, east, north = AREA_M
+    corners = [[west, south, 0.0], [east, south, 0.0], [east, north, 0.0], [west, north, 0.0], [west, south, 0.0]]
+    ring = frame().to_crs(np.array(corners))[:, :2].round(3).tolist()
+    crs = {"type": "name", "properties": {"name": CRS}}
+    write_json(work / "area.geojson", {"type": "Polygon", "crs": crs, "coordinates": [ring]})
+    return work / "area.geojson"
 
 
 def _poses(scene: Path, surveys: Path, k: int) -> dict[str, float]:

@@ -18,6 +18,7 @@ import shapely
 
 from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
+from tidefield.change.light import greenness, smoothed
 from tidefield.change.measure import Options, dilated, measure
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.shift import picture_grid, read_picture
@@ -30,8 +31,10 @@ FLIGHTS = {"first": (1414, 1481), "third": (1548, 1618)}
 CELL_M = 0.15
 SQUARE_M = 20.0
 """Side of the squares of the chessboard: longer than errors of matching are correlated."""
-DARK, GLARING = 60.0, 205.0
-"""Grey values of 255 outside of which ground is water, or so wet or so light that it may be."""
+GRASS = 0.1
+"""Greenness from which ground is grass: neither water, nor mud that may be wet, nor a track that is driven on."""
+SMOOTH_PX = 1.5
+MODELS = ("vertical", "tilt")
 _MARGIN_CELLS = 7
 _LISTS = ("gps.csv", "gcp_list.txt")
 
@@ -87,7 +90,7 @@ def compare(work: Path, say: Callable[[str], object]) -> dict[str, Any]:
     board = chessboard(grid)
     halves = [_regions(dry & (board == k), grid) for k in (0, 1)]
     record: dict[str, Any] = {"dry_m2": float(dry.sum()) * grid.cell_area_m2}
-    for model in ("vertical", "tilt"):
+    for model in MODELS:
         change = measure(
             earlier,
             later,
@@ -129,9 +132,9 @@ def chessboard(grid: Grid) -> np.ndarray:
 
 
 def dry_ground(earlier: Surface, later: Surface, grid: Grid) -> np.ndarray:
-    """Cells that both surveys show neither dark nor glaring, a metre away from what is.
+    """Cells that both surveys show as grass, a metre away from what is none.
 
-    Brightness alone decides: heights, which are what is tested, do not.
+    Colours alone decide: heights, which are what is tested, do not.
     """
     assert earlier.orthophoto is not None
     assert later.orthophoto is not None
@@ -140,8 +143,7 @@ def dry_ground(earlier: Surface, later: Surface, grid: Grid) -> np.ndarray:
     for path in (earlier.orthophoto, later.orthophoto):
         picture, known = read_picture(path, small)
         assert small.shape == grid.shape
-        grey = picture.mean(axis=2)
-        dry &= ~dilated(~known | (grey < DARK) | (grey > GLARING), _MARGIN_CELLS)
+        dry &= ~dilated(~known | (greenness(smoothed(picture, known, SMOOTH_PX)) < GRASS), _MARGIN_CELLS)
     return dry
 
 

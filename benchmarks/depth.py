@@ -7,7 +7,7 @@ The floor is the surface that interpolates the triangulated points in the view (
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ BASELINE_M = 0.5
 
 
 def measure_depth(
+    work: Path,
     runs: Path,
     categories: Sequence[str],
     width: int,
@@ -47,7 +48,8 @@ def measure_depth(
     """Render held-out views of a flat of each category and compare their depths; what was measured is kept.
 
     Args:
-        runs: folder for the flats and depth.json.
+        work: folder for the flats.
+        runs: folder for depth.json.
         categories: of flats.
         width: of the photographs, pixels.
         views: photographs of each survey.
@@ -65,7 +67,7 @@ def measure_depth(
         name = f"{category}, {width} px, {views} photographs, seed {seed}"
         if name in record["figures"]:
             continue
-        folder = runs / f"{category}_{width}_{views}_{seed}"
+        folder = work / f"{category}_{width}_{views}_{seed}"
         if not folder.exists():
             say(f"{name}: photographs")
             with completed_folder(folder) as partial:
@@ -125,7 +127,7 @@ def _parts(scene: Scene, points: Float[Tensor, "H W 3"]) -> tuple[Bool[Tensor, "
     return torch.from_numpy(plants), torch.from_numpy(steep & ~plants)
 
 
-def tables(record: dict[str, Any]) -> list[Table]:
+def tables(record: Mapping[str, Any]) -> list[Table]:
     """One table per part of the ground: errors of both, and the ratios."""
     result = []
     columns = ["flat", "share", *(f"{m}: {k}" for m in ("rendered", "points") for k in ("RMSE", "NMAD", "mean"))]

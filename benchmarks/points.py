@@ -7,7 +7,7 @@ COLMAP's features and exhaustive matches, its triangulation with the poses held.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.scales import METRICS, Run
 from tidefield.compare.tables import Table
 from tidefield.data.load import read_posed
 from tidefield.data.readers.colmap import find_colmap
@@ -25,17 +24,25 @@ from tidefield.survey.sfm.features import set_up_pycolmap
 
 POINTS_FILE = "points.json"
 WAYS = ("with", "without")
+METRICS = ("psnr_seen_cc", "ssim_seen_cc", "flip_seen_cc")
 MODELS = ("sparse/0", "sparse")
 
 
 def measure_points(
-    scenes: Sequence[Path], runs: Path, widths: Iterable[int], device: str, run: Run, say: Callable[[str], object]
+    scenes: Sequence[Path],
+    work: Path,
+    runs: Path,
+    widths: Iterable[int],
+    device: str,
+    run: Callable[[list[str]], None],
+    say: Callable[[str], object],
 ) -> dict[str, Any]:
     """Evaluate scenes with and without their points; what was measured is kept.
 
     Args:
         scenes: folders of scenes.
-        runs: folder for the scenes without points, and points.json.
+        work: folder for the scenes without points.
+        runs: folder for points.json.
         widths: of the pictures.
         device: to render on.
         run: runs a command of Tidefield's, given without "tidefield".
@@ -44,9 +51,9 @@ def measure_points(
     record = read_json(runs / POINTS_FILE) or {"figures": {}}
     for scene in scenes:
         name = scene.resolve().name
-        folders = {"with": scene, "without": runs / "scenes" / name}
+        folders = {"with": scene, "without": work / name}
         if find_colmap(scene, *MODELS) is None:
-            folders["with"] = runs / "scenes" / f"{name}_colmap"
+            folders["with"] = work / f"{name}_colmap"
             if not folders["with"].exists():
                 say(f"{name}: points of COLMAP")
                 with completed_folder(folders["with"]) as partial:
@@ -133,21 +140,14 @@ def write_colmap(scene: Path, folder: Path) -> None:
         model.write_binary(folder / "sparse" / "0")
 
 
-def tables(record: dict[str, Any]) -> list[Table]:
-    """With, without, and the difference."""
-    columns = ["scene", "width, px", "with points", "without", "difference", "SSIM with", "SSIM without"]
+def tables(record: Mapping[str, Any]) -> list[Table]:
+    """Pictures of every scene with its points and without."""
+    styles = dict(zip(METRICS, ("{:.2f}", "{:.3f}", "{:.3f}"), strict=True))
+    columns = ["scene", "width, px", *(f"{m}: {w}" for m in ("PSNR", "SSIM", "FLIP") for w in WAYS)]
     rows = []
     for name, widths in record["figures"].items():
         for width, ways in widths.items():
-            first, second = (ways[way] for way in WAYS)
-            psnr = first["psnr_seen_cc"], second["psnr_seen_cc"]
-            rows.append(
-                (
-                    name,
-                    width,
-                    *(f"{value:.2f}" for value in psnr),
-                    f"{psnr[1] - psnr[0]:+.2f}",
-                    *(f"{of['ssim_seen']:.3f}" for of in (first, second)),
-                )
-            )
-    return [Table("PSNR, dB, of doubly seen pixels after the colour fit", columns, rows)]
+            if all(way in ways for way in WAYS):
+                cells = (style.format(ways[way][metric]) for metric, style in styles.items() for way in WAYS)
+                rows.append((name, width, *cells))
+    return [Table("Doubly seen pixels, after the colour fit", columns, rows)]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import depth, points
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_tables, summarise, variants
@@ -65,6 +66,8 @@ class Stored:
     speed: Mapping[str, Any] | None = None
     memory: Mapping[str, Any] | None = None
     frames: Mapping[str, Any] | None = None
+    depth: Mapping[str, Any] | None = None
+    points: Mapping[str, Any] | None = None
 
 
 def write_page(
@@ -77,11 +80,12 @@ def write_page(
     """
     compared, ablated = read_figures(comparison, SCENES, names()), read_figures(ablation, SCENES, variants(()))
     others = [read_figures([file], SCENES, (WHOLE,)) for file in lengths]
-    stored = Stored(*(read_json(runs / file) for file in (SPEED_FILE, MEMORY_FILE, FRAMES_FILE)))
+    files = (SPEED_FILE, MEMORY_FILE, FRAMES_FILE, depth.DEPTH_FILE, points.POINTS_FILE)
+    stored = Stored(*(read_json(runs / file) for file in files))
     if not (compared.by or ablated.by or any(vars(stored).values())):
-        files = ", ".join(map(str, (*comparison, *ablation, runs)))
+        places = ", ".join(map(str, (*comparison, *ablation, runs)))
         raise RunError(
-            f"{files} hold no results: expected files of `tidefield compare`, `tidefield ablate` and the benchmarks; "
+            f"{places} hold no results: expected files of `tidefield compare`, `tidefield ablate` and the benchmarks; "
             "run them"
         )
     write_text(out, page(compared, ablated, others, stored))
@@ -101,6 +105,14 @@ def page(compared: Results, ablated: Results, others: Sequence[Results], stored:
         "## Ablation",
         *(summarise(ablated) or ["Not measured."]),
         *(table.markdown() for table in ablation_tables(ablated)),
+        "## Depth",
+        "Zero-shot, of held-out views of built-in flats, where two training photographs or more see it, against "
+        "the exact truth; *points* are interpolated in the view. The weights learned from other flats of the same "
+        "generator.",
+        *([table.markdown() for table in depth.tables(stored.depth)] if stored.depth else ["Not measured."]),
+        "## Scenes without sparse points",
+        "Zero-shot, with the points of COLMAP, and without any: then they are found when the scene is opened.",
+        *([table.markdown() for table in points.tables(stored.points)] if stored.points else ["Not measured."]),
         "## Speed",
         *_speed(stored.speed),
         "## Zero-shot views",

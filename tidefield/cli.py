@@ -26,12 +26,14 @@ from tidefield.commands import (
     compare,
     demo,
     evaluate,
+    export,
     import_,
     map_,
     prepare,
     pretrain,
     render,
     train,
+    view,
 )
 from tidefield.errors import TidefieldError
 from tidefield.files import user_can_mend
@@ -49,6 +51,8 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
     "train": (train, train.Train, "train"),
     "evaluate": (evaluate, evaluate.Evaluate, "evaluate"),
     "render": (render, render.Render, "render"),
+    "view": (view, view.View, "view"),
+    "export": (export, export.Export, "export"),
     "map": (map_, map_.Map, "map_"),
     "change": (change, change.Change, "change"),
     "compare": (compare, compare.Compare, "compare"),
@@ -67,6 +71,7 @@ The usual order of commands:
   tidefield train SCENE RUN         learn the scene
   tidefield evaluate RUN            measure quality on held-out photographs
   tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
+  tidefield view RUN                look at it in a browser; with --zero-shot from SCENE
   tidefield map RUN OUT             orthophoto, surface model and point cloud; with --zero-shot from SCENE
   tidefield change FIRST LATER OUT  what changed between two surveys, with volumes and intervals
 

@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 T = TypeVar("T")
 Part = Callable[[], tuple[Tensor, ...]]
 _SEQUENTIAL = ContextVar("sequential", default=False)
+_CHECK: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None)
 
 
 def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> list[T]:
@@ -26,6 +27,9 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
     a hand-over per operation, several times the work itself on a busy machine; and this way the results cannot
     depend on the number of cores.
     """
+    check = _CHECK.get()
+    if check is not None:
+        tasks = [partial(_checked, check, task) for task in tasks]
     if torch.device(device).type != "cpu" or _SEQUENTIAL.get():
         return [task() for task in tasks]
     cores = torch.get_num_threads()
@@ -35,6 +39,21 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
             return list(pool.map(lambda task: task(), tasks))
     finally:
         torch.set_num_threads(cores)
+
+
+def _checked(check: Callable[[], None], task: Callable[[], T]) -> T:
+    check()
+    return task()
+
+
+@contextmanager
+def interruptible(check: Callable[[], None]) -> Iterator[None]:
+    """Have `in_parallel` call a function before each task, from the task's thread: what it raises ends the work."""
+    token = _CHECK.set(check)
+    try:
+        yield
+    finally:
+        _CHECK.reset(token)
 
 
 @contextmanager

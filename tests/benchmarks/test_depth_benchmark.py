@@ -37,7 +37,9 @@ def test_known_errors_come_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return off_by(scene, 0.25)
 
     def measure(method: str) -> dict:
-        return measure_depth(tmp_path, ("tidal_trees",), 160, 8, 3, open_scene, {"method": method}, lambda _: None)
+        return measure_depth(
+            tmp_path, tmp_path, ("tidal_trees",), 160, 8, 3, open_scene, {"method": method}, lambda _: None
+        )
 
     measure("first")
     record = measure("first")

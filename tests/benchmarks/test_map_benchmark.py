@@ -59,3 +59,48 @@ def test_overlaps_are_intersections_over_unions():
     found = overlaps(np.array([2, 2, 3, 9]), np.array([2, 3, 3, 3]))
     assert [found[name]["iou"] for name in ("ground", "vegetation", "water")] == [0.5, pytest.approx(1 / 3), 0.0]
     assert overlaps(np.array([2]), np.array([2]))["water"]["iou"] is None
+
+
+@pytest.mark.slow
+def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from benchmarks.map_memory import measure_memory
+    from tidefield.maps import make
+
+    pytest.importorskip("laspy")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("LARGEST_TILE", "SMALLEST_TILE"):
+        monkeypatch.setattr(make, name, 32)
+    write_survey(make_survey("ground_textures", seed=4, views=9, width=240), tmp_path / "scene")
+    said: list[str] = []
+    found = measure_memory(tmp_path / "scene", tmp_path / "runs", 30.0, 0.3, said.append)
+    assert found["cells"] == found["points"] == 100 * 100
+    assert found["square_metres"] == pytest.approx(900)
+    assert found["peak_memory_bytes"] >= found["peak_memory_tiles_bytes"] > 1e8
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"map_memory.json"}
+    assert "16 tiles" in said[1]
+
+
+def test_an_orthophoto_is_warped_to_where_the_photograph_shows_it(tmp_path: Path):
+    from benchmarks.map_views import warp
+    from tidefield.maps.grid import Tile
+    from tidefield.maps.surface import View
+
+    survey = make_survey("ground_textures", seed=4, views=6, width=320)
+    write_survey(survey, tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", hold_out=False, cache=tmp_path / "cache")
+    grid = Grid(map_frame(scene, None), -6.0, 6.0, 0.1, 120, 120, 0.0)
+    height, colour, _ = _truth(tmp_path / "scene", grid)
+    position = (scene.cameras.position_world + scene.origin_world).numpy()
+    index = int(np.linalg.norm(position[:, :2], axis=1).argmin())
+    view = View(scene.cameras[index], Tile(grid, 0, 0, 120, 0))
+    truth = scene.photographs[index].numpy().astype(float)
+
+    def error(heights: np.ndarray) -> float:
+        shown, known = warp(colour.astype(np.uint8), heights.astype(np.float32), view, grid)
+        assert 1000 < known.sum() < known.size
+        away = shown[known] - truth[known]
+        return float(away.std())
+
+    assert error(height) < 0.8 * error(height + 3.0)  # 3 m shift pixels by one or more
+    height[:60] = np.nan
+    assert error(height) > 0

@@ -9,8 +9,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from benchmarks.points import measure_points, tables, write_colmap
-from benchmarks.scales import METRICS
+from benchmarks.points import METRICS, measure_points, tables, write_colmap
 from tidefield.data.load import load_scene, read_posed
 from tidefield.files import write_json
 from tidefield.synthetic import make_survey, write_survey
@@ -33,11 +32,11 @@ def test_scenes_lose_their_points_and_nothing_else(flat: Path, tmp_path: Path):
         mean = dict.fromkeys(METRICS, 30.0 - len(commands))
         write_json(out / "evaluation.json", {"mean": mean})
 
-    measure_points([flat], tmp_path, (100,), "cpu", run, lambda _: None)
-    record = measure_points([flat], tmp_path, (100,), "cpu", run, lambda _: None)
-    assert [words[1] for words in commands] == [str(flat), str(tmp_path / "scenes" / "flat")]
-    assert "| flat | 100 | 29.00 | 28.00 | -1.00 |" in tables(record)[0].markdown()
-    before, after = read_posed(flat, False), read_posed(tmp_path / "scenes" / "flat", False)
+    measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
+    record = measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
+    assert [words[1] for words in commands] == [str(flat), str(tmp_path / "flat")]
+    assert "| flat | 100 | 29.00 | 28.00 | 29.000 | 28.000 |" in tables(record)[0].markdown()
+    before, after = read_posed(flat, False), read_posed(tmp_path / "flat", False)
     assert before.points is not None
     assert len(before.points.uv_px)
     assert after.points is None or not len(after.points.uv_px)

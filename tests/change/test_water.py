@@ -1,5 +1,6 @@
 """The waterline and areas under levels on a plane whose every contour is known."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,9 @@ def test_areas_under_levels_have_intervals_that_contain_the_truth(tmp_path: Path
 
 
 def test_dry_ground_has_no_waterline(tmp_path: Path):
-    line = measure_water(surveyed(tmp_path, (0.0, 0.0)), (-3.0, -3.0), ()).waterline
+    found = measure_water(surveyed(tmp_path, (0.0, 0.0)), (-3.0, -3.0), (-3.0,))
+    line = found.waterline
     assert line is not None
     assert line.lines == ([], [])
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False))["waterline"]["move_m"] is None
     assert np.isnan(line.move_m).all()

@@ -313,7 +313,7 @@ def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
         assert abs(np.diff(values, axis=-2)).max() < largest
 
 
-@pytest.mark.parametrize("limit", [6_000, 30_000])
+@pytest.mark.parametrize("limit", [pytest.param(6_000, marks=pytest.mark.slow), 30_000])
 def test_a_full_disk_is_one_message_and_loses_nothing(scene: Path, out: Path, tmp_path: Path, limit: int):
     """The system refuses every byte of a file beyond a limit, as a full disk does."""
     import resource

@@ -94,11 +94,16 @@ class Water:
                 "lengths_m": [sum(part.length for part in lines) for lines in line.lines],
                 "land_gained_m2": line.land_gained_m2,
                 "land_lost_m2": line.land_lost_m2,
-                **dict(zip(("move_m", "move_low_m", "move_high_m"), line.move_m, strict=True)),
-                "quantiles_m": list(line.quantiles_m),
+                **dict(zip(("move_m", "move_low_m", "move_high_m"), map(_known, line.move_m), strict=True)),
+                "quantiles_m": [_known(value) for value in line.quantiles_m],
             },
             "below": [vars(of) for of in self.below],
         }
+
+
+def _known(value: float) -> float | None:
+    """A number for JSON, which has none that is not finite."""
+    return value if math.isfinite(value) else None
 
 
 def measure_water(change: Change, water: tuple[float, float] | None, levels: tuple[float, ...]) -> Water:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from tidefield.data.scene import Scene
     from tidefield.train.checkpoint import Run, TrainingProgress
+    from tidefield.train.loop import Callback, Trainer
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +64,10 @@ class Train:
     curve: bool = False
     """Render two held-out views at a quarter of their size from time to time, for a curve of quality against time; the
     time for it does not count."""
+    view: bool = False
+    """Show the training in a browser (`tidefield view`), on this machine only."""
+    port: int = 8080
+    """Port of --view; 0 for any that is free."""
     allow_missing: AllowMissing = False
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
@@ -87,6 +93,12 @@ def _train(options: Train, console: Console) -> None:
     from tidefield.train.loop import train as run_training
 
     budget, folder, weights = options.budget.checked(), options.run, None
+    if options.view:
+        from tidefield.viewer.page import need_viser
+        from tidefield.viewer.ports import require_port
+
+        need_viser()
+        require_port("127.0.0.1", options.port)
     device = choose_device(options.device)
     if options.resume:
         run = read_run(folder)  # its other options were settled when it was started
@@ -104,6 +116,8 @@ def _train(options: Train, console: Console) -> None:
         raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
     if options.curve and not scene.test:
         raise SceneError(f"{options.scene} holds no photograph out: expected one for --curve; leave --curve out")
+    if options.view and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+        raise RunError(f"{run.config.method} trains in a program of its own: --view shows our methods; leave it out")
     curve = make_curve(scene) if options.curve else None
     start = f", starting from {weights}" if weights else ""
     log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
@@ -131,8 +145,27 @@ def _train(options: Train, console: Console) -> None:
             _start(folder, run, scene)
         used = budget.share(trainer.progress.step, trainer.progress.seconds)
         callback = curve and curve.watch(folder, used)
-        stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
+        with ExitStack() as stack:
+            if options.view:
+                from tidefield.viewer.training import TrainingPage
+
+                page = stack.enter_context(TrainingPage(trainer, folder.resolve().name, "127.0.0.1", options.port))
+                console.print(f"{page.page.address} shows it", highlight=False, soft_wrap=True)
+                callback = _both(callback, page)
+            stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
     report_end(progress, stopped, folder, console)
+
+
+def _both(first: Callback | None, second: Callback) -> Callback:
+    """Call one callback after the other."""
+    if first is None:
+        return second
+
+    def call(trainer: Trainer, used: float) -> None:
+        first(trainer, used)
+        second(trainer, used)
+
+    return call
 
 
 def report_end(progress: TrainingProgress, stopped: int | None, folder: Path, console: Console) -> None:

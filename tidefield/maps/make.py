@@ -57,6 +57,8 @@ MARGIN = 16
 LARGEST_TILE, SMALLEST_TILE = 480, 96
 FEWEST_VIEWS = 2
 """Photographs that must see a cell: what one alone shows has no height."""
+CLOUD_ROWS = 64
+"""Rows of which points are made at once."""
 VERSION = 2
 
 
@@ -337,7 +339,11 @@ def write_cloud(out: Path, grid: Grid) -> tuple[int, dict[str, float]]:
             red, green, blue, height, sigma, views, classes = (np.nan_to_num(part[2], nan=-1) for part in rows)
             seen = (views >= FEWEST_VIEWS) & (classes > 0)
             colour = np.stack([red, green, blue]).clip(0).astype(np.uint8)
-            cloud.write(rows[0][0], np.where(seen, height, np.nan), sigma, colour, views.clip(0), classes.clip(0))
+            height = np.where(seen, height, np.nan)
+            for first in range(0, len(height), CLOUD_ROWS):  # a point takes ten times a cell's memory
+                part = slice(first, first + CLOUD_ROWS)
+                row = rows[0][0] + first
+                cloud.write(row, height[part], sigma[part], colour[:, part], views[part].clip(0), classes[part].clip(0))
             for value in number:
                 number[value] += int((seen & (classes == value)).sum())
     names = {"ground": GROUND, "vegetation": VEGETATION, "water": WATER}

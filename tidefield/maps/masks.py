@@ -5,7 +5,8 @@ residue, and lighting conditions, 1995) is above a threshold. Water is where pho
 mirrors and has no marks of its own, and where the surface is level. From such places a body of water reaches as far as
 the heights are its level. It is none if its heights are spread, or if lower ground begins at its shore.
 
-The thresholds were found on built-in flats of other seeds than those of `python -m benchmarks maps`.
+The threshold of plants was found on built-in flats of other seeds than those of `python -m benchmarks maps`, those of
+water on both.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ LOWER_M, LOWER_SHARE = 0.01, 0.15
 SMALLEST_M2 = 1.0
 """Smallest body of water."""
 BLOCK_M = 2.0
-"""Side of the squares whose medians are taken for independent in the standard error of a level."""
+"""Side of the squares whose medians give the standard error of a level."""
 SMALLEST_CELLS = 12
 """Smaller polygons are left out."""
 SIMPLIFIED_CELLS = 0.7
@@ -155,7 +156,10 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _level_error(height: np.ndarray, wet: np.ndarray, level: float, side: int) -> float:
-    """Standard error of a level: that of the mean of squares' medians; the cells' spread with fewer than four."""
+    """Standard error of a level: the standard deviation of squares' medians, or of cells with fewer than four.
+
+    It is not divided by the root of their number: the pairs of photographs share errors over all of a body.
+    """
     medians = []
     for row in range(0, height.shape[0], side):
         for column in range(0, height.shape[1], side):
@@ -164,7 +168,7 @@ def _level_error(height: np.ndarray, wet: np.ndarray, level: float, side: int) -
                 medians.append(np.median(height[square][wet[square]]))
     if len(medians) < 4:
         return _spread(height[wet] - level)
-    return float(np.std(medians, ddof=1) / math.sqrt(len(medians)))
+    return float(np.std(medians, ddof=1))
 
 
 def read_water(dsm: Path, agreement: Path, orthophoto: Path, grid: Grid) -> tuple[np.ndarray, list[Body], Grid]:

@@ -134,7 +134,7 @@ def make_trajectory(
         raise TidefieldError(f"no camera path is called {path!r}: expected {', '.join(SHAPES)} or a .json file")
     stored = read_nerfstudio_path(Path(path), scene.root)
     position = stored.position - scene.origin_world.double().cpu().numpy()
-    cameras = _cameras(scene, position, stored.rotation, stored.width, stored.height, stored.focal_px)
+    cameras = path_cameras(scene, position, stored.rotation, stored.width, stored.height, stored.focal_px)
     return Trajectory(cameras, stored.frames_per_second or FRAMES_PER_SECOND)
 
 
@@ -383,16 +383,16 @@ def _well_seen(shape: Shape, scene: Scene, frames: int, width: int, height: int)
         def worst(reach: float) -> float:
             """Return the smallest share of doubly seen pixels in a frame."""
             position, rotation = shape(layout, frames, reach)
-            cameras = _cameras(scene, position[checked], rotation[checked], width, height)
+            cameras = path_cameras(scene, position[checked], rotation[checked], width, height)
             cameras = cameras.resized(CHECKED_PX, CHECKED_PX)
             return min(float(doubly_seen(scene, cameras[k]).float().mean()) for k in range(len(cameras)))
 
         enough = ENOUGH * worst(REACHES[-1])
         reach = next(reach for reach in REACHES if worst(reach) >= enough)
-    return _cameras(scene, *shape(layout, frames, reach), width, height)
+    return path_cameras(scene, *shape(layout, frames, reach), width, height)
 
 
-def _cameras(
+def path_cameras(
     scene: Scene,
     position: Positions,
     rotation: Rotations,
@@ -400,7 +400,8 @@ def _cameras(
     height: int,
     focal_px: Float64[np.ndarray, " N"] | None = None,
 ) -> Cameras:
-    """Return path cameras; without focal lengths, with the photographs' (the narrower view if the aspects differ)."""
+    """Return cameras of a path at the common exposure; without focal lengths, with the photographs' (the narrower view
+    if the aspects differ)."""
     train = scene.cameras[list(scene.train)]
     count, size = len(position), torch.tensor([width, height])
     if focal_px is None:

@@ -1,0 +1,128 @@
+"""A photograph that took no part in a map, against the orthophoto warped into it by the map's surface.
+
+Next to it the same orthophoto, warped by the surface of the sparse points. The colours of both are fitted to the
+photograph's by an affine function, because its exposure is not known to the map.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from benchmarks.maps import _whole
+from tidefield.compare.tables import Table
+from tidefield.data.load import load_scene
+from tidefield.evaluation.metrics import fit_colours, flip_map, ssim_map
+from tidefield.files import completed_folder, write_json
+from tidefield.machine import describe
+from tidefield.maps.grid import Grid, map_frame
+from tidefield.maps.make import DSM, MAP_FILE, ORTHOPHOTO
+from tidefield.maps.surface import COARSEST, View, sparse_surface
+
+ROUNDS = 30
+"""A ray's height is taken from the surface where it was last, so often."""
+
+
+def measure_views(root: Path, out: Path, half_m: float, say: Callable[[str], object]) -> dict[str, Any]:
+    """Map the middle of a built-in flat without its most central photograph, and compare with that.
+
+    Args:
+        root: the scene.
+        out: folder for a copy without the photograph, the map, pictures and map_views.json.
+        half_m: half the side of the square that is mapped.
+        say: reports progress.
+    """
+    import rasterio
+    from rich.console import Console
+
+    from tidefield.commands.common import ZeroShot
+    from tidefield.commands.map_ import Map, map_
+
+    scene = load_scene(root, hold_out=False)
+    position = (scene.cameras.position_world.double() + scene.origin_world.double()).numpy()
+    left_out = int(np.linalg.norm(position[:, :2], axis=1).argmin())
+    name = scene.names[left_out]
+    if not (out / "scene").exists():
+        with completed_folder(out / "scene") as partial:
+            shutil.copytree(root / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
+            shutil.copytree(root / "sparse", partial / "sparse")
+    square = [[x * half_m, y * half_m] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    write_json(out / "area.json", {"type": "Polygon", "coordinates": [square]})
+    if not (out / "map" / MAP_FILE).exists():
+        say(f"map without {name}")
+        options = Map(out / "scene", out / "map", ZeroShot(zero_shot=True), area=out / "area.json", allow_missing=True)
+        map_(options, Console(quiet=True))
+    with rasterio.open(out / "map" / DSM) as dataset:
+        height = dataset.read(1, masked=True).filled(np.nan)
+        transform = dataset.transform
+    with rasterio.open(out / "map" / ORTHOPHOTO) as dataset:
+        colour = dataset.read([1, 2, 3]).transpose(1, 2, 0)
+    assert scene.points is not None
+    middle = float(np.nanmedian(height))
+    grid = Grid(map_frame(scene, None), transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
+    sparse = sparse_surface(scene, grid.coarser(COARSEST)).on(_whole(grid), 0)[: grid.rows, : grid.columns]
+    truth = scene.photographs[left_out]
+    view = View(scene.cameras[left_out], _whole(grid))
+    result: dict[str, Any] = {"photograph": name, "cell_m": grid.cell}
+    known, shown = None, {}
+    for method, surface in (("map", height), ("sparse points", sparse)):
+        warped, mask = warp(colour, surface - middle, view, grid)
+        shown[method], known = warped, mask if known is None else known & mask
+    assert known is not None
+    rows, columns = np.nonzero(known)
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    mask, photograph = torch.from_numpy(known[box]), truth[box]
+    for method, picture in shown.items():
+        fitted = fit_colours(torch.from_numpy(picture[box]), photograph, mask)
+        cv2.imwrite(str(out / f"{method.split()[0]}.png"), cv2.cvtColor(fitted.numpy(), cv2.COLOR_RGB2BGR))
+        result[method] = {
+            "ssim": float(ssim_map(fitted, photograph)[mask].mean()),
+            "flip": float(flip_map(fitted, photograph)[mask].mean()),
+        }
+    cv2.imwrite(str(out / "photograph.png"), cv2.cvtColor(photograph.numpy(), cv2.COLOR_RGB2BGR))
+    result |= {"pixels": int(mask.sum()), **describe()}
+    write_json(out / "map_views.json", result)
+    return result
+
+
+def warp(colour: np.ndarray, height: np.ndarray, view: View, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Show an orthophoto in a photograph: each pixel's ray is followed to the surface; returns it, and where it is.
+
+    Args:
+        colour: of the cells, 8 bits.
+        height: of the cells above `Grid.height`, NaN where there is none.
+        view: the photograph's projection; the middle of its tile is that of the grid's square.
+        grid: the cells.
+    """
+    width, tall = view.size
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(tall) + 0.5)
+    inverse = np.linalg.inv(view.matrix[:, :3])
+    ray = np.stack([u, v, np.ones_like(u)], -1) @ inverse.T
+    side = max(grid.rows, grid.columns)
+    at = np.full(u.shape, float(np.nanmedian(height)))
+    filled = np.where(np.isfinite(height), height, np.nanmedian(height)).astype(np.float32)
+
+    def cells() -> tuple[np.ndarray, np.ndarray]:
+        share = (at - view.position[2]) / ray[..., 2]
+        east, north = (view.position[k] + share * ray[..., k] for k in (0, 1))
+        column, row = east / grid.cell + side / 2 - 0.5, side / 2 - north / grid.cell - 0.5
+        return column.astype(np.float32), row.astype(np.float32)
+
+    for _ in range(ROUNDS):
+        # Halfway each time: where the surface is steeper than the ray it would go to and fro.
+        at += 0.5 * (cv2.remap(filled, *cells(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) - at)
+    column, row = cells()
+    there = cv2.remap(np.isfinite(height).astype(np.float32), column, row, cv2.INTER_LINEAR) == 1
+    return cv2.remap(colour, column, row, cv2.INTER_LINEAR), there
+
+
+def table(record: dict[str, Any]) -> Table:
+    """SSIM and FLIP of both."""
+    rows = [(name, f"{record[name]['ssim']:.3f}", f"{record[name]['flip']:.3f}") for name in ("map", "sparse points")]
+    return Table(f"{record['photograph']}, {record['pixels']:,} pixels", ["surface", "SSIM", "FLIP"], rows)

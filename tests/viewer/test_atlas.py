@@ -1,0 +1,145 @@
+"""Maps from straight above: tiles, values, sections and volumes against rasters that are known."""
+
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
+
+from map_folders import CELL, SHAPE, corner, write_change, write_map
+from surveys_of_two_dates import write_surface
+
+from tidefield.errors import RunError
+from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
+
+
+def box(left: float, top: float, right: float, bottom: float) -> np.ndarray:
+    return np.array([corner(left, top), corner(right, top), corner(right, bottom), corner(left, bottom)])
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """The values of a tile, NaN where there are none."""
+    raw = np.asarray(Image.open(io.BytesIO(content))).astype(np.int64)
+    code = (raw[..., 0] << 16) | (raw[..., 1] << 8) | raw[..., 2]
+    return np.where(raw[..., 3] > 0, (code - (1 << 23)) * STEP, np.nan)
+
+
+def test_a_tile_has_the_cell_below_each_of_its_pixels(tmp_path: Path):
+    heights = np.random.default_rng(0).uniform(-3, 40, SHAPE).astype(np.float32)
+    atlas = Atlas([write_map(tmp_path / "map", (1, 2, 3), heights)])
+    for level, column, row in ((atlas.finest, 0, 0), (atlas.finest, 1, 1)):
+        content = atlas.tile(0, "height", level, column, row)
+        assert content is not None
+        side = atlas.side / 2**level / CELL  # in cells
+        at = (np.arange(TILE_PX) + 0.5) / TILE_PX * side
+        rows, columns = (at + row * side).astype(int), (at + column * side).astype(int)
+        expected = np.full((TILE_PX, TILE_PX), np.nan)
+        inside = np.ix_(rows < SHAPE[0], columns < SHAPE[1])
+        expected[inside] = heights[np.ix_(rows[rows < SHAPE[0]], columns[columns < SHAPE[1]])]
+        assert np.allclose(decoded(content), expected, atol=STEP / 2 + 1e-5, equal_nan=True)
+
+
+def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
+    heights = np.ones(SHAPE, np.float32)
+    heights[40:, 40:] = -9999
+    atlas = Atlas([write_map(tmp_path / "map", (1, 2, 3), heights)])
+    last = 2**atlas.finest - 1
+    assert atlas.tile(0, "height", atlas.finest, last, last) is None
+    assert atlas.tile(0, "height", atlas.finest, 0, 0) is not None
+    for wrong in ((0, "height", 0, 1, 0), (1, "height", 0, 0, 0), (0, "other", 0, 0, 0), (0, "height", 60, 0, 0)):
+        assert atlas.tile(*wrong) is None
+
+
+def test_values_at_a_place_are_those_of_the_cell_it_lies_in(tmp_path: Path):
+    atlas = Atlas([write_map(tmp_path / "map", (1, 2, 3))])
+    for column, row in ((0.01, 0.01), (10.99, 7.99), (99.9, 79.9)):
+        (found,) = atlas.at(*corner(column, row))
+        assert found["height"] == pytest.approx(5 + 0.01 * int(column) + 0.02 * int(row), abs=1e-5)
+        assert found["sigma"] == pytest.approx(0.02)
+    assert atlas.at(*corner(-0.5, 3)) == [{"height": None, "sigma": None}]
+
+
+def test_a_section_has_heights_and_distances_along_its_line(tmp_path: Path):
+    atlas = Atlas([write_map(tmp_path / "map", (1, 2, 3))])
+    found = atlas.section(np.array([corner(10, 40.5), corner(50, 40.5), corner(50, 60.5)]))
+    assert found["distance"][-1] == pytest.approx(60 * CELL)
+    heights = np.array(found["sheets"][0]["height"], dtype=float)
+    assert heights[0] == pytest.approx(5 + 0.01 * 10 + 0.02 * 40, abs=1e-5)
+    assert heights[-1] == pytest.approx(5 + 0.01 * 50 + 0.02 * 60, abs=1e-5)
+
+
+def test_the_volume_of_a_change_and_its_interval_are_the_closed_form(tmp_path: Path):
+    dz = np.zeros(SHAPE, np.float32)
+    dz[10:20, 10:30] = 0.4
+    dz[10:20, 30:40] = -0.2
+    atlas = Atlas([write_change(tmp_path / "change", dz, sigma=0.03, systematic_m=0.01)])
+    found = atlas.area(box(10, 10, 40, 20), detection_m=0.1)
+    (volumes,) = found["sheets"]
+    assert found["area_m2"] == pytest.approx(300 * CELL**2)
+    for name, cells, value in (("net", 300, 200 * 0.4 - 100 * 0.2), ("cut", 100, 100 * 0.2), ("fill", 200, 200 * 0.4)):
+        half = 1.96 * CELL**2 * math.hypot(0.03 * math.sqrt(cells), 0.01 * cells)
+        assert volumes[name]["value_m3"] == pytest.approx(value * CELL**2, rel=1e-4)
+        assert volumes[name]["high_m3"] - volumes[name]["value_m3"] == pytest.approx(half, rel=1e-3)
+    assert "cut" in volumes
+    beyond = atlas.area(box(10, 10, 40, 20), detection_m=0.3)["sheets"][0]
+    assert beyond["cut"]["value_m3"] == 0
+    assert beyond["fill"] == volumes["fill"]
+
+
+def test_a_heap_on_sloping_ground_has_its_volume_above_the_polygons_rim(tmp_path: Path):
+    rows, columns = np.indices(SHAPE)
+    ground = 5 + 0.01 * columns + 0.02 * rows
+    ground[30:40, 40:60] += 1.5
+    atlas = Atlas([write_map(tmp_path / "map", (1, 2, 3), ground)])
+    (volumes,) = atlas.area(box(30, 20, 70, 50))["sheets"]
+    assert volumes["above"]["value_m3"] == pytest.approx(200 * 1.5 * CELL**2, rel=0.05)
+    assert volumes["above"]["low_m3"] < 200 * 1.5 * CELL**2 < volumes["above"]["high_m3"]
+
+
+def test_maps_in_another_system_are_shown_in_the_first_ones(tmp_path: Path):
+    from pyproj import Transformer
+
+    first = write_map(tmp_path / "first 2023-05-01", (1, 2, 3))
+    second = write_map(tmp_path / "second 2024-05-01", (1, 2, 3))
+    to_31 = Transformer.from_crs("EPSG:32630", "EPSG:32631", always_xy=True)
+    x, y = to_31.transform(*corner(SHAPE[1] / 2, SHAPE[0] / 2))
+    flat = np.full((400, 400), 7.0, np.float32)
+    write_surface(second / "odm_dem" / "dsm.tif", flat, CELL, x - 100, y + 100, "EPSG:32631", -9999.0)
+    for name in ("odm_dem/dsm_sigma.tif", "odm_orthophoto/odm_orthophoto.tif"):
+        (second / name).unlink()
+    atlas = Atlas([second, first])
+    assert [sheet.date for sheet in atlas.sheets] == ["2023-05-01", "2024-05-01"]
+    found = atlas.at(*corner(50.5, 40.5))
+    assert found[0]["height"] == pytest.approx(5 + 0.5 + 0.8, abs=1e-5)
+    assert found[1]["height"] == pytest.approx(7.0)
+
+
+def test_what_the_page_is_told_names_no_folders_place(tmp_path: Path):
+    atlas = Atlas([write_map(tmp_path / "a" / "map", (1, 2, 3)), write_map(tmp_path / "b" / "map", (4, 5, 6))])
+    told = json.dumps(atlas.describe())
+    assert [sheet["title"] for sheet in json.loads(told)["sheets"]] == ["a/map", "b/map"]
+    assert str(tmp_path) not in told
+    assert tmp_path.name not in told
+
+
+def test_polygons_and_folders_that_cannot_be_used_are_one_clear_error(tmp_path: Path):
+    folder = write_map(tmp_path / "map", (1, 2, 3))
+    atlas = Atlas([folder])
+    with pytest.raises(RunError, match="crosses itself, or has no area: expected one that does not"):
+        atlas.area(box(10, 10, 40, 20)[[0, 2, 1, 3]])
+    with pytest.raises(RunError, match="the section has no length"):
+        atlas.section(np.array([corner(1, 1), corner(1, 1)]))
+    assert is_sheet(folder)
+    assert not is_sheet(tmp_path)
+    far = tmp_path / "far"
+    write_surface(far / "odm_dem" / "dsm.tif", np.ones((8, 8), np.float32), 0.01, west=9e6, north=2e6)
+    with pytest.raises(RunError, match="apart: expected maps of one place"):
+        Atlas([folder, far])
+    (folder / "odm_dem" / "dsm.tif").write_bytes(b"II*\0 not a raster")
+    with pytest.raises(RunError, match="cannot be read"):
+        Atlas([folder])

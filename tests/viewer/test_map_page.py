@@ -1,0 +1,181 @@
+"""The page of maps in a real browser: ruler, swipe, dates, detection, address; and what its server refuses."""
+
+import http.client
+import io
+import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import open_browser
+from PIL import Image
+
+pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
+
+from map_folders import SHAPE, corner, write_change, write_map
+
+from tidefield.viewer.atlas import Atlas
+from tidefield.viewer.map_page import MapPage
+
+SCREENSHOTS = os.environ.get("TIDEFIELD_SCREENSHOTS")
+SIZE = {"width": 900, "height": 700}
+
+
+@contextmanager
+def page_of(*folders: Path) -> Iterator[MapPage]:
+    page = MapPage(Atlas(folders), "127.0.0.1", 0)
+    try:
+        yield page
+    finally:
+        page.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    with open_browser() as opened:
+        yield opened
+
+
+def two_dates(folder: Path) -> tuple[Path, Path]:
+    return write_map(folder / "flat 2023-05-01", (200, 30, 30)), write_map(folder / "flat 2024-05-03", (30, 30, 200))
+
+
+def colours(tab, name: str) -> np.ndarray:
+    content = tab.screenshot()
+    if SCREENSHOTS:
+        Path(SCREENSHOTS, f"{name}.png").write_bytes(content)
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+
+
+def pixel_of(tab, place: tuple[float, float]) -> tuple[float, float]:
+    """Where the page shows a place, by the address."""
+    tab.wait_for_function("location.hash.length > 1")
+    x, y, s = (float(re.search(rf"[#&]{k}=([^&]*)", tab.evaluate("location.hash")).group(1)) for k in "xys")
+    return SIZE["width"] / 2 + (place[0] - x) / s, SIZE["height"] / 2 - (place[1] - y) / s
+
+
+def test_the_ruler_between_two_points_gives_their_distance_within_a_pixel_on_the_ground(tmp_path: Path, browser):
+    first, last = corner(20, 20), corner(80, 60)
+    with page_of(write_map(tmp_path / "map", (90, 120, 60))) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(page.address)
+        tab.get_by_role("button", name="Ruler").click()
+        for place in (first, last):
+            tab.mouse.click(*pixel_of(tab, place))
+        words = tab.get_by_text("Distance").inner_text()
+        tab.get_by_text("m up").wait_for()
+        rise = float(re.search(r"([+-][\d.]+) m up", tab.locator("#result").inner_text()).group(1))
+        scale = float(re.search(r"[#&]s=([^&]*)", tab.evaluate("location.hash")).group(1))
+        colours(tab, "ruler")
+        tab.close()
+    found = float(re.search(r"([\d.]+) m", words).group(1))
+    assert abs(found - np.hypot(30, 20)) < scale
+    assert rise == pytest.approx(0.01 * 60 + 0.02 * 40, abs=0.04)
+
+
+def test_the_swipe_shows_both_dates_the_slider_changes_them_and_the_address_brings_them_back(tmp_path: Path, browser):
+    with page_of(*two_dates(tmp_path)) as page:
+        tab = browser.new_page(viewport=SIZE)
+        errors: list[str] = []
+        tab.on("pageerror", lambda error: errors.append(str(error)))
+        tab.goto(page.address)
+        tab.get_by_label("Swipe").check()
+        tab.wait_for_timeout(700)
+        picture = colours(tab, "swipe")
+        assert tuple(picture[300, 300]) == (200, 30, 30)
+        assert tuple(picture[300, 600]) == (30, 30, 200)
+        tab.mouse.move(450, 350)
+        tab.mouse.down()
+        tab.mouse.move(700, 350, steps=3)
+        tab.mouse.up()
+        tab.wait_for_timeout(300)
+        assert tuple(colours(tab, "swiped")[300, 600]) == (200, 30, 30)
+        again = browser.new_page(viewport=SIZE)
+        again.goto(page.address + "/" + tab.evaluate("location.hash"))
+        again.wait_for_timeout(700)
+        assert np.abs(colours(again, "again") - colours(tab, "swiped"))[100:500].mean() < 1
+        again.get_by_label("Swipe").uncheck()
+        again.get_by_label("Date").fill("1")
+        again.wait_for_timeout(700)
+        assert tuple(colours(again, "later")[300, 300]) == (30, 30, 200)
+        assert errors == []
+        tab.close()
+        again.close()
+
+
+def test_the_level_of_detection_hides_smaller_changes_and_the_area_has_the_volume(tmp_path: Path, browser):
+    dz = np.full(SHAPE, 0.1, np.float32)
+    dz[:, 50:] = -0.5
+    with page_of(write_change(tmp_path / "change", dz)) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(page.address)
+        tab.wait_for_timeout(700)
+        left, right = (tuple(map(round, pixel_of(tab, corner(c, 40)))) for c in (25, 75))
+        picture, ground = colours(tab, "detection_low"), (233, 237, 240)
+        assert picture[right[1], right[0], 0] > picture[right[1], right[0], 2] + 50  # lower is red
+        assert tuple(picture[left[1], left[0]]) != ground
+        tab.get_by_label("Detection").fill("0.3")
+        tab.wait_for_timeout(500)
+        picture = colours(tab, "detection_high")
+        assert tuple(picture[left[1], left[0]]) == ground
+        assert tuple(picture[right[1], right[0]]) != ground
+        tab.get_by_role("button", name="Area").click()
+        for place in (corner(60, 30), corner(80, 30), corner(80, 50), corner(60, 50)):
+            tab.mouse.click(*pixel_of(tab, place))
+        tab.get_by_text("net change").wait_for()
+        row = tab.get_by_role("row").filter(has_text="net change").inner_text()
+        colours(tab, "area")
+        tab.close()
+    assert float(re.search(r"(-[\d.]+) m³", row).group(1)) == pytest.approx(-400 * 0.5 * 0.25, rel=0.05)
+
+
+def test_on_a_phone_nothing_leaves_the_screen(tmp_path: Path, browser):
+    with page_of(*two_dates(tmp_path)) as page:
+        context = browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True)
+        tab = context.new_page()
+        tab.goto(page.address)
+        tab.get_by_role("button", name="Section").tap()
+        tab.touchscreen.tap(120, 400)
+        tab.touchscreen.tap(260, 420)
+        tab.get_by_text("Section of").wait_for()
+        tab.wait_for_timeout(300)
+        colours(tab, "phone")
+        for name in ("#controls", "#place", "#result"):
+            found = tab.locator(name).bounding_box()
+            assert found is not None
+            assert found["x"] >= 0
+            assert found["x"] + found["width"] <= 390
+            assert found["y"] + found["height"] <= 780
+        tab.close()
+        context.close()
+
+
+def test_the_server_answers_nothing_but_its_page(tmp_path: Path):
+    with page_of(write_map(tmp_path / "map", (1, 2, 3))) as page:
+        port = int(page.address.rpartition(":")[2])
+
+        def status(path: str, host: str = "localhost") -> tuple[int, bytes]:
+            connection = http.client.HTTPConnection("127.0.0.1", port)
+            connection.putrequest("GET", path, skip_host=True)
+            connection.putheader("Host", host)
+            connection.endheaders()
+            answer = connection.getresponse()
+            content = answer.read()
+            connection.close()
+            return answer.status, content
+
+        assert status("/")[0] == 200
+        assert status("/", "attacker.example")[0] == 403
+        for path in ("/../map.json", "/%2e%2e/map.json", "/tile/0/../../map.json", "/map.json", "/etc/passwd"):
+            assert status(path)[0] == 404
+        for path in ("/at", "/at?points=1", "/at?points=nan,1", "/at?points=1,1e99", "/area?points=1,1;2,2"):
+            code, content = status(path)
+            assert code == 400
+            assert "expected" in json.loads(content)["error"]
+        assert status("/section?points=" + ";".join(["1,1"] * 501))[0] == 400
+        assert status("/tile/0/height/0/9/9.png")[0] == 204
+        assert status("/tile/0/height/0/0/0.png")[1][:4] == b"\x89PNG"

@@ -1,0 +1,149 @@
+"""The page of a scene in a real browser: it opens, the camera moves, the picture sharpens, a path is saved."""
+
+import io
+import os
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import textured_wall
+import torch
+from browser import open_browser
+from jaxtyping import Float64
+from PIL import Image
+
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.rendering import Rendering
+from tidefield.render.camera_paths import make_trajectory
+from tidefield.viewer.page import ScenePage
+from tidefield.viewer.ports import require_port
+
+pytest.importorskip("viser", reason="needs viser, which is not installed")
+SCREENSHOTS = os.environ.get("TIDEFIELD_SCREENSHOTS")
+"""A folder to keep the screenshots in, for people to look at."""
+
+
+def wall() -> Scene:
+    return textured_wall.scene(textured_wall.cameras(6, 96, 72))
+
+
+def render_wall(camera: Cameras) -> Rendering:
+    """The wall as it is, wherever the camera is in front of it."""
+    colour = textured_wall.photograph(camera).float() / 255
+    return Rendering(colour, textured_wall.true_depth(camera), torch.ones(camera.height, camera.width))
+
+
+@contextmanager
+def page_of(scene: Scene) -> Iterator[ScenePage]:
+    page = ScenePage(scene, render_wall, "wall", "127.0.0.1", 0, 400)
+    try:
+        yield page
+    finally:
+        page.close()
+
+
+def picture_of(tab, name: str) -> Float64[np.ndarray, "H W 3"]:
+    """What a tab shows, left of its controls."""
+    content = tab.screenshot()
+    if SCREENSHOTS:
+        Path(SCREENSHOTS, f"{name}.png").write_bytes(content)
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), dtype=np.float64)[200:500, 100:450]
+
+
+def sharpness(picture: Float64[np.ndarray, "H W 3"]) -> float:
+    """Mean absolute difference of neighbouring pixels."""
+    return float(np.abs(np.diff(picture, axis=0)).mean() + np.abs(np.diff(picture, axis=1)).mean())
+
+
+def test_the_camera_moves_the_picture_sharpens_and_a_path_is_saved_and_read(tmp_path: Path):
+    scene = wall()
+    with page_of(scene) as page, open_browser() as browser:
+        tab = browser.new_page(viewport={"width": 900, "height": 600})
+        foreign: list[str] = []
+        tab.on("request", lambda request: foreign.append(request.url))
+        tab.goto(page.address)
+        tab.get_by_text("sharp,").wait_for()
+        tab.get_by_text("Photographs", exact=True).click()
+        tab.wait_for_timeout(500)
+        first = picture_of(tab, "first")
+        assert sharpness(first) > 1, "nothing is shown"
+        tab.get_by_text("Path", exact=True).click()
+        tab.get_by_role("button", name="Add key frame").click()
+        tab.get_by_text("1 key frame").wait_for()
+
+        tab.mouse.move(300, 300)
+        tab.mouse.down(button="right")
+        tab.mouse.move(420, 330, steps=4)
+        tab.mouse.up(button="right")
+        tab.wait_for_timeout(1500)
+        moved = picture_of(tab, "moved")
+        assert np.abs(moved - first).mean() > 5, "the picture did not change"
+
+        tab.get_by_role("button", name="Add key frame").click()
+        tab.get_by_text("2 key frames").wait_for()
+        with tab.expect_download() as download:
+            tab.get_by_role("button", name="Save as nerfstudio's path").click()
+        download.value.save_as(tmp_path / "camera_path.json")
+        tab.get_by_text("View", exact=True).click()
+        tab.get_by_role("button", name="Address of this view").click()
+        address = tab.get_by_role("link", name="This view").get_attribute("href")
+        again = browser.new_page(viewport={"width": 900, "height": 600})
+        again.goto(page.address + re.sub(r"^[^?]*", "", address))
+        again.get_by_text("sharp,").wait_for()
+        again.get_by_text("Photographs", exact=True).click()
+        again.wait_for_timeout(500)
+        returned = picture_of(again, "address")
+        assert np.abs(returned - moved).mean() < 0.3 * np.abs(first - moved).mean(), "the address shows another view"
+        outside = [url for url in foreign if not url.startswith((page.address, "data:", "blob:"))]
+        assert outside == []
+        tab.close()
+        again.close()
+    cameras = make_trajectory(str(tmp_path / "camera_path.json"), scene, frames=1, width=1, height=1).cameras
+    assert len(cameras) == 240
+    assert (cameras.width, cameras.height) == (1280, 720)
+    way = cameras.position_world[-1] - cameras.position_world[0]
+    assert float(way.norm()) > 0.1
+    view = render_wall(cameras[120].resized(64, 36))
+    assert view.colour.shape == (36, 64, 3)
+
+
+def test_a_picture_that_rests_is_sharper_than_the_first_one():
+    with page_of(wall()) as page, open_browser() as browser:
+        coarse_only = {"done": False}
+        make = page.frames._render
+
+        def wait_then_render(camera: Cameras) -> Rendering:
+            while not coarse_only["done"]:
+                torch.ones(1).sum()
+            return make(camera)
+
+        page.frames.replace_method(wait_then_render)
+        tab = browser.new_page(viewport={"width": 900, "height": 600})
+        tab.goto(page.address)
+        tab.get_by_text("coarse").wait_for()
+        tab.get_by_text("Photographs", exact=True).click()
+        tab.wait_for_timeout(500)
+        coarse = picture_of(tab, "coarse")
+        coarse_only["done"] = True
+        tab.get_by_text("sharp,").wait_for()
+        tab.wait_for_timeout(500)
+        sharp = picture_of(tab, "sharp")
+        (viewer,) = page.frames._viewers.values()
+        true = render_wall(viewer.camera.resized(900, 600)).colour.double().numpy()[200:500, 100:450] * 255
+        assert np.abs(sharp - true).mean() < 0.5 * np.abs(coarse - true).mean()
+        tab.close()
+
+
+def test_a_port_in_use_is_one_clear_error():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(RunError, match=rf"port {port} of 127\.0\.0\.1 cannot be listened on .*choose another"):
+            require_port("127.0.0.1", port)

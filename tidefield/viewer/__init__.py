@@ -1,0 +1,1 @@
+"""Looking at runs, scenes, maps and changes in a browser."""

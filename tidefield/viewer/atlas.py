@@ -1,0 +1,519 @@
+"""Maps and changes to look at from straight above: layers, tiles, values, sections and volumes, in one system.
+
+All is shown in the coordinate system of the first folder. Tiles are squares of `TILE_PX` pixels; those of level z have
+2^-z of the side of the whole area, and are counted from its north-western corner.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from PIL import Image
+
+from tidefield.change.errors import Variogram, region_error
+from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
+from tidefield.change.surfaces import date_in
+from tidefield.change.volumes import Volume
+from tidefield.errors import RunError
+from tidefield.files import read_json
+from tidefield.maps.rasters import need
+
+TILE_PX = 256
+STEP = 0.0005
+"""Of values in tiles, in their unit: 24 bits reach 4,194 to both sides."""
+FINEST_LEVEL = 20
+SECTION_POINTS = 600
+MOST_POINTS = 500
+MOST_CELLS = 16_000_000
+"""Of the box around a polygon."""
+BAND = 1.96
+"""Standard errors on both sides of a value that hold 95% of normal errors."""
+CHANGE_FILE, CHANGE_RASTER, MAP_FILE = "change.json", "change.tif", "map.json"
+SIGMAS = ("odm_dem/dsm_sigma.tif", "dsm_sigma.tif")
+HILLSHADES = ("odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif")
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A raster's band to look at.
+
+    Attributes:
+        name: in addresses.
+        title: for people.
+        path, band: of the raster.
+        kind: "picture" (colours, or grey), or values that the page colours: "height", "error" or "change".
+        low, high: ends of the colours; most values are between them.
+    """
+
+    name: str
+    title: str
+    path: Path
+    band: int
+    kind: str
+    low: float = 0.0
+    high: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A map, or a change between two.
+
+    Attributes:
+        folder: where it is.
+        title: the folder's name.
+        date: YYYY-MM-DD, if it is known.
+        kind: "map" or "change".
+        layers: of it.
+        heights, sigma: rasters of a map's surface and its standard error.
+        numbers: what change.json or map.json has.
+    """
+
+    folder: Path
+    title: str
+    date: str | None
+    kind: str
+    layers: tuple[Layer, ...]
+    heights: Path | None
+    sigma: Path | None
+    numbers: dict[str, Any]
+
+    @property
+    def detection_m(self) -> float | None:
+        """The usual level of detection of a change."""
+        return self.numbers["level_of_detection_m"].get("median") if self.kind == "change" else None
+
+
+def is_sheet(folder: Path) -> bool:
+    """Return whether a folder is one of `tidefield map`, ODM or `tidefield change`."""
+    return folder.is_dir() and (
+        (folder / CHANGE_RASTER).is_file()
+        or first_of(folder, SURFACES) is not None
+        or first_of(folder, ORTHOPHOTOS) is not None
+    )
+
+
+def open_sheet(folder: Path) -> Sheet:
+    """Open a folder of a map or a change.
+
+    Raises:
+        RunError: it is neither, or not complete, or damaged.
+    """
+    name = folder.resolve().name
+    if (folder / CHANGE_RASTER).is_file():
+        numbers = read_json(folder / CHANGE_FILE)
+        if not isinstance(numbers, dict) or not {"earlier", "later", "level_of_detection_m"} <= set(numbers):
+            raise RunError(f"{folder} has no {CHANGE_FILE} of a change: expected what `tidefield change` wrote")
+        dz = folder / CHANGE_RASTER
+        reach = max(abs(v) for v in _usual(dz, 1))
+        layers = (
+            Layer("change", "Change", dz, 1, "change", -reach, reach),
+            Layer("error", "Error of change", dz, 2, "error", *_usual(dz, 2)),
+        )
+        return Sheet(folder, name, numbers["later"].get("date"), "change", layers, None, None, numbers)
+    heights, sigma = first_of(folder, SURFACES), first_of(folder, SIGMAS)
+    found: list[Layer] = []
+    for kind, title, path in (
+        ("orthophoto", "Orthophoto", first_of(folder, ORTHOPHOTOS)),
+        ("hillshade", "Hillshade", first_of(folder, HILLSHADES)),
+    ):
+        if path is not None:
+            found.append(Layer(kind, title, path, 1, "picture"))
+    if heights is not None:
+        found.append(Layer("height", "Height", heights, 1, "height", *_usual(heights, 1)))
+    if sigma is not None:
+        found.append(Layer("error", "Error of height", sigma, 1, "error", *_usual(sigma, 1)))
+    if not found:
+        raise RunError(f"{folder} is no map: expected a folder of `tidefield map`, ODM or `tidefield change`")
+    numbers = read_json(folder / MAP_FILE) or {}
+    date = date_in(name) or (date_in(str(numbers.get("scene", ""))) if isinstance(numbers, dict) else None)
+    return Sheet(folder, name, date, "map", tuple(found), heights, sigma, numbers)
+
+
+def _with_own_titles(sheets: list[Sheet]) -> list[Sheet]:
+    """The sheets, with their folders' folders in the titles where these would be alike."""
+    titles = [sheet.title for sheet in sheets]
+    return [
+        replace(sheet, title=f"{sheet.folder.resolve().parent.name}/{sheet.title}")
+        if titles.count(sheet.title) > 1
+        else sheet
+        for sheet in sheets
+    ]
+
+
+class Atlas:
+    """Sheets in one coordinate system.
+
+    Args:
+        folders: of maps and changes.
+
+    Raises:
+        RunError: a folder is none, or lies nowhere near the first one.
+    """
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        rasterio = need("rasterio")
+        self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
+        with _opened(self.sheets[0].layers[0].path) as file:
+            self.crs = file.crs
+        if self.crs is None:
+            raise RunError(f"{self.sheets[0].title} states no coordinate system: expected one in its files")
+        boxes, cells = [], []
+        for sheet in self.sheets:
+            for layer in sheet.layers:
+                with self._reader(layer.path) as file:
+                    boxes.append(file.bounds)
+                    cells.append(min(abs(file.transform.a), abs(file.transform.e)))
+        box = np.array(boxes)
+        self.bounds = tuple(map(float, (*box[:, :2].min(0), *box[:, 2:].max(0))))
+        self.cell = float(min(cells))
+        self.side = float(max(self.bounds[2] - self.bounds[0], self.bounds[3] - self.bounds[1]))
+        if self.side / self.cell > TILE_PX << FINEST_LEVEL:
+            raise RunError(f"the folders lie {self.side:,.0f} apart: expected maps of one place; name others, or fewer")
+        self.finest = min(FINEST_LEVEL, max(0, math.ceil(math.log2(self.side / self.cell / TILE_PX))) + 1)
+        self._rasterio = rasterio
+        self.metre, self.metre_up, self.unit, self.unit_up, self.name = self._units()
+
+    def describe(self) -> dict[str, Any]:
+        """What the page needs to know, without the name of any folder's place."""
+        return {
+            "crs": self.name,
+            "unit": self.unit,
+            "metre": self.metre,
+            "metre_up": self.metre_up,
+            "unit_up": self.unit_up,
+            "bounds": self.bounds,
+            "side": self.side,
+            "finest": self.finest,
+            "tile": TILE_PX,
+            "step": STEP,
+            "sheets": [
+                {
+                    "title": sheet.title,
+                    "date": sheet.date,
+                    "kind": sheet.kind,
+                    "detection": sheet.numbers["level_of_detection_m"].get("median")
+                    if sheet.kind == "change"
+                    else None,
+                    "layers": [
+                        {"name": one.name, "title": one.title, "kind": one.kind, "low": one.low, "high": one.high}
+                        for one in sheet.layers
+                    ],
+                }
+                for sheet in self.sheets
+            ],
+        }
+
+    def tile(self, sheet: int, layer: str, level: int, column: int, row: int) -> bytes | None:
+        """Return a tile as PNG; None where there is no such tile, or nothing in it."""
+        chosen = self._layer(sheet, layer)
+        if chosen is None or not 0 <= level <= self.finest or not (0 <= column < 1 << level and 0 <= row < 1 << level):
+            return None
+        side = self.side / (1 << level)
+        west, north = self.bounds[0] + column * side, self.bounds[3] - row * side
+        with self._reader(chosen.path) as file:
+            bands = [1, 2, 3] if chosen.kind == "picture" and file.count >= 3 else [chosen.band]
+            values, seen = _read(file, bands, west, north, side / TILE_PX, self._rasterio)
+        if not seen.any():
+            return None
+        picture = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
+        if chosen.kind == "picture":
+            picture[..., :3] = values.transpose(1, 2, 0) if len(values) == 3 else values[0][..., None]
+        else:
+            code = np.where(seen, np.rint(np.where(seen, values[0], 0) / STEP) + (1 << 23), 0)
+            code = code.clip(0, (1 << 24) - 1).astype(np.uint32)
+            for k in range(3):
+                picture[..., k] = (code >> (16 - 8 * k)) & 255
+        picture[..., 3] = 255 * seen
+        content = io.BytesIO()
+        Image.fromarray(picture).save(content, "PNG", compress_level=1)
+        return content.getvalue()
+
+    def at(self, x: float, y: float) -> list[dict[str, float | None]]:
+        """Return the values of every sheet's cell at a place: heights or change, with their standard errors."""
+        return [{k: _plain(float(v[0])) for k, v in one.items()} for one in self._along(np.array([[x, y]]))]
+
+    def section(self, points: Float64[np.ndarray, "N 2"]) -> dict[str, Any]:
+        """Return values along a line through points, and the distance from its beginning in metres."""
+        lengths = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
+        if lengths[-1] == 0:
+            raise RunError("the section has no length: expected two places apart; draw it again")
+        along = np.linspace(0, lengths[-1], SECTION_POINTS)
+        place = np.stack([np.interp(along, lengths, points[:, k]) for k in range(2)], axis=1)
+        sheets = [{k: [_plain(v) for v in values.tolist()] for k, values in one.items()} for one in self._along(place)]
+        return {"distance": (self.metre * along).tolist(), "sheets": sheets}
+
+    def area(self, points: Float64[np.ndarray, "N 2"], detection_m: float = 0.0) -> dict[str, Any]:
+        """Return the area of a polygon, and in it the volumes of every sheet in cubic metres.
+
+        Of a change: net of all cells; cut and fill of those beyond a level of detection; with 95% intervals from the
+        random, correlated and systematic errors that `tidefield change` measured. Of a map: above and below the plane
+        through the surface along the polygon's edge, where intervals take the errors of all cells to be alike, which
+        makes them wide.
+        """
+        import shapely
+
+        polygon = shapely.Polygon(points)
+        if not polygon.is_valid or polygon.area == 0:
+            raise RunError("the polygon crosses itself, or has no area: expected one that does not; draw it again")
+        results: list[dict[str, Any]] = []
+        for sheet in self.sheets:
+            path = sheet.layers[0].path if sheet.kind == "change" else sheet.heights
+            if path is None:
+                results.append({})
+                continue
+            with self._reader(path) as file:
+                box, inside = _cells_in(file, polygon, self._rasterio)
+                if not inside.any():
+                    results.append({})
+                    continue
+                values = _band(file, 1, box)
+                transform = _corner_at(file.transform, box)
+                cell = abs(transform.a) * self.metre
+                cell_area = cell * abs(transform.e) * self.metre
+                sigma = _band(file, 2, box) if sheet.kind == "change" else None
+            inside &= np.isfinite(values)
+            if sheet.kind == "change":
+                results.append(_change_volumes(values, sigma, inside, cell, cell_area, sheet.numbers, detection_m))
+                continue
+            if sheet.sigma is not None:
+                with self._reader(sheet.sigma) as file:
+                    error = _band(file, 1, box)
+                sigma = error if error.shape == values.shape else None
+            results.append(self._map_volumes(polygon, values, sigma, inside, transform, cell_area, path))
+        return {"area_m2": polygon.area * self.metre**2, "length_m": polygon.length * self.metre, "sheets": results}
+
+    def _map_volumes(
+        self, polygon: Any, heights: Any, sigma: Any, inside: Any, transform: Any, cell_area: float, path: Path
+    ) -> dict[str, Any]:
+        rim = np.array([polygon.exterior.interpolate(s, normalized=True).coords[0] for s in np.linspace(0, 1, 200)])
+        with self._reader(path) as file:
+            z = _sample(file, rim, 1)
+        known = np.isfinite(z)
+        if known.sum() < 3 or not inside.any():
+            return {}
+        centre = rim.mean(0)
+        design = np.column_stack([np.ones(known.sum()), rim[known] - centre])
+        plane = np.linalg.lstsq(design, z[known], rcond=None)[0]
+        rows, columns = np.nonzero(inside)
+        x = transform.c + (columns + 0.5) * transform.a - centre[0]
+        y = transform.f + (rows + 0.5) * transform.e - centre[1]
+        above = self.metre_up * (heights[inside] - (plane[0] + plane[1] * x + plane[2] * y))
+        result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
+        for name, chosen in (("above", above > 0), ("below", above < 0)):
+            value = float(np.abs(above[chosen]).sum()) * cell_area
+            result[name] = {"value_m3": value}
+            if sigma is not None:
+                own = self.metre_up * np.nan_to_num(sigma[inside][chosen], nan=0.0)
+                half = BAND * float(own.sum()) * cell_area
+                result[name] |= {"low_m3": value - half, "high_m3": value + half}
+        return result
+
+    def _along(self, place: Float64[np.ndarray, "N 2"]) -> list[dict[str, Float64[np.ndarray, " N"]]]:
+        """The values of every sheet at places."""
+        found = []
+        for sheet in self.sheets:
+            values: dict[str, Any] = {}
+            if sheet.kind == "change":
+                with self._reader(sheet.layers[0].path) as file:
+                    for k, name in enumerate(("change", "change_sigma", "p"), start=1):
+                        values[name] = _sample(file, place, k)
+            for name, path in (("height", sheet.heights), ("sigma", sheet.sigma)):
+                if path is not None:
+                    with self._reader(path) as file:
+                        values[name] = _sample(file, place, 1)
+            found.append(values)
+        return found
+
+    def _layer(self, sheet: int, name: str) -> Layer | None:
+        if not 0 <= sheet < len(self.sheets):
+            return None
+        return next((layer for layer in self.sheets[sheet].layers if layer.name == name), None)
+
+    @contextmanager
+    def _reader(self, path: Path) -> Iterator[Any]:
+        """A raster in the atlas' system; opened for each use, since a data set belongs to one thread."""
+        from rasterio.vrt import WarpedVRT
+
+        with _opened(path) as file:
+            if file.crs == self.crs or file.crs is None:
+                yield file
+                return
+            with WarpedVRT(file, crs=self.crs) as warped:
+                yield warped
+
+    def _units(self) -> tuple[float, float, str, str, str]:
+        """Metres in a unit of the plan and of heights, both units, and the system's name."""
+        from pyproj import CRS
+
+        crs = CRS.from_wkt(self.crs.to_wkt())
+        plan = crs.axis_info[0]
+        if "degree" in plan.unit_name:
+            raise RunError(f"the maps are in degrees ({crs.name}): expected a projected system; make them in one")
+        up = next((axis for axis in crs.axis_info if axis.direction == "up"), None)
+        unit, unit_up = (
+            "m" if name in ("metre", "meter") else name for name in (plan.unit_name, up.unit_name if up else "metre")
+        )
+        return plan.unit_conversion_factor, up.unit_conversion_factor if up else 1.0, unit, unit_up, crs.name
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    rasterio = need("rasterio")
+    try:
+        with rasterio.open(path) as file:
+            yield file
+    except rasterio.errors.RasterioIOError as error:
+        raise RunError(f"{path} cannot be read ({error}): expected a GeoTIFF; make the map again") from error
+
+
+def _usual(path: Path, band: int) -> tuple[float, float]:
+    """The 2nd and 98th percentile of a raster's values, from a small picture of it."""
+    with _opened(path) as file:
+        step = max(1.0, max(file.shape) / 512)
+        shape = tuple(max(1, round(side / step)) for side in file.shape)
+        values = file.read(band, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.percentile(known, [2, 98]).tolist()
+    return low, max(high, low + 1e-3)
+
+
+def _read(
+    file: Any, bands: list[int], west: float, north: float, resolution: float, rasterio: Any
+) -> tuple[np.ndarray, Bool[np.ndarray, "P P"]]:
+    """Bands of a tile, and where they are known."""
+    values = np.zeros((len(bands), TILE_PX, TILE_PX), np.float32)
+    seen = np.zeros((TILE_PX, TILE_PX), bool)
+    box = file.bounds
+    left, right = ((edge - west) / resolution for edge in (box.left, box.right))
+    top, bottom = ((north - edge) / resolution for edge in (box.top, box.bottom))
+    c0, c1 = max(0, math.floor(left)), min(TILE_PX, math.ceil(right))
+    r0, r1 = max(0, math.floor(top)), min(TILE_PX, math.ceil(bottom))
+    if c0 >= c1 or r0 >= r1:
+        return values, seen
+    across, down = resolution / abs(file.transform.a), resolution / abs(file.transform.e)
+    if across <= 1:  # several pixels show one cell
+        columns = np.floor((np.arange(c0, c1) + 0.5 - left) * across).astype(int)
+        rows = np.floor((np.arange(r0, r1) + 0.5 - top) * down).astype(int)
+        columns, rows = (np.clip(x, 0, n - 1) for x, n in ((columns, file.width), (rows, file.height)))
+        window = rasterio.windows.Window(columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1)
+        part, known = _known(file, bands, window, None, rasterio)
+        nearest = np.ix_(rows - rows[0], columns - columns[0])
+        values[:, r0:r1, c0:c1] = np.where(known, part, 0)[:, nearest[0], nearest[1]]
+        seen[r0:r1, c0:c1] = known[nearest]
+        return values, seen
+    col, row = max(0.0, (c0 - left) * across), max(0.0, (r0 - top) * down)
+    window = rasterio.windows.Window(
+        col, row, min(file.width - col, (c1 - c0) * across), min(file.height - row, (r1 - r0) * down)
+    )
+    part, known = _known(file, bands, window, (r1 - r0, c1 - c0), rasterio)
+    values[:, r0:r1, c0:c1] = np.where(known, part, 0)
+    seen[r0:r1, c0:c1] = known
+    return values, seen
+
+
+def _known(
+    file: Any, bands: list[int], window: Any, shape: tuple[int, int] | None, rasterio: Any
+) -> tuple[np.ndarray, Bool[np.ndarray, "h w"]]:
+    """Bands of a window, averaged to a shape, and where they are known."""
+    average = rasterio.enums.Resampling.average
+    out = None if shape is None else (len(bands), *shape)
+    part = file.read(bands, window=window, out_shape=out, resampling=average, masked=True)
+    known = file.dataset_mask(window=window, out_shape=shape or part.shape[1:]) > 0
+    known &= ~np.ma.getmaskarray(part).any(axis=0)
+    if part.dtype.kind == "f":
+        known &= np.isfinite(part.data).all(axis=0)
+    return part.data, known
+
+
+def _sample(file: Any, place: Float64[np.ndarray, "N 2"], band: int) -> Float64[np.ndarray, " N"]:
+    """A raster's cells at places; NaN outside and where nothing is known."""
+    rows, columns = np.floor(_cells(file, place)).astype(np.int64)[:, ::-1].T
+    inside = (rows >= 0) & (rows < file.height) & (columns >= 0) & (columns < file.width)
+    found = np.full(len(place), np.nan)
+    if inside.any():
+        r, c = rows[inside], columns[inside]
+        from rasterio.windows import Window
+
+        box = Window(c.min(), r.min(), c.max() - c.min() + 1, r.max() - r.min() + 1)  # type: ignore[call-arg]
+        if box.width * box.height <= MOST_CELLS:
+            found[inside] = _band(file, band, box)[r - r.min(), c - c.min()]
+        else:
+            found[inside] = [float(_band(file, band, Window(x, y, 1, 1))[0, 0]) for y, x in zip(r, c, strict=True)]  # type: ignore[call-arg]
+    return found
+
+
+def _cells(file: Any, place: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Columns and rows of places, counted from the raster's corner."""
+    inverse = ~file.transform
+    matrix = np.array([[inverse.a, inverse.b], [inverse.d, inverse.e]])
+    return place @ matrix.T + (inverse.c, inverse.f)
+
+
+def _corner_at(transform: Any, window: Any) -> Any:
+    """The transform of a window."""
+    a, b, c, d, e, f = transform[:6]
+    x, y = window.col_off, window.row_off
+    return type(transform)(a, b, c + a * x + b * y, d, e, f + d * x + e * y)
+
+
+def _band(file: Any, band: int, window: Any) -> Float64[np.ndarray, "h w"]:
+    return file.read(band, window=window, masked=True).astype(np.float64).filled(np.nan)
+
+
+def _cells_in(file: Any, polygon: Any, rasterio: Any) -> tuple[Any, Bool[np.ndarray, "h w"]]:
+    """The window of a raster around a polygon, and which of its cells have their centres inside."""
+    from rasterio.features import geometry_mask
+
+    west, south, east, north = polygon.bounds
+    (c0, r0), (c1, r1) = _cells(file, np.array([[west, north], [east, south]]))
+    columns = (max(0, math.floor(c0)), min(file.width, math.ceil(c1)))
+    rows = (max(0, math.floor(r0)), min(file.height, math.ceil(r1)))
+    width, height = max(0, columns[1] - columns[0]), max(0, rows[1] - rows[0])
+    if width * height > MOST_CELLS:
+        raise RunError(f"the polygon covers {width} x {height} cells: expected {MOST_CELLS:,} or fewer; draw a smaller")
+    window = rasterio.windows.Window(columns[0], rows[0], width, height)
+    if not width or not height:
+        return window, np.zeros((0, 0), bool)
+    transform = _corner_at(file.transform, window)
+    return window, geometry_mask([polygon], (height, width), transform, invert=True)
+
+
+def _change_volumes(
+    dz: Any, sigma: Any, inside: Any, cell_m: float, cell_area: float, numbers: dict[str, Any], detection_m: float
+) -> dict[str, Any]:
+    measured = numbers.get("variogram", {})
+    variogram = Variogram(tuple(measured.get("sill_shares", ())), tuple(measured.get("ranges_m", ())))
+    systematic = float(numbers.get("registration", {}).get("systematic_m", 0.0))
+    freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
+    result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
+    chosen = {"net": inside, "cut": inside & (dz < -detection_m), "fill": inside & (dz > detection_m)}
+    for name, region in chosen.items():
+        error = region_error(np.nan_to_num(sigma).astype(np.float32), region, variogram, cell_m)
+        area = float(region.sum()) * cell_area
+        value = float(dz[region].sum()) * cell_area
+        volume = Volume(
+            value if name == "net" else abs(value),
+            error.random * cell_area,
+            error.correlated * cell_area,
+            systematic * area,
+            area,
+            degrees_of_freedom=freedom,
+        )
+        low, high = volume.interval_m3
+        result[name] = {"value_m3": volume.value_m3, "low_m3": low, "high_m3": high}
+    return result
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
