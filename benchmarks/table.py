@@ -106,9 +106,8 @@ def page(compared: Results, ablated: Results, others: Sequence[Results], stored:
         *(summarise(ablated) or ["Not measured."]),
         *(table.markdown() for table in ablation_tables(ablated)),
         "## Depth",
-        "Zero-shot, of held-out views of built-in flats, where two training photographs or more see it, against "
-        "the exact truth; *points* are interpolated in the view. The weights learned from other flats of the same "
-        "generator.",
+        "Zero-shot, of held-out views of built-in flats, against the exact truth, in doubly seen pixels; *points* are "
+        "interpolated in the view. The weights learned from other flats of the same generator.",
         *([table.markdown() for table in depth.tables(stored.depth)] if stored.depth else ["Not measured."]),
         "## Scenes without sparse points",
         "Zero-shot, with the points of COLMAP, and without any: then they are found when the scene is opened.",

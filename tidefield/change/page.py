@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from tidefield.change.cover import Cover
 from tidefield.change.figures import (
@@ -28,6 +27,7 @@ from tidefield.change.views import View
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
+from tidefield.pages import template_environment
 
 MINUS = "\u2212"
 _SHOWN_OUTLINES = 12
@@ -44,15 +44,7 @@ def write_page(
     views: Sequence[View] = (),
 ) -> None:
     """Write the page, which needs no other file."""
-    environment = Environment(
-        loader=ChoiceLoader(
-            [PackageLoader("tidefield.change", "templates"), PackageLoader("tidefield.survey.report", "templates")]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment("tidefield.change", "tidefield.survey.report")
     environment.filters |= {
         "metres": lambda value, digits=3: number(value, digits),
         "signed": lambda value, digits=3: signed(value, digits),

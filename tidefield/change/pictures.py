@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image, ImageDraw, ImageFont
 
 from tidefield.change.figures import GAINED as GREEN
@@ -19,6 +18,7 @@ from tidefield.change.figures import LOST as BROWN
 from tidefield.change.figures import LOWER as RED
 from tidefield.change.views import COLOUR, GAINED, HIGHER, LIGHT, LOST, LOWER, UNKNOWN, View
 from tidefield.files import completed_file, write_text
+from tidefield.pages import template_environment
 from tidefield.render.stills import SOFTWARE
 from tidefield.render.video import write_video
 
@@ -117,9 +117,7 @@ def _fading(view: View) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 def swipe_page(view: View, names: tuple[str, str]) -> str:
     """A page of both pictures with a handle between them, which needs no other file."""
-    environment = Environment(
-        loader=PackageLoader("tidefield.change", "templates"), autoescape=True, undefined=StrictUndefined
-    )
+    environment = template_environment("tidefield.change")
     script = (
         "const of=n=>document.getElementById(n),h=of('handle'),l=of('later'),r=of('rule');"
         'const f=()=>{l.style.clipPath="inset(0 0 0 "+h.value+"%)";r.style.left=h.value+"%"};'

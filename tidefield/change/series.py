@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from tidefield.change.figures import HIGHER, INK, LOWER, RULE, SOFT, figure_of, png
@@ -23,6 +22,7 @@ from tidefield.change.page import cubic
 from tidefield.change.volumes import Volume
 from tidefield.change.write import write_csv
 from tidefield.files import write_json, write_text
+from tidefield.pages import template_environment
 
 VOLUMES = ("net", "cut", "fill")
 _MOST_PLOTS = 12
@@ -99,15 +99,7 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
         "closure": {region: closure(entries, region) for region in regions},
     }
     write_json(folder / "series.json", numbers)
-    environment = Environment(
-        loader=ChoiceLoader(
-            [PackageLoader("tidefield.change", "templates"), PackageLoader("tidefield.survey.report", "templates")]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment("tidefield.change", "tidefield.survey.report")
     environment.filters["cubic"] = cubic
     shown = regions[:_MOST_PLOTS]
     html = environment.get_template("series.html").render(

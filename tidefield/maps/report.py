@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from tidefield import __version__
 from tidefield.files import write_text
 from tidefield.maps.cloud import GROUND, VEGETATION, WATER
 from tidefield.maps.rasters import need
+from tidefield.pages import template_environment
 
 WIDEST = 900
 """Of a picture, pixels."""
@@ -45,13 +45,7 @@ def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fil
         ),
         ("Classes", _uri(_classes(_read(out / rasters["classes"])[0])), "Ground brown, vegetation green, water blue."),
     ]
-    environment = Environment(
-        loader=PackageLoader("tidefield.maps", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment("tidefield.maps")
     command = shlex.join(["tidefield", *sys.argv[1:]])
     page = environment.get_template("map.html").render(
         m=result, pictures=pictures, version=__version__, command=command, fill=fill

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
+from tidefield.pages import template_environment
 from tidefield.survey.report.figures import COLOURS, draw_histogram, draw_map, draw_residuals, spaced
 from tidefield.survey.report.findings import Findings
 from tidefield.survey.report.numbers import Numbers, duration
@@ -29,13 +29,7 @@ STAGES = {"quality": "Rejected for their quality", "poses": "Could not be regist
 def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
     """Render the page as HTML; every name in it is escaped."""
     located = findings.frame is not None
-    environment = Environment(
-        loader=PackageLoader("tidefield.survey.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment("tidefield.survey.report")
     environment.filters |= _formats(located) | {"data_uri": _data_uri}
     scatters = [(comparison.title, draw_residuals(comparison)) for comparison in findings.comparisons()]
     lost = []
