@@ -135,9 +135,8 @@ def compare_cover(
     for name, where in inside.items():
         areas[name] = {}
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
-            low, value, high = sorted(float(np.isin(classes[k][where], codes).sum()) * cell for k in (-1, 0, 1))
-            value = float(np.isin(classes[0][where], codes).sum()) * cell
-            areas[name][what] = Area(value, low, high)
+            sizes = [float(np.isin(classes[k][where], codes).sum()) * cell for k in (0, -1, 1)]
+            areas[name][what] = Area(sizes[0], min(sizes), max(sizes))
     red, green, blue = (float(gain) for gain in gains)
     return Cover(grid, classes[0], (red, green, blue), bare, float(scatter), float(known.sum()) * cell, areas)
 

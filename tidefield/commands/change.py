@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.commands.common import Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing
 
@@ -265,12 +265,9 @@ def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, 
     with ExitStack() as stack:
         sites = []
         for path in options.scenes:
-            if (path / RUN_FILE).exists():
-                opened = open_trained(path, device, False, console, hold_out=False)
-                scene, render, _ = stack.enter_context(opened)
-            else:
-                scene = load(path, None, False, console, hold_out=False)
-                render, _ = open_zero_shot(ZeroShot(zero_shot=True), scene, device)
+            zero = ZeroShot(zero_shot=not (path / RUN_FILE).exists())
+            opened = open_source(path, zero, device, False, console, hold_out=False)
+            scene, render, _ = stack.enter_context(opened)
             sites.append(Site.of(scene, render))
         names = options.cameras or (choose_camera(found, sites[0]),)
         with ProgressBar(console, "Rendering views") as bar:

@@ -108,6 +108,28 @@ def open_zero_shot(
 
 
 @contextmanager
+def open_source(
+    source: Path,
+    zero: ZeroShot,
+    device: torch.device,
+    allow_missing: bool,
+    console: Console,
+    sampling: Sampling = USUAL_SAMPLING,
+    hold_out: bool = True,
+) -> Iterator[tuple[Scene, Render, dict[str, Any]]]:
+    """The scene and the method of a scene with trained weights, or of a run, while the block lasts, and its record.
+
+    Without `hold_out` all photographs are sources, as for products.
+    """
+    if zero.zero_shot:
+        scene = load(source, None, allow_missing, console, hold_out)
+        yield scene, *open_zero_shot(zero, scene, device, sampling)
+    else:
+        with open_trained(source, device, allow_missing, console, sampling, hold_out) as opened:
+            yield opened
+
+
+@contextmanager
 def open_trained(
     folder: Path,
     device: torch.device,

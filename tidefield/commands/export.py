@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
 from tidefield.files import require_writable
 
@@ -52,14 +51,8 @@ def export(options: Export, console: Console) -> None:
         raise RunError(f"--width {options.width} was asked for: expected 32 to 4096 pixels; choose another")
     require_writable(options.out, overwrite=options.overwrite)
     device = choose_device(options.device)
-    with ExitStack() as stack:
-        if options.zero.zero_shot:
-            scene = load(options.source, None, options.allow_missing, console)
-            render, _ = open_zero_shot(options.zero, scene, device)
-        else:
-            opened = open_trained(options.source, device, options.allow_missing, console)
-            scene, render, _ = stack.enter_context(opened)
-        with ProgressBar(console, "Rendering") as bar:
-            found = make_gaussians(render, scene.cameras[list(scene.train)], options.width, bar)
+    opened = open_source(options.source, options.zero, device, options.allow_missing, console)
+    with opened as (scene, render, _), ProgressBar(console, "Rendering") as bar:
+        found = make_gaussians(render, scene.cameras[list(scene.train)], options.width, bar)
     write_gaussians(found, options.out, scene.origin_world.tolist(), options.overwrite)
     console.print(f"{options.out}: {len(found.mean_world):,} Gaussians", highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
 
 if TYPE_CHECKING:
@@ -74,12 +74,8 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     device = choose_device(options.device)
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
-        if options.zero.zero_shot:
-            scene = load(options.source, None, options.allow_missing, console, hold_out=False)
-            render, record = open_zero_shot(options.zero, scene, device)
-        else:
-            opened = open_trained(options.source, device, options.allow_missing, console, hold_out=False)
-            scene, render, record = stack.enter_context(opened)
+        opened = open_source(options.source, options.zero, device, options.allow_missing, console, hold_out=False)
+        scene, render, record = stack.enter_context(opened)
         frame = map_frame(scene, read_georeference(scene.root), options.heights)
         area, interval = None, options.contours and options.contours * frame.metre_up
         if options.area is not None:

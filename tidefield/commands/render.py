@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import (
-    AllowMissing,
-    Device,
-    Footprint,
-    Verbosity,
-    ZeroShot,
-    load,
-    open_trained,
-    open_zero_shot,
-)
+from tidefield.commands.common import AllowMissing, Device, Footprint, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError, TidefieldError
 from tidefield.files import require_writable
 
@@ -80,13 +70,8 @@ def render(options: Render, console: Console) -> None:
         raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
     device, sampling = choose_device(options.device), options.footprint.sampling
-    with ExitStack() as stack:
-        if options.zero.zero_shot:
-            scene = load(options.source, None, options.allow_missing, console)
-            view, _ = open_zero_shot(options.zero, scene, device, sampling)
-        else:
-            opened = open_trained(options.source, device, options.allow_missing, console, sampling)
-            scene, view, _ = stack.enter_context(opened)
+    opened = open_source(options.source, options.zero, device, options.allow_missing, console, sampling)
+    with opened as (scene, view, _):
         if camera is not None:
             own = scene.cameras[scene.index(camera)]
             own = own.resized(*_size(own, options.width, options.height))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, load, open_trained, open_zero_shot
+from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
 
 if TYPE_CHECKING:
@@ -70,14 +70,11 @@ def view(options: View, console: Console) -> None:
     if len(options.sources) > 1:
         raise RunError(f"{len(options.sources)} scenes were named: expected one at a time; leave the others out")
     device = choose_device(options.device)
+    if not options.zero.zero_shot:
+        _require_trained(source)
     with ExitStack() as stack:
-        if options.zero.zero_shot:
-            scene = load(source, None, options.allow_missing, console)
-            render, _ = open_zero_shot(options.zero, scene, device)
-        else:
-            _require_trained(source)
-            opened = open_trained(source, device, options.allow_missing, console)
-            scene, render, _ = stack.enter_context(opened)
+        opened = open_source(source, options.zero, device, options.allow_missing, console)
+        scene, render, _ = stack.enter_context(opened)
         name = source.resolve().name
         page = ScenePage(scene, render, name, options.host, options.port, options.width)
         stack.callback(page.close)
