@@ -5,6 +5,7 @@ A run stores its `Config` as JSON next to its weights; `config_from_json` reads 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import reprlib
@@ -91,7 +92,7 @@ class NetworkConfig:
     uniform_fraction: Share = 0.05
     """Share of a finer pass's samples that are spread evenly instead of where the coarser pass found the surface."""
     without: tuple[Part, ...] = ()
-    """Parts of the paper that are left out, for the ablation: views count alike instead of by direction (eq. 6),
+    """Parts of the paper that are left out: views count alike instead of by direction (eq. 6),
     densities come from each sample alone, colours from the neighbours alone."""
 
 
@@ -205,6 +206,8 @@ SWIFT = Config(
             PassConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
         ),
         views=5,
+        # Neither brings anything that can be measured there (docs/results.md, "What the paper's parts bring").
+        without=("ray transformer", "target colour"),
     ),
     train=TrainConfig(
         tile_px=32,
@@ -272,14 +275,32 @@ def warm_start(config: Config) -> Config:
 
 
 def vary(config: Config, name: str) -> AnyConfig:
-    """The variant of that name: one part changed or left out, for the ablation.
+    """The variant of that name: one part changed, left out or added, for the ablation.
 
     Raises:
-        RunError: there is none.
+        RunError: there is none, or none of this configuration.
     """
     if name not in VARIANTS:
         raise RunError(f"there is no variant {name}: expected one of {', '.join(VARIANTS)}")
-    return VARIANTS[name](config)
+    try:
+        return VARIANTS[name](config)
+    except _NotApplicable as reason:
+        names = ", ".join(variants_of(config))
+        raise RunError(f"{config.preset} has no variant {name}: {reason}; expected one of {names}") from None
+
+
+def variants_of(config: Config) -> tuple[str, ...]:
+    """The names of the variants that a configuration has."""
+    names = []
+    for name, change in VARIANTS.items():
+        with contextlib.suppress(_NotApplicable):
+            change(config)
+            names.append(name)
+    return tuple(names)
+
+
+class _NotApplicable(Exception):
+    """A variant of a part that a configuration does not have, or that it has already."""
 
 
 def _network(config: Config, **changes: Any) -> Config:
@@ -287,7 +308,21 @@ def _network(config: Config, **changes: Any) -> Config:
 
 
 def _without(config: Config, part: Part) -> Config:
+    if part in config.network.without:
+        raise _NotApplicable(f"it has no {part}")
     return _network(config, without=(*config.network.without, part))
+
+
+def _with(config: Config, part: Part) -> Config:
+    if part not in config.network.without:
+        raise _NotApplicable(f"it has its {part} already")
+    return _network(config, without=tuple(other for other in config.network.without if other != part))
+
+
+def _degree(config: Config, degree: int) -> Config:
+    if "target colour" in config.network.without:
+        raise _NotApplicable("it has no target colour")
+    return _network(config, harmonics_degree=degree)
 
 
 def _neighbours(config: Config, strategy: Literal["seen", "direction"]) -> Config:
@@ -306,7 +341,9 @@ VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     "no-direction-weights": partial(_without, part="direction weights"),
     "no-ray-transformer": partial(_without, part="ray transformer"),
     "no-target-colour": partial(_without, part="target colour"),
-    **{f"degree-{degree}": partial(_network, harmonics_degree=degree) for degree in (0, 1, 2, 3, 4)},
+    "with-ray-transformer": partial(_with, part="ray transformer"),
+    "with-target-colour": partial(_with, part="target colour"),
+    **{f"degree-{degree}": partial(_degree, degree=degree) for degree in (0, 1, 2, 3, 4)},
     **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
     "neighbours-seen": partial(_neighbours, strategy="seen"),
     "neighbours-direction": partial(_neighbours, strategy="direction"),

@@ -12,7 +12,18 @@ from tidefield.commands.ablate import Ablate
 from tidefield.compare.ablation import ablation_tables, summarise, variants, write_ablation
 from tidefield.compare.results import Result, Results, read_results
 from tidefield.compare.run import OTHER_SEED, Settings, commands, compare
-from tidefield.config import PAPER, SWIFT, VARIANTS, EncoderConfig, NerfConfig, config_from_json, config_to_json, vary
+from tidefield.config import (
+    PAPER,
+    SWIFT,
+    VARIANTS,
+    Config,
+    EncoderConfig,
+    NerfConfig,
+    config_from_json,
+    config_to_json,
+    variants_of,
+    vary,
+)
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.model.network import make_network
@@ -20,9 +31,12 @@ from tidefield.model.network import make_network
 SETTINGS = Settings(minutes=10.0, steps=None, width=48, device="cpu", seed=0, preset="paper")
 
 
-@pytest.mark.parametrize("preset", [SWIFT, PAPER], ids=lambda config: config.preset)
-@pytest.mark.parametrize("name", VARIANTS)
-def test_a_variant_is_a_network_that_a_run_can_store(name: str, preset):
+@pytest.mark.parametrize(
+    ("preset", "name"),
+    [(preset, name) for preset in (SWIFT, PAPER) for name in variants_of(preset)],
+    ids=lambda value: value if isinstance(value, str) else value.preset,
+)
+def test_a_variant_is_a_network_that_a_run_can_store(preset: Config, name: str):
     varied = vary(preset, name)
     assert config_from_json(json.loads(json.dumps(config_to_json(varied)))) == varied
     if name == "no-neighbours":
@@ -43,14 +57,37 @@ def test_an_unknown_variant_is_refused():
         vary(SWIFT, "colourless")
 
 
+@pytest.mark.parametrize(
+    ("preset", "name", "reason"),
+    [
+        (SWIFT, "no-ray-transformer", "it has no ray transformer"),
+        (SWIFT, "degree-1", "it has no target colour"),
+        (PAPER, "with-target-colour", "it has its target colour already"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.preset,
+)
+def test_a_variant_of_a_part_that_a_preset_does_not_have_is_refused(preset: Config, name: str, reason: str):
+    with pytest.raises(RunError, match=f"{preset.preset} has no variant {name}: {reason}; expected one of no-neigh"):
+        vary(preset, name)
+    assert name not in variants_of(preset)
+
+
+def test_parts_that_are_added_come_back():
+    both = vary(vary(SWIFT, "with-ray-transformer"), "with-target-colour")
+    assert both.network.without == ()
+    assert len(list(make_network(both.network).parameters())) > len(list(make_network(SWIFT.network).parameters()))
+
+
 def test_variants_are_trained_like_the_network_itself():
-    names = variants(("views-2",))
+    names = variants(("views-2",), "paper")
     assert names == ("tidefield", OTHER_SEED, "views-2")
     whole, other, fewer = (commands(Path("S"), Path("F"), name, SETTINGS)["train"] for name in names)
     assert whole[3:5] == ["--preset", "paper"]
     assert fewer == [*whole[:5], "--variant", "views-2", *whole[5:]]
     assert other == [*whole[:-1], "1"]
-    assert len(variants(Ablate.variants)) == 2 + len(VARIANTS)
+    everything = variants(Ablate.variants, "swift")
+    assert everything[2:] == variants_of(SWIFT)
+    assert set(variants_of(SWIFT) + variants_of(PAPER)) == set(VARIANTS)
 
 
 def test_the_table_marks_differences_within_the_noise(tmp_path: Path):
@@ -89,7 +126,7 @@ def test_the_summary_names_what_has_no_effect_on_any_scene(tmp_path: Path):
 def test_an_ablation_is_run_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_colmap(tmp_path / "flats", survey(PINHOLE))
-    run, names = Children(load_scene(tmp_path / "flats", width=48)), variants(("views-2",))
+    run, names = Children(load_scene(tmp_path / "flats", width=48)), variants(("views-2",), "paper")
     compare({"flats": tmp_path / "flats"}, names, SETTINGS, tmp_path / "out", run, quiet)
     results = read_results(tmp_path / "out", ["flats"], names)
     files = write_ablation(results, SETTINGS, tmp_path / "out")

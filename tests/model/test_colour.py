@@ -210,11 +210,13 @@ def test_views_straight_behind_the_target_stay_finite(kind: type[ColourBlend]):
     assert own(evidence, straight, direction).isfinite().all()
 
 
-def test_neighbours_only_the_neighbours_share_everything_that_one_of_them_sees():
-    own, (evidence, gathered, direction) = randomise(AngularColourBlend(H, 3, neighbours_only=True).double()), scene()
+@pytest.mark.parametrize("kind", BLENDS)
+def test_without_a_target_the_neighbours_share_everything_and_what_none_sees_is_grey(kind: type[ColourBlend]):
+    own, (evidence, gathered, direction) = randomise(kind(H, 3, neighbours_only=True).double()), scene()
     share, seen = shares(own, evidence, gathered, direction), gathered.valid.any(1)
+    torch.testing.assert_close(share.sum(1)[seen], torch.ones(int(seen.sum())).double())
     blended = (share[..., None] * gathered.colours).sum(1)
     torch.testing.assert_close(own(evidence, gathered, direction)[seen], blended[seen])
-    assert (share.sum(1)[~seen] == 0).all()
+    assert (own(evidence, gathered, direction)[~seen] == 0.5).all()
     own(evidence, gathered, direction).sum().backward()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in own.parameters())
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in own.parameters())

@@ -50,5 +50,5 @@ def ablate(options: Ablate, console: Console) -> None:
         vary(PRESETS[options.preset], name)  # before anything is trained
     # From scratch, all of them: trained weights would belong to one of the variants only.
     settings = make_settings(options.budget, options.width, options.device, options.seed, True, options.preset)
-    results = run_all(named(options.scenes), variants(options.variants), settings, options.out, console)
+    results = run_all(named(options.scenes), variants(options.variants, options.preset), settings, options.out, console)
     print_lines(console, write_ablation(results, settings, options.out))

@@ -8,7 +8,7 @@ from pathlib import Path
 from tidefield.compare.results import Results
 from tidefield.compare.run import OTHER_SEED, WHOLE, Settings
 from tidefield.compare.tables import Table, shown, write_figures, write_tables
-from tidefield.config import VARIANTS
+from tidefield.config import PRESETS, variants_of
 
 LEAST_DB = 0.05
 """A smaller difference counts as noise, even if two seeds happen to agree better."""
@@ -21,9 +21,9 @@ _METRICS = (
 )
 
 
-def variants(chosen: Sequence[str]) -> tuple[str, ...]:
-    """The whole network, the same with another seed, and its variants; all of these where none is chosen."""
-    return (WHOLE, OTHER_SEED, *(chosen or VARIANTS))
+def variants(chosen: Sequence[str], preset: str) -> tuple[str, ...]:
+    """The whole network, the same with another seed, and its variants; all that the preset has where none is chosen."""
+    return (WHOLE, OTHER_SEED, *(chosen or variants_of(PRESETS[preset])))
 
 
 def ablation_tables(results: Results) -> list[Table]:

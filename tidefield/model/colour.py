@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -65,11 +65,18 @@ def expand(coefficients: Float[Tensor, "*B 3 K"], basis_values: Float[Tensor, "*
     return (coefficients * basis_values[..., None, :]).sum(-1)
 
 
+def blend_neighbours(logits: Float[Tensor, "T N P"], gathered: Gathered) -> Float[Tensor, "T P 3"]:
+    """Eq. 7 over the neighbours alone; middle grey where none sees the sample."""
+    # Where no view is valid the softmax is of nothing.
+    share = torch.softmax(logits.masked_fill(~gathered.valid, -torch.inf), dim=1).nan_to_num()
+    return torch.where(gathered.valid.any(1)[..., None], weighted_sum(gathered.colours, share), 0.5)
+
+
 def blend(
     logits: Float[Tensor, "T N P"],
     target_logit: Float[Tensor, "T P"],
-    colours: Float[Tensor, "T N P 3"],
     target: Float[Tensor, "T P 3"],
+    colours: Float[Tensor, "T N P 3"],
 ) -> Float[Tensor, "T P 3"]:
     """Eq. 7: c = sum_i C_i exp(w_ci) / sum_j exp(w_cj) over the neighbours' colours and the target's own."""
     share = torch.softmax(torch.cat([logits, target_logit[:, None]], dim=1), dim=1)
@@ -85,34 +92,37 @@ class ColourBlend(nn.Module):
     Args:
         hidden: H.
         degree: J.
-        neighbours_only: the target has no share where a neighbour sees the sample; for the ablation.
+        neighbours_only: there is no target: colours are the neighbours' alone, and middle grey where none sees.
         inputs: numbers that enter each neighbour's logit next to F_N,i: d - d_i (3), d.d_i and w_n,i.
     """
 
     def __init__(self, hidden: int, degree: int, neighbours_only: bool = False, inputs: int = 5) -> None:
         super().__init__()
-        self.degree, self.neighbours_only = degree, neighbours_only
+        self.degree = degree
         self.view = nn.Linear(hidden, hidden)
         self.direction = nn.Linear(inputs, hidden, bias=False)
         self.logit = nn.Linear(hidden, 1)
-        self.target = nn.Linear(hidden, 1 + 3 * (degree + 1) ** 2)
         nn.init.zeros_(self.logit.weight)
-        nn.init.zeros_(self.target.weight)
-        nn.init.zeros_(self.target.bias)
+        self.target = None if neighbours_only else nn.Linear(hidden, 1 + 3 * (degree + 1) ** 2)
+        if self.target is not None:
+            nn.init.zeros_(self.target.weight)
+            nn.init.zeros_(self.target.bias)
 
     def forward(
         self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
     ) -> Float[Tensor, "T P 3"]:
         """Colours of P samples per tile; `direction` is d, unit, towards the samples."""
-        target_logit, target = self.target_colour(evidence, direction, 0.5)
         logits = self.view_logits(evidence, gathered, self.view_inputs(evidence, gathered, direction))
+        if self.target is None:
+            return blend_neighbours(logits, gathered)
         logits = logits.masked_fill(~gathered.valid, -torch.inf)
-        return blend(logits, self.restrict(target_logit, gathered.valid), gathered.colours, target)
+        return blend(logits, *self.target_colour(evidence, direction, 0.5), gathered.colours)
 
     def target_colour(
         self, evidence: Evidence, direction: Float[Tensor, "T P 3"], origin: Float[Tensor, "T P 3"] | float
     ) -> tuple[Float[Tensor, "T P"], Float[Tensor, "T P 3"]]:
         """The target candidate: its logit, and its colour, expanded in spherical harmonics around `origin`."""
+        assert self.target is not None, "there is no target"
         head = self.target(evidence.density)
         return head[..., 0], origin + expand(head[..., 1:].unflatten(-1, (3, -1)), basis(direction, self.degree))
 
@@ -134,10 +144,6 @@ class ColourBlend(nn.Module):
         hidden = torch.baddbmm(hidden.flatten(0, 1), torch.stack(inputs, dim=2).flatten(0, 1).transpose(1, 2), across)
         return self.logit(F.relu(hidden, inplace=True))[..., 0].unflatten(0, gathered.cosine.shape[:2])
 
-    def restrict(self, target_logit: Float[Tensor, "T P"], valid: Bool[Tensor, "T N P"]) -> Float[Tensor, "T P"]:
-        """The target's logit, minus infinity where only neighbours may take part."""
-        return target_logit.masked_fill(valid.any(1), -torch.inf) if self.neighbours_only else target_logit
-
 
 class AngularColourBlend(ColourBlend):
     """Eqs. 7 and 8 with a prior on angles, for `swift`.
@@ -150,8 +156,9 @@ class AngularColourBlend(ColourBlend):
     def __init__(self, hidden: int, degree: int, neighbours_only: bool = False) -> None:
         super().__init__(hidden, degree, neighbours_only, inputs=7)
         self.angle = nn.Parameter(torch.tensor(1.0))
-        with torch.no_grad():
-            self.target.bias[0] = -2.0  # a share of 12%
+        if self.target is not None:
+            with torch.no_grad():
+                self.target.bias[0] = -2.0  # a share of 12%
 
     def forward(
         self, evidence: Evidence, gathered: Gathered, direction: Float[Tensor, "T P 3"]
@@ -161,11 +168,11 @@ class AngularColourBlend(ColourBlend):
         inputs = [*self.view_inputs(evidence, gathered, direction), closeness / 4, gathered.octaves_coarser]
         logits = self.view_logits(evidence, gathered, inputs)
         logits = logits + self.angle * closeness + gathered.blend_weight.log()
-        share = torch.softmax(logits.masked_fill(~gathered.valid, -torch.inf), dim=1)
-        # Where no view is valid the softmax is of nothing, and the target's colour is around middle grey.
-        seen = evidence.valid[..., None]
-        blended = torch.where(seen, weighted_sum(gathered.colours, share.nan_to_num()), 0.5)
+        blended = blend_neighbours(logits, gathered)
+        if self.target is None:
+            return blended
+        # Where no view sees, the target's colour is around middle grey.
         target_logit, target = self.target_colour(evidence, direction, blended)
         # Relative to the neighbours' total, so that one bias means the same share for two views and for ten.
-        target_share = torch.sigmoid(self.restrict(target_logit, gathered.valid))[..., None]
-        return torch.where(seen, torch.lerp(blended, target, target_share), target)
+        mixed = torch.lerp(blended, target, torch.sigmoid(target_logit)[..., None])
+        return torch.where(evidence.valid[..., None], mixed, target)

@@ -47,8 +47,7 @@ class PaperNetwork(Network):
         # The shipped weights have learned with displaced features (docs/method.md, section 2).
         self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),), aligned=False)
         self.aggregate = Aggregate(channels, hidden, uniform_weights="direction weights" in config.without)
-        if "ray transformer" not in config.without:
-            self.transformer = RayTransformer(hidden, config.heads)
+        self.transformer = None if "ray transformer" in config.without else RayTransformer(hidden, config.heads)
         self.density = nn.Linear(hidden, 1)
         self.colour = ColourBlend(hidden, config.harmonics_degree, "target colour" in config.without)
 
@@ -103,7 +102,7 @@ class PaperNetwork(Network):
         self, features: Float[Tensor, "T R M H"], s: Float[Tensor, "T R M"], valid: Tensor
     ) -> Float[Tensor, "T R M"]:
         """sigma >= 0 from all F_sigma of a ray together; 0 where no view sees the sample."""
-        if hasattr(self, "transformer"):
+        if self.transformer is not None:
             rays = (x.flatten(0, 1) for x in (features, s, valid))
             features = self.transformer(*rays).unflatten(0, features.shape[:2])
         return F.softplus(self.density(features)[..., 0]) * valid

@@ -163,8 +163,7 @@ class Pass(nn.Module):
         hidden = config.hidden
         uniform = "direction weights" in network.without
         self.aggregate = ComparingAggregate(config.feature_channels, hidden, folded=True, uniform_weights=uniform)
-        if "ray transformer" not in network.without:
-            self.transformer = RayTransformer(hidden, network.heads)
+        self.transformer = None if "ray transformer" in network.without else RayTransformer(hidden, network.heads)
         self.density = nn.Linear(hidden, 1)
         self.prior_features = nn.Linear(3, hidden)
         self.agreement_features = nn.Linear(2, hidden)
@@ -192,7 +191,7 @@ class Pass(nn.Module):
         degrees = degrees_of_freedom(evidence).unflatten(1, rays[1:])
         agreement = self._agreement_score(evidence, degrees)
         x, score = self._prior(evidence.density.unflatten(1, rays[1:]), samples, intervals, degrees, agreement)
-        if hasattr(self, "transformer"):
+        if self.transformer is not None:
             x = self.transformer(*(t.flatten(0, 1) for t in (x, samples.s, valid))).unflatten(0, rays[:2])
         score = score + agreement + self.density(x)[..., 0] + widths(samples.s).log()
         empty = None if opaque else self.empty
