@@ -291,6 +291,31 @@ def points(
         print(table.markdown(), end="\n\n")
 
 
+def parts(
+    weights: tyro.conf.Positional[tuple[Path, ...]],
+    scenes: tuple[Path, ...] = (),
+    runs: Path = MEASURED,
+    width: int = 400,
+    device: str = "auto",
+) -> None:
+    """Zero-shot views with weights that were trained with and without parts of the network (minutes for each scene).
+
+    Args:
+        weights: Files of `tidefield pretrain`, trained alike but for their parts.
+        scenes: Folders.
+        runs: Store the figures in this folder's parts.json; what it holds is not measured again.
+        width: Of the pictures in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    tune_process()
+    from benchmarks.parts import measure_parts, tables
+    from tidefield.device import choose_device
+
+    record = measure_parts(weights, scenes, runs, width, choose_device(device), partial(print, flush=True))
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+
+
 def depth(
     work: Path = Path("runs/depth"),
     runs: Path = MEASURED,
@@ -517,7 +542,7 @@ def table(
         comparison: Files of `tidefield compare`; of a result in several files the last one counts.
         ablation: Files of `tidefield ablate`, likewise.
         lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
-        runs: Folder of speed, frames, memory, depth and points.
+        runs: Folder of speed, frames, memory, depth, points and parts.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
@@ -545,7 +570,7 @@ def main(words: Sequence[str] | None = None) -> None:
         words = ["speed", *words]
     mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, *mapped, points, depth, *changes, view, kills, fuzz)
+    measured = (speed, frames, memory, scales, surveys, *mapped, points, parts, depth, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import depth, points
+from benchmarks import parts as paper_parts
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
-from tidefield.compare.ablation import ablation_tables, summarise, variants
+from tidefield.compare.ablation import ablation_tables, summarise
 from tidefield.compare.results import Result, Results, read_figures
-from tidefield.compare.run import WHOLE
+from tidefield.compare.run import OTHER_SEED, WHOLE
 from tidefield.compare.tables import (
     NOTHING,
     REGIONS,
@@ -33,6 +34,7 @@ from tidefield.compare.tables import (
     shown,
     trainings,
 )
+from tidefield.config import VARIANTS
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import read_json, write_text
@@ -68,6 +70,7 @@ class Stored:
     frames: Mapping[str, Any] | None = None
     depth: Mapping[str, Any] | None = None
     points: Mapping[str, Any] | None = None
+    parts: Mapping[str, Any] | None = None
 
 
 def write_page(
@@ -78,9 +81,12 @@ def write_page(
     Raises:
         RunError: when there is no measurement at all.
     """
-    compared, ablated = read_figures(comparison, SCENES, names()), read_figures(ablation, SCENES, variants(()))
+    compared, ablated = (
+        read_figures(comparison, SCENES, names()),
+        read_figures(ablation, SCENES, (WHOLE, OTHER_SEED, *VARIANTS)),
+    )
     others = [read_figures([file], SCENES, (WHOLE,)) for file in lengths]
-    files = (SPEED_FILE, MEMORY_FILE, FRAMES_FILE, depth.DEPTH_FILE, points.POINTS_FILE)
+    files = (SPEED_FILE, MEMORY_FILE, FRAMES_FILE, depth.DEPTH_FILE, points.POINTS_FILE, paper_parts.PARTS_FILE)
     stored = Stored(*(read_json(runs / file) for file in files))
     if not (compared.by or ablated.by or any(vars(stored).values())):
         places = ", ".join(map(str, (*comparison, *ablation, runs)))
@@ -105,6 +111,10 @@ def page(compared: Results, ablated: Results, others: Sequence[Results], stored:
         "## Ablation",
         *(summarise(ablated) or ["Not measured."]),
         *(table.markdown() for table in ablation_tables(ablated)),
+        "## What the paper's parts bring",
+        "Zero-shot, with weights that were trained across scenes alike, with and without them: the preset `swift` has "
+        "those parts that bring something there.",
+        *([table.markdown() for table in paper_parts.tables(stored.parts)] if stored.parts else ["Not measured."]),
         "## Depth",
         "Zero-shot, of held-out views of built-in flats, against the exact truth, in doubly seen pixels; *points* are "
         "interpolated in the view. The weights learned from other flats of the same generator.",

@@ -343,6 +343,7 @@ VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     "no-target-colour": partial(_without, part="target colour"),
     "with-ray-transformer": partial(_with, part="ray transformer"),
     "with-target-colour": partial(_with, part="target colour"),
+    "with-every-part": lambda config: _with(_with(config, "ray transformer"), "target colour"),
     **{f"degree-{degree}": partial(_degree, degree=degree) for degree in (0, 1, 2, 3, 4)},
     **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
     "neighbours-seen": partial(_neighbours, strategy="seen"),

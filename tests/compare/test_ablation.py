@@ -73,7 +73,8 @@ def test_a_variant_of_a_part_that_a_preset_does_not_have_is_refused(preset: Conf
 
 
 def test_parts_that_are_added_come_back():
-    both = vary(vary(SWIFT, "with-ray-transformer"), "with-target-colour")
+    both = vary(SWIFT, "with-every-part")
+    assert isinstance(both, Config)
     assert both.network.without == ()
     assert len(list(make_network(both.network).parameters())) > len(list(make_network(SWIFT.network).parameters()))
 

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.train import report_end
-from tidefield.config import PRESETS, Budget, checked_seed
+from tidefield.config import PRESETS, Budget, Config, checked_seed, vary
 from tidefield.errors import RunError
 from tidefield.files import delete_partials, is_empty, only_writer
 
@@ -33,6 +33,8 @@ class Pretrain:
     real: tuple[Path, ...] = ()
     """Scenes to learn from, too; only their training photographs are used."""
     preset: Preset = "swift"
+    variant: str | None = None
+    """Of the preset, as `tidefield ablate` names them, to find out what a part brings."""
     budget: OmitArgPrefixes[Budget] = Budget()
     seed: int = 0
     """Of the weights, the scenes and their order."""
@@ -73,6 +75,11 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
     from tidefield.train.stream import Stream
 
     folder, config = options.out, PRESETS[options.preset]
+    if options.variant is not None:
+        varied = vary(config, options.variant)
+        if not isinstance(varied, Config):
+            raise RunError(f"--variant {options.variant} has no neighbouring views to learn from: choose another")
+        config = varied
     if across.is_main_process():
         delete_partials(*(folder / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)

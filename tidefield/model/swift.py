@@ -5,10 +5,12 @@ What it adds to `model.paper`:
 
 - A coarse pass with one ray for 4 x 4 pixels finds the surface; a fine pass searches around it.
 - A score of each sample is the logarithm of how likely the surface is there (`Pass.weights`): the prior from matched
-  photographs and sparse points, the agreement of the views, and what the ray transformer finds from both. The density
-  is the hazard rate of that distribution, so more samples do not stop more light.
+  photographs and sparse points, the agreement of the views, and what the aggregated features say. The density is the
+  hazard rate of that distribution, so more samples do not stop more light.
 - The views' colours are read by cubic interpolation from learnedly sharpened photographs, and blended by angle
   (`colour.AngularColourBlend`).
+- The ray transformer and the target colour are left out in the preset, because they bring nothing here
+  (docs/results.md); variants have them.
 - Views fade in and out (`blend_weight`), so that neither tiles nor frames of a video jump.
 - The aggregation's first layer is applied to the feature maps, once per photograph instead of once per sample.
 
@@ -151,7 +153,7 @@ class SwiftNetwork(Network):
 
 
 class Pass(nn.Module):
-    """Aggregation, ray transformer and density of one pass.
+    """Aggregation, density and, in variants, ray transformer of one pass.
 
     Args:
         network, config: of the whole and of this pass.

@@ -1,0 +1,104 @@
+"""What the paper's parts bring to weights that are trained across scenes: zero-shot views with each of several files.
+
+A weights file says which parts its network has, so files of `tidefield pretrain` that were trained alike, with other
+variants of the preset, are compared as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tidefield.compare.tables import Table
+from tidefield.config import Config, config_from_json
+from tidefield.data.load import load_scene
+from tidefield.data.surface import doubly_seen
+from tidefield.errors import RunError
+from tidefield.evaluation.metrics import fit_colours, flip_map, psnr, ssim_map
+from tidefield.files import read_json, write_json
+from tidefield.machine import describe
+from tidefield.methods import zero_shot
+from tidefield.model.rendering import to_8_bit
+from tidefield.train.checkpoint import read_weights_file, weights_sha256
+
+PARTS_FILE = "parts.json"
+METRICS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "flip": "{:.4f}"}
+
+
+def measure_parts(
+    files: Sequence[Path],
+    scenes: Sequence[Path],
+    runs: Path,
+    width: int,
+    device: torch.device,
+    say: Callable[[str], object],
+) -> dict[str, Any]:
+    """Compare weights files on the held-out photographs of scenes; what was measured is kept.
+
+    Args:
+        files: weights of `tidefield pretrain`.
+        scenes: folders.
+        runs: folder for parts.json.
+        width: of the pictures, pixels.
+        device: to render on.
+        say: reports progress.
+
+    Raises:
+        RunError: a file is damaged, or holds no weights of a preset.
+    """
+    record = read_json(runs / PARTS_FILE) or {"files": {}, "figures": {}}
+    for file in files:
+        header, _ = read_weights_file(file)
+        config = config_from_json(header["config"], f"{file}: config")
+        if not isinstance(config, Config):
+            raise RunError(f"{file} is of {config.method}: expected weights of a preset; name others")
+        own = weights_sha256(file)
+        record["files"][own] = {
+            **{key: header[key] for key in ("steps", "seed", "real", "validation")},
+            "preset": config.preset,
+            "without": list(config.network.without),
+        }
+        for folder in scenes:
+            name = f"{folder.resolve().name}, {width} px"
+            if own not in record["figures"].setdefault(name, {}):
+                say(f"{name}: {file}")
+                scene = load_scene(folder, width=width)
+                render, _ = zero_shot(config, file, scene, device)
+                rows = []
+                for index in scene.test:
+                    truth, seen = scene.photographs[index], doubly_seen(scene, scene.cameras[index])
+                    with torch.no_grad():
+                        image = fit_colours(to_8_bit(render(scene.cameras[index]).colour), truth, seen)
+                    maps = (ssim_map(image, truth), flip_map(image, truth))
+                    rows.append((psnr(image, truth, seen), *(float(values[seen].mean()) for values in maps)))
+                means = (sum(column) / len(rows) for column in zip(*rows, strict=True))
+                record["figures"][name][own] = dict(zip(METRICS, means, strict=True))
+            command = "python -m benchmarks parts WEIGHTS... --scenes SCENE..."
+            write_json(runs / PARTS_FILE, {**record, **describe(), "command": command})
+    return record
+
+
+def tables(record: Mapping[str, Any]) -> list[Table]:
+    """Pictures of every scene with each of the files, and what the files themselves say of their validation."""
+    columns = {own: _label(about) for own, about in record["files"].items()}
+    rows = [
+        (scene, *(style.format(found[own][metric]) for metric, style in METRICS.items() for own in columns))
+        for scene, found in record["figures"].items()
+        if all(own in found for own in columns)
+    ]
+    names = [f"{metric.upper()}: {label}" for metric in METRICS for label in columns.values()]
+    last = {label: record["files"][own]["validation"][-1]["psnr"] for own, label in columns.items()}
+    scenes = list(next(iter(last.values())))
+    validated = [[label, *(f"{psnr[scene]:.2f}" for scene in scenes)] for label, psnr in last.items()]
+    return [
+        Table("Held-out photographs, doubly seen pixels, after the colour fit", ["scene", *names], rows),
+        Table("PSNR in dB at the end of the training, of the scenes that it validates on", ["", *scenes], validated),
+    ]
+
+
+def _label(about: Mapping[str, Any]) -> str:
+    """How a table names a weights file: by the parts that its network lacks."""
+    return f"without {' and '.join(about['without'])}" if about["without"] else "with every part"
