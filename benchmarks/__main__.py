@@ -163,6 +163,71 @@ def surveys(
     print(out)
 
 
+def flight(
+    out: tyro.conf.Positional[Path],
+    category: str = "ground_textures",
+    strips: int = 50,
+    each: int = 100,
+    width: int = 400,
+    altitude: float = 60.0,
+    forward_overlap: float = 0.8,
+    side_overlap: float = 0.7,
+    gps: float = 1.5,
+    seed: int = 0,
+) -> None:
+    """Make the photographs of a large flight over a built-in flat, as a drone writes them (minutes; continues).
+
+    `tidefield prepare OUT/photographs SCENE` reads them, and OUT/truth.json has the true positions. The same command
+    completes what was interrupted.
+
+    Args:
+        out: Folder for `photographs/` and `truth.json`: a new one, or one of the same flight.
+        category: Kind of flat: tidal_trees, river_mouths, ground_textures, vegetation or deep_water.
+        strips: Number of strips.
+        each: Photographs of each strip.
+        width: Of a photograph, in pixels.
+        altitude: Height above the mud, in metres.
+        forward_overlap: Share of a photograph that the next one shows again.
+        side_overlap: Share of a strip that the next one shows again.
+        gps: Standard deviation of the stated positions in each horizontal direction, in metres; twice that vertically.
+        seed: Of everything random.
+    """
+    tune_process()
+    from tidefield.progress import ProgressBar, make_console
+    from tidefield.synthetic import Flight
+    from tidefield.synthetic.large import LargeFlight, make_large_flight
+
+    own = Flight(altitude_m=altitude, forward_overlap=forward_overlap, side_overlap=side_overlap)
+    plan = LargeFlight(category, seed, strips, each, width, gps_m=gps, flight=own)
+    with ProgressBar(make_console(quiet=False), "Photographing") as bar:
+        make_large_flight(plan, out, bar)
+
+
+def large(
+    flights: tyro.conf.Positional[tuple[Path, ...]],
+    work: Path,
+    runs: Path = MEASURED,
+    options: tuple[str, ...] = (),
+    threads: int = 1,
+) -> None:
+    """Time, memory and errors of `tidefield prepare` on flights of `python -m benchmarks flight`, by stage (minutes).
+
+    Args:
+        flights: Their folders.
+        work: Folder for the scenes.
+        runs: Store the figures in this folder's large.json; what is measured is not measured again.
+        options: Of `tidefield prepare`, without their dashes, such as mapper=global.
+        threads: Of each process.
+    """
+    from benchmarks.large import lines, measure_flight
+
+    words = [word for option in options for word in f"--{option}".split("=", 1)]
+    for folder in flights:
+        name = " ".join([folder.resolve().name, *options])
+        found = measure_flight(folder, work / name.replace(" ", "_"), runs, name, words, threads)
+        print("\n".join([name, *lines(found)]), flush=True)
+
+
 def kills(runs: Path = MEASURED, train: int = 20, prepare: int = 10, compare: int = 10, seed: int = 0) -> None:
     """Kill commands at random moments, complete their work, and compare it with that of uninterrupted ones (minutes).
 
@@ -570,7 +635,9 @@ def main(words: Sequence[str] | None = None) -> None:
         words = ["speed", *words]
     mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
-    measured = (speed, frames, memory, scales, surveys, *mapped, points, parts, depth, *changes, view, kills, fuzz)
+    quality = (points, parts, depth)
+    surveyed = (surveys, flight, large)
+    measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:

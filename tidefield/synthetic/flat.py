@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -50,6 +50,10 @@ class TidalFlat:
     def highest_m(self) -> float:
         """A height that nothing exceeds."""
         return max(float(self.surface.values.max()), self.plants.highest_m)
+
+    def with_plants_within(self, low_m: tuple[float, float], high_m: tuple[float, float]) -> TidalFlat:
+        """The same flat with only those plants that may reach into a rectangle: photographs of it are the same."""
+        return replace(self, plants=self.plants.within(low_m, high_m))
 
     def photograph(
         self, camera: Cameras, supersample: int = 2, seconds: float = 0.0

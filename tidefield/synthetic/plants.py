@@ -149,6 +149,21 @@ class Plants:
         tops = leaves.centre[2] + leaves.radius, stems.start[2] + stems.radius, stems.end[2] + stems.radius
         return float(torch.cat([*tops, torch.tensor([-math.inf])]).max())
 
+    def within(self, low_m: tuple[float, float], high_m: tuple[float, float]) -> Plants:
+        """Select what may reach into a rectangle of ground: its south-west and north-east corners."""
+        leaves, stems = self.leaves, self.stems
+        low, high = (torch.tensor(corner)[:, None] for corner in (low_m, high_m))
+        middle = 0.5 * (stems.start + stems.end)[:2]
+        reach = stems.radius + 0.5 * torch.linalg.vector_norm(stems.end - stems.start, dim=0)
+        near_leaves, near_stems = (
+            torch.nonzero(((at > low - r) & (at < high + r)).all(0))[:, 0]
+            for at, r in ((leaves.centre[:2], leaves.radius), (middle, reach))
+        )
+        return Plants(
+            Leaves(**{name: value[..., near_leaves] for name, value in vars(leaves).items() if name != "planes"}),
+            Stems(**{name: value[..., near_stems] for name, value in vars(stems).items()}),
+        )
+
     def nearest(self, view: View) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
         """Find, for every ray of a view, depth and number of the first primitive it meets; inf and -1 where none."""
         # Depth in the upper and the primitive in the lower half of one integer: the least is the nearest, and

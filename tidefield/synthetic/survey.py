@@ -21,7 +21,7 @@ from tidefield.synthetic.settings import settings_for
 
 _CELL_PER_ALTITUDE = 0.0035
 """Spacing of the terrain's nodes: some two thirds of a pixel of a photograph 240 wide, whatever the altitude."""
-_LARGEST_CELL_M = 0.6
+LARGEST_CELL_M = 0.6
 """Upper limit of that spacing: creeks need it, whatever the altitude."""
 _NOISE_PX = 0.3
 """Standard deviation of an observation, per axis."""
@@ -144,13 +144,17 @@ def photograph_flat(
     return Survey(category, seed, flat, cameras, photographs, depth, points)
 
 
-def fly(flight: Flight, views: int, width: int, random: np.random.Generator) -> Cameras:
-    """Plan a lawn-mower flight over the origin: strips north and south in turn, image tops in flight direction."""
+def fly(flight: Flight, views: int, width: int, random: np.random.Generator, strips: int | None = None) -> Cameras:
+    """Plan a lawn-mower flight over the origin: strips north and south in turn, image tops in flight direction.
+
+    Args:
+        strips: their number; if not given, as many as make the surveyed ground about a square.
+    """
     height = round(width * flight.aspect)
     across = flight.altitude_m / flight.focal_ratio
     along = across * flight.aspect
     spacing_m = np.array([across * (1 - flight.side_overlap), along * (1 - flight.forward_overlap)])
-    strips = max(1, min(views, round(math.sqrt(views * spacing_m[1] / spacing_m[0]))))
+    strips = strips or max(1, min(views, round(math.sqrt(views * spacing_m[1] / spacing_m[0]))))
     poses = []
     for strip, members in enumerate(np.array_split(np.arange(views), strips)):
         heading = 0.0 if strip % 2 == 0 else math.pi
@@ -195,7 +199,7 @@ def ground_extent(cameras: Cameras, flight: Flight) -> Extent:
     length = run.norm(dim=-1, keepdim=True)
     run = run * (length.clamp(max=4.0) / length)
     ground = (cameras.position_world[:, None, :2] + run * below).reshape(-1, 2)
-    cell_m = min(flight.altitude_m * _CELL_PER_ALTITUDE, _LARGEST_CELL_M)
+    cell_m = min(flight.altitude_m * _CELL_PER_ALTITUDE, LARGEST_CELL_M)
     return Extent.around((ground.amin(0) - 4).tolist(), (ground.amax(0) + 4).tolist(), cell_m)
 
 

@@ -1,0 +1,89 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tidefield.errors import SceneError
+from tidefield.geometry.geodesy import WGS84, LocalFrame
+from tidefield.survey.io.photographs import read_survey
+from tidefield.synthetic import Flight, make_survey
+from tidefield.synthetic.large import PHOTOGRAPHS, TRUTH_FILE, LargeFlight, make_large_flight, true_positions
+
+PLAN = LargeFlight("vegetation", seed=3, strips=2, each=4, width=64, gps_m=2.0, flight=Flight(altitude_m=20.0))
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("flight") / "flight"
+    make_large_flight(PLAN, folder)
+    return folder
+
+
+def test_photographs_are_read_as_a_survey_with_noisy_positions_and_the_true_lens(flight):
+    survey = read_survey(flight / PHOTOGRAPHS)
+    truth = true_positions(flight)
+    assert [p.name for p in survey.photographs] == sorted(truth)
+    assert len(truth) == 8
+    frame = LocalFrame.at(WGS84, (8.3, 53.7, 0.0))
+    errors = []
+    for photograph in survey.photographs:
+        place = photograph.position
+        assert place is not None
+        assert photograph.lens is not None
+        assert photograph.lens.focal_px == pytest.approx(0.8 * 64, rel=1e-3)
+        stated = np.array([[place.longitude_deg, place.latitude_deg, place.height_m]])
+        errors.append((frame.from_geographic(stated) - frame.from_geographic(np.array([truth[photograph.name]])))[0])
+    assert 0.5 < np.std(np.array(errors)[:, :2]) / 2.0 < 2.0
+    times = [photograph.time_s for photograph in survey.photographs]
+    assert (np.diff(times) == 3.0).all()
+
+
+def test_strips_overlap_as_planned(flight):
+    frame = LocalFrame.at(WGS84, (8.3, 53.7, 0.0))
+    places = frame.from_geographic(np.array(list(true_positions(flight).values()))).reshape(2, 4, 3)
+    across, along = 20 / 0.8, 20 / 0.8 * 0.75
+    assert np.diff(places[..., 0].mean(1)) == pytest.approx(0.3 * across, abs=0.5)
+    assert np.diff(places[0, :, 1]) == pytest.approx(np.full(3, 0.2 * along), abs=1.2)
+    assert (np.diff(places[1, :, 1]) < 0).all(), "the second strip is flown back"
+
+
+def test_photographs_do_not_depend_on_plants_elsewhere():
+    made = make_survey("vegetation", seed=3, views=6, width=48, supersample=1)
+    camera = made.cameras[2]
+    corners = torch.tensor([[0.0, 0.0], [48, 0], [0, 36], [48, 36]])
+    ground = camera.position_world[0] + camera.directions_world(corners[None])[0] * (camera.position_world[0, 2] + 3)
+    low, high = (ground[:, :2].amin(0) - 1).tolist(), (ground[:, :2].amax(0) + 1).tolist()
+    part = made.flat.with_plants_within(tuple(low), tuple(high))
+    assert len(part.plants.leaves) < 0.9 * len(made.flat.plants.leaves)
+    for whole, own in zip(made.flat.photograph(camera, 1), part.photograph(camera, 1), strict=True):
+        assert torch.equal(whole, own)
+
+
+def test_an_interrupted_flight_goes_on_and_makes_the_same_files(flight):
+    files = sorted((flight / PHOTOGRAPHS).iterdir())
+    before = files[5].read_bytes()
+    files[5].unlink()
+    times = {file: file.stat().st_mtime_ns for file in files if file.exists()}
+    seen = []
+    make_large_flight(PLAN, flight, lambda done, whole: seen.append((done, whole)))
+    assert seen == [(8, 8)]
+    assert files[5].read_bytes() == before
+    assert {file: file.stat().st_mtime_ns for file in times} == times
+    with Image.open(files[5]) as picture:
+        assert picture.size == (64, 48)
+
+
+def test_a_folder_of_another_flight_or_of_something_else_is_refused(flight, tmp_path):
+    with pytest.raises(SceneError, match="another flight"):
+        make_large_flight(replace(PLAN, seed=4), flight)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(SceneError, match="something else"):
+        make_large_flight(PLAN, tmp_path)
+    with pytest.raises(SceneError, match=TRUTH_FILE):
+        true_positions(tmp_path)
+    with pytest.raises(SceneError, match="one or more"):
+        make_large_flight(replace(PLAN, strips=0), tmp_path / "new")
+    assert json.loads((flight / TRUTH_FILE).read_text())["plan"]["seed"] == 3
