@@ -22,6 +22,7 @@ RANK = {
     "methods": 6,
     "api": 7,
     "compare": 7,
+    "nerfbaselines": 7,
     "nerfstudio": 7,
     "viewer": 7,
     "commands": 8,

@@ -1,24 +1,19 @@
 """Tidefield inside nerfstudio: what its commands make of a scene, in nerfstudio's own environment."""
 
 import json
-import os
-import subprocess
-import sysconfig
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from foreign_environment import run
 from PIL import Image
 from scenes_on_disk import FISHEYE, UTM, survey, write_colmap
 
-from tidefield.baselines.nerfstudio import environment
 from tidefield.config import PRESETS
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.data.load import load_scene, read_posed
 from tidefield.data.scene import Scene, every_eighth
-from tidefield.errors import RunError
 from tidefield.evaluation.evaluate import evaluate
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
@@ -26,30 +21,7 @@ from tidefield.model.network import make_network
 from tidefield.model.renderer import Renderer
 from tidefield.synthetic import make_survey, write_survey
 
-ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "tests/nerfstudio_commands.py"
 STEPS = 3
-POINTS = {kind: f"nerfstudio.{kind}_configs" for kind in ("method", "dataparser")}
-
-
-def entry_points() -> dict[str, str]:
-    """Those of pyproject.toml, as nerfstudio takes them from its environment variables."""
-    groups = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
-    return {
-        f"NERFSTUDIO_{kind.upper()}_CONFIGS": ",".join(f"{name}={place}" for name, place in groups[group].items())
-        for kind, group in POINTS.items()
-    }
-
-
-def run(*words: str | Path) -> None:
-    try:
-        python = environment.python()
-    except RunError as error:
-        pytest.skip(str(error))
-    command = [python, SCRIPT, environment.WORKER, sysconfig.get_path("purelib"), *words]
-    settings = {**os.environ, **entry_points(), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([str(word) for word in command], env=settings, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
 
 def georeference(scene: Path) -> LocalFrame:

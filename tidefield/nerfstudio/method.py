@@ -8,7 +8,7 @@ those of the scene (undistorted, with their exposure), not nerfstudio's. So ns-e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -32,9 +32,10 @@ from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import psnr, psnr_from_mse
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, to_8_bit
 from tidefield.nerfstudio.data import PHOTOGRAPH, SceneOutputs, SceneParserConfig, pinholes, to_nerfstudio
-from tidefield.render.camera_paths import path_cameras
+from tidefield.render.camera_paths import free_camera
 from tidefield.train.checkpoint import given_or_shipped
 from tidefield.train.loop import ADAM, SceneTrainer
 
@@ -194,13 +195,9 @@ class TidefieldModel(Model):
         if photograph is not None:
             return self.scene.cameras[int(photograph)].resized(width, height)
         pose = camera.camera_to_worlds[0].double().cpu().numpy() * (1, -1, -1, 1)
-        focal, principal = (
-            torch.cat(pair).reshape(1, 2).cpu() for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy))
-        )
-        free = path_cameras(
-            self.scene, pose[None, :, 3] / self.scale, pose[None, :, :3], width, height, focal[0, :1].double().numpy()
-        )
-        return replace(free, focal_px=focal.float(), principal_px=principal.float())
+        pose[:, 3] /= self.scale
+        fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+        return free_camera(self.scene, pose, Lens(width, height, fx, fy, cx, cy))
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         error = outputs.get("error")

@@ -1,8 +1,8 @@
-"""Run nerfstudio's commands with Tidefield, in nerfstudio's own environment.
+"""Run commands of nerfstudio and NerfBaselines with Tidefield, in nerfstudio's own environment.
 
-`nerfstudio_commands.py WORKER PACKAGES COMMAND ARGUMENTS ... [: COMMAND ARGUMENTS ...]` with ns-train and so on; the
-command `rays` writes what the data parser makes of a scene. Packages that only Tidefield needs come from the folder
-PACKAGES, after nerfstudio's own.
+`foreign_commands.py WORKER PACKAGES COMMAND ARGUMENTS ... [: COMMAND ARGUMENTS ...]` with ns-train and so on, or
+nerfbaselines; the command `rays` writes what nerfstudio's data parser makes of a scene. Packages that only Tidefield
+needs come from the folder PACKAGES, after nerfstudio's own.
 """
 
 from __future__ import annotations
@@ -37,6 +37,17 @@ def write_rays(scene: str, out: str) -> None:
     Path(out).write_text(json.dumps(found))
 
 
+def run_nerfbaselines(arguments: list[str]) -> None:
+    """Its LPIPS has random weights: tests fetch nothing from the net."""
+    import torchvision.models
+
+    for name in ("alexnet", "vgg16"):
+        network = getattr(torchvision.models, name)
+        setattr(torchvision.models, name, lambda network=network, **_: network(weights=None))
+    sys.argv = ["nerfbaselines", *arguments]
+    import_module("nerfbaselines.cli").main()
+
+
 def main(worker: str, packages: str, words: list[str]) -> None:
     sys.path.append(packages)
     runpy.run_path(worker)["without_compiled_torchvision"]()
@@ -46,6 +57,9 @@ def main(worker: str, packages: str, words: list[str]) -> None:
         command, *arguments = group
         if command == "rays":
             write_rays(*arguments)
+            continue
+        if command == "nerfbaselines":
+            run_nerfbaselines(arguments)
             continue
         sys.argv = [command, *arguments]
         import_module(f"nerfstudio.scripts.{command.removeprefix('ns-')}").entrypoint()
