@@ -6,6 +6,7 @@ CHECKPOINT/checkpoint.safetensors and what the training was asked for, CHECKPOIN
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -120,11 +121,14 @@ class TidefieldMethod(Method):
 
 
 def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with their defaults, checked."""
+    """Settings with their defaults, checked; the command line has numbers as text."""
     unknown = sorted(set(given) - set(SETTINGS))
     if unknown:
         raise RunError(f"there is no setting {unknown[0]}: expected {', '.join(SETTINGS)}; choose one of these")
-    return {name: from_json(_TYPES[name], given.get(name, value), name) for name, value in SETTINGS.items()}
+    number = re.compile(r"-?\d{1,20}")
+    values = {name: given.get(name, value) for name, value in SETTINGS.items()}
+    values = {name: int(x) if isinstance(x, str) and number.fullmatch(x) else x for name, x in values.items()}
+    return {name: from_json(_TYPES[name], value, name) for name, value in values.items()}
 
 
 def write_scene(dataset: Dataset, folder: Path) -> None:
