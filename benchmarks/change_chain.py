@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -21,21 +20,17 @@ from tidefield.change.regions import Region
 from tidefield.change.surfaces import Grid
 from tidefield.change.write import polygons_of
 from tidefield.data.load import load_scene
-from tidefield.files import completed_folder, read_json, write_json, write_text
+from tidefield.files import completed_folder, read_json, write_json
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.maps.make import MAP_FILE
+from tidefield.synthetic.flights import BARE, write_flights
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import Difference, Pair, make_pair
 
 CRS, ORIGIN = "EPSG:32631", (500_000.0, 5_800_000.0, 0.0)
 CATEGORY, SEED = "river_mouths", 11
 CHANGE_M = 0.2
-CONTROL_POINTS = 8
-CONTROL_M, MARK_PX, GPS_M = 0.01, 0.3, 1.5
-"""Deviations of surveyed control, of its marks in photographs, and of the receiver's positions."""
 DATES = ("2023-05-01", "2024-05-01")
-BARE = 0.02
-"""Density of plants below which ground counts as bare."""
 _CELL_M = 0.15
 AREA_M = (-8.0, -14.0, 38.0, 14.0)
 """West, south, east and north of what is mapped, in the flat's coordinates: a bank, the bar, and ground that stays."""
@@ -48,32 +43,7 @@ def frame() -> LocalFrame:
 
 def write_photographs(pair: Pair, folder: Path) -> None:
     """Write both surveys' photographs, positions and control as a pilot has them, and the truth beside them."""
-    changed = pair.ground_change
-    for k, (survey, date) in enumerate(zip((pair.earlier, pair.later), DATES, strict=True)):
-        random = np.random.default_rng([SEED, 20290, k])
-        photographs = folder / date / "photographs"
-        photographs.mkdir(parents=True)
-        names = [f"IMG_{k}{i:03d}.jpg" for i in range(len(survey.cameras))]
-        for name, picture in zip(names, survey.photographs.numpy(), strict=True):
-            bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-            assert cv2.imwrite(str(photographs / name), bgr, [cv2.IMWRITE_JPEG_QUALITY, 96])
-        position = survey.cameras.position_world.double().numpy()
-        noisy = frame().to_geographic(position + random.normal(0, GPS_M, position.shape))
-        rows = [f"{n},{p[1]:.8f},{p[0]:.8f},{p[2]:.2f}" for n, p in zip(names, noisy, strict=True)]
-        write_text(photographs / "gps.csv", "\n".join(["image_name,lat,lon,gps_height", *rows]) + "\n")
-        points = _control(pair, changed)
-        points[:, 2] = survey.flat.bed.sample(torch.from_numpy(points[:, :2].T).float())[0].numpy()
-        uv, depth = survey.cameras.project(torch.from_numpy(points).float())
-        surveyed = frame().to_crs(points + random.normal(0, CONTROL_M, points.shape))
-        lines = [CRS]
-        width, height = survey.cameras.width, survey.cameras.height
-        for i, name in enumerate(names):
-            for p, place in enumerate(surveyed):
-                u, v = uv[i, p].tolist()
-                if depth[i, p] > 0 and 5 < u < width - 5 and 5 < v < height - 5:
-                    u, v = u + random.normal(0, MARK_PX), v + random.normal(0, MARK_PX)
-                    lines.append(f"{place[0]:.4f} {place[1]:.4f} {place[2]:.4f} {u:.2f} {v:.2f} {name} P{p}")
-        write_text(photographs / "gcp_list.txt", "\n".join(lines) + "\n")
+    write_flights(pair, folder, frame(), DATES, SEED)
     layers = {
         f"{layer}{k}": getattr(survey.flat, layer).values[0].numpy()
         for k, survey in enumerate((pair.earlier, pair.later))
@@ -89,28 +59,6 @@ def write_photographs(pair: Pair, folder: Path) -> None:
             positions1=pair.later.cameras.position_world.numpy(),
             **layers,
         )
-
-
-def _control(pair: Pair, changed: Raster) -> np.ndarray:
-    """Places of control: bare, dry, unchanged, seen by three photographs of both dates, and far from each other."""
-    candidates = np.random.default_rng([SEED, 20291]).uniform(-45, 45, (4000, 2))
-    xy = torch.from_numpy(candidates.T).float()
-    good = np.abs(changed.sample(xy)[0].numpy()) < 1e-6
-    for survey in (pair.earlier, pair.later):
-        bed, surface = (raster.sample(xy)[0].numpy() for raster in (survey.flat.bed, survey.flat.surface))
-        good &= (surface - bed < 1e-3) & (survey.flat.marsh.sample(xy)[0].numpy() < BARE)
-        points = torch.from_numpy(np.column_stack([candidates, bed])).float()
-        uv, depth = survey.cameras.project(points)
-        size = survey.cameras.size_px[:, None].float()
-        seen = ((uv > 8) & (uv < size - 8)).all(-1) & (depth > 0)
-        good &= (seen.sum(0) >= 3).numpy()
-    left = candidates[good]
-    assert len(left) >= CONTROL_POINTS, "the flat has no room for control"
-    chosen = [left[np.argmin(left.sum(axis=1))]]
-    while len(chosen) < CONTROL_POINTS:
-        away = np.min([np.hypot(*(left - one).T) for one in chosen], axis=0)
-        chosen.append(left[np.argmax(away)])
-    return np.column_stack([np.array(chosen), np.zeros(CONTROL_POINTS)])
 
 
 class Truth:

@@ -42,14 +42,14 @@ def measure_view(
     from tidefield.methods import zero_shot
     from tidefield.render.camera_paths import make_trajectory
     from tidefield.train.checkpoint import given_or_shipped
-    from tidefield.viewer.frames import Frame, FrameServer
+    from tidefield.viewer.frames import SAMPLING, Frame, FrameServer
     from tidefield.viewer.preview import Preview
 
     if moves < 2 or rests < 1:
         raise RunError(f"{moves} moves and {rests} rests were asked for: expected at least 2 and 1; choose more")
     scene = load_scene(scene_folder)
     config = PRESETS["swift"]
-    render, _ = zero_shot(config, given_or_shipped(None, "swift"), scene, choose_device("cpu"))
+    render, _ = zero_shot(config, given_or_shipped(None, "swift"), scene, choose_device("cpu"), SAMPLING)
     cameras = make_trajectory("orbit", scene, frames=round(360 / STEP_DEGREES), width=width, height=height).cameras
     preview = Preview(scene)
     server = FrameServer(preview, render, preview.prepare)

@@ -1,4 +1,4 @@
-"""Settings of the documentation's site: Sphinx, the theme furo, and MyST for pages in Markdown."""
+"""Settings of the documentation's site: Sphinx, the theme furo, and MyST for pages in Markdown and the notebook."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ project = "Tidefield"
 author = "The Tidefield developers"
 copyright = author
 release = tidefield.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build", "measured"]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
+# The notebook is shown as it was run: `tests/test_notebook.py` runs it.
+nb_execution_mode = "off"
 # Generated pages go from headings of level 1 to level 3.
 suppress_warnings = ["myst.header"]
 html_theme = "furo"

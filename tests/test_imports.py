@@ -22,6 +22,8 @@ RANK = {
     "methods": 6,
     "api": 7,
     "compare": 7,
+    "nerfbaselines": 7,
+    "nerfstudio": 7,
     "viewer": 7,
     "commands": 8,
     "cli": 9,

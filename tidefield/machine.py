@@ -29,14 +29,16 @@ def tune_process() -> None:
     OpenMP's threads spin briefly while they wait, unless the user says otherwise: those that spin long take the cores
     from threads that have work, and a busy machine becomes several times slower; those that do not spin at all wake up
     late on a quiet one. And glibc keeps freed memory for the next step: by default blocks of over 32 MB go back to the
-    system at once and come again as fresh, zeroed pages, which is half the time of a step.
+    system at once and come again as fresh, zeroed pages, which is half the time of a step. All threads share one heap:
+    threads' own hold at most 64 MB, and larger blocks would be such pages again.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:  # there is none in other C libraries, such as musl
-        trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
+        trim_threshold, mmap_threshold, arena_max = -1, -3, -8  # M_TRIM_THRESHOLD and so on of malloc.h
         mallopt(trim_threshold, 1 << 30)
         mallopt(mmap_threshold, 1 << 30)
+        mallopt(arena_max, 1)
 
 
 def describe() -> dict[str, Any]:

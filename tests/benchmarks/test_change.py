@@ -76,9 +76,10 @@ def test_photographs_of_the_chain_come_with_control_that_fits_them(tmp_path, mon
     from benchmarks import change_chain
     from tidefield.change.surfaces import Grid
     from tidefield.survey.io.photographs import read_survey
+    from tidefield.synthetic import flights
     from tidefield.synthetic.two_dates import Difference, make_pair
 
-    monkeypatch.setattr(change_chain, "CONTROL_POINTS", 4)
+    monkeypatch.setattr(flights, "CONTROL_POINTS", 4)
     pair = make_pair("ground_textures", 3, Difference(0.2), views=9, width=96)
     change_chain.write_photographs(pair, tmp_path)
     survey = read_survey(tmp_path / change_chain.DATES[1] / "photographs", None, None)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
+from tidefield.config import Sampling
 from tidefield.errors import RunError
 from tidefield.files import require_writable
 
@@ -51,7 +52,9 @@ def export(options: Export, console: Console) -> None:
         raise RunError(f"--width {options.width} was asked for: expected 32 to 4096 pixels; choose another")
     require_writable(options.out, overwrite=options.overwrite)
     device = choose_device(options.device)
-    opened = open_source(options.source, options.zero, device, options.allow_missing, console)
+    # Pixels that share a cell are averaged anyway: several rays for each would take several times as long.
+    sampling = Sampling(rays_per_side=1)
+    opened = open_source(options.source, options.zero, device, options.allow_missing, console, sampling)
     with opened as (scene, render, _), ProgressBar(console, "Rendering") as bar:
         found = make_gaussians(render, scene.cameras[list(scene.train)], options.width, bar)
     write_gaussians(found, options.out, scene.origin_world.tolist(), options.overwrite)

@@ -63,6 +63,7 @@ def view(options: View, console: Console) -> None:
     if not options.zero.zero_shot and _are_maps(options.sources):
         _view_maps(options, console)
         return
+    from tidefield.viewer.frames import SAMPLING
     from tidefield.viewer.page import ScenePage, need_viser
 
     need_viser()
@@ -73,7 +74,7 @@ def view(options: View, console: Console) -> None:
     if not options.zero.zero_shot:
         _require_trained(source)
     with ExitStack() as stack:
-        opened = open_source(source, options.zero, device, options.allow_missing, console)
+        opened = open_source(source, options.zero, device, options.allow_missing, console, SAMPLING)
         scene, render, _ = stack.enter_context(opened)
         name = source.resolve().name
         page = ScenePage(scene, render, name, options.host, options.port, options.width)

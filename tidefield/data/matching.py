@@ -11,8 +11,10 @@ Alphabet: V photographs, K depths that are tried, H W pixels of a camera, h w ce
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise, product
 
 import torch
@@ -26,6 +28,7 @@ from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
+from tidefield.parallel import in_parallel
 
 LEVELS = 4
 """Levels, each twice as fine as the one before; the last has the camera's own pixels."""
@@ -74,6 +77,7 @@ class Matcher:
     def __init__(self, scene: Scene, pyramid: Pyramid | None = None) -> None:
         self.scene, self.pyramid = scene, pyramid or Pyramid(scene)
         self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self._reading = threading.Lock()
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras, cells: Float[Tensor, "3 h w"]) -> DepthPrior:
@@ -88,7 +92,9 @@ class Matcher:
         reach = 0.0 if known.any() else float((near - far).max() / 2)
         known = known | ~known.any()
         found, half = torch.empty_like(start), torch.empty_like(start)
-        for outer, inner in _parts(camera):
+
+        @torch.inference_mode()  # each thread needs its own
+        def match(outer: _Box, inner: _Box) -> None:
             (left, top), (right, bottom) = outer
             part = replace(
                 camera,
@@ -99,6 +105,12 @@ class Matcher:
             (x0, y0), (x1, y1) = inner
             found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
             half[y0:y1, x0:x1] = around[y0 - top : y1 - top, x0 - left : x1 - left]
+
+        parts = [partial(match, *part) for part in _parts(camera)]
+        if len(parts) > 1:
+            in_parallel(parts, start.device)
+        else:
+            parts[0]()
         matched = torch.stack([_on_cells(cells, image) for image in (found, half)])
         middle, half = matched
         ends = middle + half, torch.minimum(middle - half, middle)
@@ -227,8 +239,12 @@ class Matcher:
     def _image(self, photograph: int, level: int, camera: Cameras) -> Float[Tensor, "1 1 H W"]:
         """A photograph at a level of the pyramid without its local means and contrasts."""
         key = photograph, level
+        with self._reading:
+            return self._image_of(key, camera)
+
+    def _image_of(self, key: tuple[int, int], camera: Cameras) -> Float[Tensor, "1 1 H W"]:
         if key not in self._kept:
-            colours, _ = self.pyramid.read(photograph, level)
+            colours, _ = self.pyramid.read(*key)
             grey = (colours.float() / 255 / camera.gain_of_rows()).mean(-1)
             mean = _box(grey, CONTRAST_PX)
             variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)

@@ -8,7 +8,7 @@ length and near and far come from the training cameras; all frames are at the sc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -416,6 +416,22 @@ def path_cameras(
         near_far=torch.as_tensor(_near_far(scene, pose, lenses), dtype=torch.float32),
         gain=torch.ones(count, 3),
     )
+
+
+def free_camera(scene: Scene, T_world_camera: Float64[np.ndarray, "3 4"], lens: Lens) -> Cameras:
+    """Return one camera at the common exposure, as another program's viewer or test asks for it.
+
+    Args:
+        scene: which it looks at.
+        T_world_camera: in the scene's coordinates, its origin subtracted.
+        lens: without distortion.
+    """
+    focal = np.array([lens.fx])
+    camera = path_cameras(
+        scene, T_world_camera[None, :, 3], T_world_camera[None, :, :3], lens.width, lens.height, focal
+    )
+    focal_px, principal_px = torch.tensor([[lens.fx, lens.fy]]), torch.tensor([[lens.cx, lens.cy]])
+    return replace(camera, focal_px=focal_px, principal_px=principal_px)
 
 
 def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Lens, ...]) -> Float64[np.ndarray, "N 2"]:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
+from tidefield.config import Sampling
 from tidefield.errors import TidefieldError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 
 REST_SECONDS = 0.2
 """Time without motion after which a camera rests."""
+SAMPLING = Sampling(rays_per_side=1)
+"""Of sharp pictures: several rays per pixel, usual from far away, take several times as long."""
 COARSE_PX = 200
 """Width of coarse pictures."""
 DEFECT = "This is a defect of the program: the terminal has the details."

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
+from tidefield.viewer.frames import SAMPLING
 from tidefield.viewer.page import ScenePage
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def _as_it_is(trainer: Trainer) -> Render:
 
     def render(camera: Cameras) -> Rendering:
         if not made:
-            made.append(still.renderer())
+            made.append(still.renderer(SAMPLING))
         return made[0](camera)
 
     return render

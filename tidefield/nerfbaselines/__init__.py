@@ -1,0 +1,1 @@
+"""Tidefield inside NerfBaselines; runs where NerfBaselines is installed, and nothing else imports it."""

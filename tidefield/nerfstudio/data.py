@@ -1,0 +1,148 @@
+"""nerfstudio's data parser of every scene that Tidefield reads: `ns-train METHOD --data SCENE tidefield-data`.
+
+nerfstudio's methods expect a scene of about unit size around the origin. The way back into metres and into the scene's
+coordinate reference system is kept with the run, in `dataparser_transforms.json`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from tidefield.data.georeference import read_georeference
+from tidefield.data.load import own_lens, read_posed
+from tidefield.data.scene import every_eighth
+from tidefield.files import write_json
+from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
+
+PHOTOGRAPH = "photograph"
+"""Entry of nerfstudio's cameras that has the index of the scene's photograph that a camera took."""
+
+
+@dataclass
+class SceneOutputs(DataparserOutputs):
+    """What nerfstudio asks a data parser for, and where on the Earth it is.
+
+    Attributes:
+        georeference: frame of the scene's coordinates as they are on disk (`LocalFrame.to_json`); None if unknown.
+    """
+
+    georeference: dict[str, Any] | None = None
+
+    def save_dataparser_transform(self, path: Path) -> None:
+        """Write `transform` and `scale`, as nerfstudio does, and the `georeference`.
+
+        scale * (transform [p; 1]) takes a point of the scene into nerfstudio's coordinates.
+        """
+        super().save_dataparser_transform(path)
+        values = json.loads(path.read_text(encoding="utf-8"))
+        write_json(path, {**values, "georeference": self.georeference})
+
+
+@dataclass
+class SceneParserConfig(DataParserConfig):
+    """Scenes of `tidefield prepare` and `import`, and all that Tidefield reads."""
+
+    _target: type = field(default_factory=lambda: SceneParser)
+    auto_scale_poses: bool = True
+    """Scale positions to at most 1, as nerfstudio's own parser does; otherwise they are in metres around the middle of
+    the cameras."""
+
+
+class SceneParser(DataParser):
+    """Reads poses, lenses, masks, the split and the sparse points of a scene; photographs are left where they are."""
+
+    config: SceneParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> SceneOutputs:
+        root = self.config.data
+        posed = read_posed(root, allow_missing=False)
+        train, test = every_eighth(len(posed.names))
+        if posed.split is not None:
+            train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+        chosen = train if split == "train" else test
+        origin = posed.T_world_camera[:, :, 3].mean(axis=0)
+        pose = posed.T_world_camera.copy()
+        pose[:, :, 3] -= origin
+        radius = float(np.abs(pose[:, :, 3]).max())
+        scale = 1 / radius if self.config.auto_scale_poses else 1.0
+        pose[:, :, 3] *= scale
+        lenses = [own_lens(posed.paths[i], posed.lenses[i])[0] for i in chosen]
+        masks = [posed.masks[i] for i in chosen] if posed.masks else []
+        reach = radius * scale
+        georeference = read_georeference(root)
+        frame = None if georeference is None else georeference.frame
+        metadata: dict[str, Any] = {"root": root}
+        if posed.points is not None:
+            xyz, rgb = posed.points.xyz_world, posed.points.rgb
+            metadata["points3D_xyz"] = torch.from_numpy((xyz - origin) * scale).float()
+            metadata["points3D_rgb"] = torch.from_numpy(np.full(xyz.shape, 128, np.uint8) if rgb is None else rgb)
+        return SceneOutputs(
+            image_filenames=[posed.paths[i] for i in chosen],
+            cameras=to_nerfstudio(pose[list(chosen)], lenses, chosen),
+            alpha_color=torch.tensor(posed.background_rgb or (1.0, 1.0, 1.0)),
+            scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3])),
+            # nerfstudio reads masks of all photographs or of none.
+            mask_filenames=[mask for mask in masks if mask is not None] if all(masks) and masks else None,
+            metadata=metadata,
+            dataparser_transform=torch.from_numpy(np.concatenate([np.eye(3), -origin[:, None]], axis=1)).float(),
+            dataparser_scale=scale,
+            georeference=None if frame is None else frame.to_json(),
+        )
+
+
+def to_nerfstudio(
+    T_world_camera: Float64[np.ndarray, "V 3 4"], lenses: Sequence[LensModel], photographs: Sequence[int]
+) -> NerfstudioCameras:
+    """Return cameras as nerfstudio has them.
+
+    Args:
+        T_world_camera: poses with OpenCV's axes, in nerfstudio's coordinates.
+        lenses: of each camera.
+        photographs: the scene's photographs that they took.
+    """
+    fisheye = [isinstance(lens, FisheyeLens) for lens in lenses]
+    distortion = [
+        (lens.k1, lens.k2, lens.k3, lens.k4, 0.0, 0.0)
+        if isinstance(lens, FisheyeLens)
+        else (lens.k1, lens.k2, lens.k3, 0.0, lens.p1, lens.p2)
+        for lens in lenses
+        if isinstance(lens, Lens | FisheyeLens)
+    ]
+    calibration = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
+    fx, fy, cx, cy = calibration.unbind(1)
+    kinds = [CameraType.FISHEYE.value if wide else CameraType.PERSPECTIVE.value for wide in fisheye]
+    return NerfstudioCameras(
+        camera_to_worlds=torch.from_numpy(T_world_camera * (1, -1, -1, 1)).float(),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        width=torch.tensor([lens.width for lens in lenses]),
+        height=torch.tensor([lens.height for lens in lenses]),
+        distortion_params=torch.tensor(distortion),
+        camera_type=torch.tensor(kinds),
+        metadata={PHOTOGRAPH: torch.tensor(photographs)[:, None]},
+    )
+
+
+def pinholes(cameras: Cameras) -> list[Lens]:
+    """The lenses of undistorted photographs."""
+    columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
+    return [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
+
+
+PARSER = DataParserSpecification(SceneParserConfig(), "Scenes of Tidefield, with the way back into their coordinates")

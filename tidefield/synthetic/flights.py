@@ -1,0 +1,92 @@
+"""Write surveys of two dates as a pilot brings them home: photographs, a receiver's positions, and surveyed control.
+
+Nothing else of the truth is written; what is known of it has the errors that it has in the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from tidefield.errors import SceneError
+from tidefield.files import write_text
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.synthetic.two_dates import Pair
+
+CONTROL_POINTS = 8
+CONTROL_M, MARK_PX, GPS_M = 0.01, 0.3, 1.5
+"""Deviations of surveyed control, of its marks in photographs, and of the receiver's positions."""
+BARE = 0.02
+"""Density of plants below which ground counts as bare."""
+
+
+def write_flights(pair: Pair, folder: Path, frame: LocalFrame, dates: Sequence[str], seed: int) -> None:
+    """Write FOLDER/DATE/photographs of both dates: JPEGs, gps.csv and gcp_list.txt, which `tidefield prepare` reads.
+
+    Args:
+        pair: of surveys.
+        folder: to write to.
+        frame: in which the flat's coordinates are.
+        dates: names of both surveys.
+        seed: of all errors and of where control is.
+
+    Raises:
+        SceneError: no ground is fit for control, or the folder cannot be written to.
+    """
+    for k, (survey, date) in enumerate(zip((pair.earlier, pair.later), dates, strict=True)):
+        random = np.random.default_rng([seed, 20290, k])
+        photographs = folder / date / "photographs"
+        photographs.mkdir(parents=True)
+        names = [f"IMG_{k}{i:03d}.jpg" for i in range(len(survey.cameras))]
+        for name, picture in zip(names, survey.photographs.numpy(), strict=True):
+            bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+            if not cv2.imwrite(str(photographs / name), bgr, [cv2.IMWRITE_JPEG_QUALITY, 96]):
+                raise SceneError(f"cannot write {photographs / name}: free some space or name another folder")
+        position = survey.cameras.position_world.double().numpy()
+        noisy = frame.to_geographic(position + random.normal(0, GPS_M, position.shape))
+        rows = [f"{n},{p[1]:.8f},{p[0]:.8f},{p[2]:.2f}" for n, p in zip(names, noisy, strict=True)]
+        write_text(photographs / "gps.csv", "\n".join(["image_name,lat,lon,gps_height", *rows]) + "\n")
+        points = _control(pair, seed)
+        points[:, 2] = survey.flat.bed.sample(torch.from_numpy(points[:, :2].T).float())[0].numpy()
+        uv, depth = survey.cameras.project(torch.from_numpy(points).float())
+        surveyed = frame.to_crs(points + random.normal(0, CONTROL_M, points.shape))
+        lines = [frame.crs]
+        width, height = survey.cameras.width, survey.cameras.height
+        for i, name in enumerate(names):
+            for p, place in enumerate(surveyed):
+                u, v = uv[i, p].tolist()
+                if depth[i, p] > 0 and 5 < u < width - 5 and 5 < v < height - 5:
+                    u, v = u + random.normal(0, MARK_PX), v + random.normal(0, MARK_PX)
+                    lines.append(f"{place[0]:.4f} {place[1]:.4f} {place[2]:.4f} {u:.2f} {v:.2f} {name} P{p}")
+        write_text(photographs / "gcp_list.txt", "\n".join(lines) + "\n")
+
+
+def _control(pair: Pair, seed: int) -> Float64[np.ndarray, "P 3"]:
+    """Places of control: bare, dry, unchanged, seen by three photographs of both dates, and far from each other."""
+    candidates = np.random.default_rng([seed, 20291]).uniform(-45, 45, (4000, 2))
+    xy = torch.from_numpy(candidates.T).float()
+    good = np.abs(pair.ground_change.sample(xy)[0].numpy()) < 1e-6
+    for survey in (pair.earlier, pair.later):
+        bed, surface = (raster.sample(xy)[0].numpy() for raster in (survey.flat.bed, survey.flat.surface))
+        good &= (surface - bed < 1e-3) & (survey.flat.marsh.sample(xy)[0].numpy() < BARE)
+        points = torch.from_numpy(np.column_stack([candidates, bed])).float()
+        uv, depth = survey.cameras.project(points)
+        size = survey.cameras.size_px[:, None].float()
+        seen = ((uv > 8) & (uv < size - 8)).all(-1) & (depth > 0)
+        good &= (seen.sum(0) >= 3).numpy()
+    left = candidates[good]
+    if len(left) < CONTROL_POINTS:
+        raise SceneError(
+            f"the flat has {len(left)} places for control: expected {CONTROL_POINTS}; fly more photographs, or another "
+            "seed"
+        )
+    chosen = [left[np.argmin(left.sum(axis=1))]]
+    while len(chosen) < CONTROL_POINTS:
+        away = np.min([np.hypot(*(left - one).T) for one in chosen], axis=0)
+        chosen.append(left[np.argmax(away)])
+    return np.column_stack([np.array(chosen), np.zeros(CONTROL_POINTS)])
