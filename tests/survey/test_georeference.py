@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, located, name_of, with_control
+from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, located, name_of, quiet, with_control
 
 from tidefield.errors import SurveyError
+from tidefield.survey.georeference import bundle_adjustment
+from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.georeference.gps_alignment import camera_centres, find_down
 from tidefield.survey.survey import Survey
 
@@ -240,3 +242,19 @@ def test_differential_positions_and_ground_control_combine(bowl):
     numbers = sorted(truth.points3D)
     there = found.frame.from_crs(FRAME.to_crs(np.array([truth.points3D[k].xyz for k in numbers])))
     assert np.median(np.abs(np.array([model.points3D[k].xyz for k in numbers]) - there)[:, 2]) < 0.15
+
+
+def test_a_long_model_that_bends_is_held_by_the_positions_of_ordinary_receivers(monkeypatch):
+    flight = fly(lines=2, each=40, noise_px=1.5, position_m=0.5)
+    bent = pycolmap.Reconstruction(flight.model)
+    bundle_adjustment.solve(bent, bundle_adjustment.all_images(bent), refine_extra_params=False)
+    errors = {}
+    for many in (10_000, 10):
+        monkeypatch.setattr(bundle_adjustment, "MANY", many)
+        model = pycolmap.Reconstruction(bent)
+        found = georeference(model, flight.survey, quiet)
+        assert any("held by the positions" in note for note in found.notes) == (many == 10)
+        centres = camera_centres(model)
+        off = np.array([centres[p.name] for p in flight.survey.photographs]) - flight.centres_world
+        errors[many] = float(np.std(off[:, 2]))
+    assert errors[10] < 0.8 * errors[10_000], errors

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
+from tidefield.survey.sfm.blocks import cut
 from tidefield.survey.sfm.features import FeatureOptions
 from tidefield.survey.stages import Stages
 
@@ -67,6 +69,25 @@ def test_all_cameras_are_at_their_true_positions(made: tuple[Path, Prepared], fl
     assert model.compute_mean_reprojection_error() < 0.6
     camera = next(iter(model.cameras.values()))
     assert camera.focal_length_x == pytest.approx(FOCAL, rel=0.01)
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_poses_estimated_in_blocks_or_at_once_are_as_good(
+    mapper: Literal["incremental", "global"],
+    made: tuple[Path, Prepared],
+    flight: Flight,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    scene = tmp_path / "scene"
+    shutil.copytree(made[0], scene)
+    if mapper == "incremental":
+        monkeypatch.setattr("tidefield.survey.prepare.cut", partial(cut, whole=6, most=6))
+    survey, console = read_survey(flight.folder), Console(quiet=True)
+    redone = prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, console, colour="off", mapper=mapper, redo="poses")
+    assert redone.models == [sorted(flight.names)]
+    assert np.abs(position_error_m(scene, flight)).max() < 0.25
+    assert not (scene / "prepare" / "blocks").exists()
 
 
 def test_the_scene_loads_with_its_split_and_consistent_colours(made: tuple[Path, Prepared]):

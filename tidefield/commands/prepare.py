@@ -53,6 +53,9 @@ class Prepare:
     """Most features to find in a photograph: 100 to 50000."""
     feature_width: int = 2400
     """Longer side in pixels to which larger photographs are reduced to find features: 100 to 50000."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """How poses are estimated: photograph by photograph, or all at once. Surveys of more than 400 photographs are
+    reconstructed in blocks that share photographs, by either."""
     downscale: Downscale = ()
     redo: str | None = None
     """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
@@ -91,6 +94,7 @@ def prepare(options: Prepare, console: Console) -> None:
         holdout=options.holdout,
         colour=options.colour,
         downscale=options.downscale,
+        mapper=options.mapper,
         redo=options.redo,
     )
     with writing_to(options.scene):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import shutil
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
@@ -28,8 +29,18 @@ from tidefield.survey.io.gcp_file import write_check_points
 from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs, without
 from tidefield.survey.quality.measures import Measures
+from tidefield.survey.sfm.blocks import cut, matched_pairs, merge, reconstruct_blocks, settle
 from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database
-from tidefield.survey.sfm.mapping import Heights, LensChoice, LensTrial, choose_lens, reconstruct, registered_names
+from tidefield.survey.sfm.mapping import (
+    Heights,
+    LensChoice,
+    LensTrial,
+    Mapper,
+    choose_lens,
+    large_enough,
+    reconstruct,
+    registered_names,
+)
 from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
 from tidefield.survey.sfm.placing import MIN_INLIERS, place
@@ -81,6 +92,7 @@ def prepare(
     holdout: bool = False,
     colour: Literal["auto", "on", "off"] = "auto",
     downscale: Sequence[int] = (),
+    mapper: Mapper = "incremental",
     redo: str | None = None,
 ) -> Prepared:
     """Make a scene of a survey, or continue an interrupted run.
@@ -92,6 +104,7 @@ def prepare(
             quality and their colours do not depend on their pixels.
         colour: correct exposures and lens falloff: where it helps, always, or never.
         downscale: factors of reduced photographs to write beside the others.
+        mapper: one photograph after the other, or all at once.
         redo: a stage to repeat, with all that follow.
 
     Raises:
@@ -162,7 +175,11 @@ def prepare(
         return models, _lens_from_json(facts["lens"])
 
     models, choice = stages.run(
-        "poses", {}, model_files(model), lambda _: estimate_poses(mapped, database, model, console), read_poses
+        "poses",
+        {"mapper": mapper} if mapper != "incremental" else {},
+        model_files(model),
+        lambda resume: estimate_poses(mapped, database, model, console, mapper, resume),
+        read_poses,
     )
 
     def read_located(facts: Facts) -> tuple[Georeference, list[str]]:
@@ -224,15 +241,34 @@ def choose_pairs(
     return {"pairs": [[photographs[i].name, photographs[j].name] for i, j in pairs]}
 
 
-def estimate_poses(survey: Survey, database: Path, folder: Path, console: Console) -> Facts:
-    """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder."""
+def estimate_poses(
+    survey: Survey, database: Path, folder: Path, console: Console, mapper: Mapper = "incremental", resume: bool = False
+) -> Facts:
+    """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder.
+
+    Large surveys are reconstructed in blocks, unless their focal lengths are unknown: each block would find its own.
+
+    Args:
+        resume: keep the blocks of an interrupted run.
+    """
     known = all(photograph.lens is not None for photograph in survey.photographs)
+    names = [photograph.name for photograph in survey.photographs]
+    blocks = cut(survey.photographs, matched_pairs(database, names)) if known else []
     with ProgressBar(console, "Estimating poses") as bar:
-        names = [photograph.name for photograph in survey.photographs]
-        models = reconstruct(database, folder.with_name("models"), names, bar, known)
+        largest = None
+        if len(blocks) <= 1:
+            models = reconstruct(database, folder.with_name("models"), names, bar, known, mapper)
+        else:
+            log.info(f"poses: {len(blocks)} blocks of up to {max(len(block.names) for block in blocks)} photographs")
+            parts = reconstruct_blocks(database, folder.with_name("blocks"), blocks, known, mapper, resume, bar)
+            parts = large_enough(sorted(parts, key=lambda model: -model.num_reg_images()), database, names)
+            largest = pycolmap.Reconstruction(parts[0])
+            models = merge(parts, database)
+            settle(models[0])
     with ProgressBar(console, "Choosing a lens") as bar:
-        choice = choose_lens(models[0], survey.photographs, known, bar)
+        choice = choose_lens(models[0], survey.photographs, known, bar, largest)
     write_model(models[0], folder)
+    shutil.rmtree(folder.with_name("blocks"), ignore_errors=True)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 

@@ -27,6 +27,11 @@ _LEAST_M = 0.01
 """Smallest standard deviation of a position, which keeps its weight finite."""
 _FEWEST = 8
 """Positions that the adjustment needs, and at least half of the photographs must have one."""
+MANY = 400
+"""From so many photographs on, positions of ordinary receivers hold a model, too."""
+_CORRELATED = 3.0
+"""Factor on their standard deviations: a receiver's error is about the same in ten photographs in a row, which together
+count as one."""
 _FOLDS = 4
 _WORTH = 0.7
 """The model is adjusted if the distance from the positions left out falls below this share of what it was."""
@@ -66,13 +71,7 @@ def adjust_to_positions(
     names = sorted(given)
     if len(names) < max(_FEWEST, model.num_reg_images() / 2):
         return ()
-    priors: dict[str, pycolmap.PosePrior] = {}
-    for image in (model.image(number) for number in sorted(model.reg_image_ids())):
-        if image.name in given:
-            prior = priors[image.name] = pycolmap.PosePrior()
-            prior.corr_data_id, prior.position = image.data_id, given[image.name]
-            prior.position_covariance = np.diag(np.maximum(sigma_m[image.name], _LEAST_M) ** 2)
-            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+    priors = _priors(model, given, sigma_m)
     before = _residual_m(model, given, names)
     light = thinned(model)
     left_out: dict[bool, Float64[np.ndarray, "N 3"]] = {}
@@ -106,6 +105,46 @@ def adjust_to_positions(
     if rejected:
         notes.append(f"The positions of {list_names(rejected)} are worse than they state, and were not used for this.")
     return tuple(notes)
+
+
+def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple[str, ...]:
+    """Adjust a large aligned model to the positions of ordinary receivers, in place.
+
+    The longer a survey, the more its model bends: matches determine it ever more weakly, while the errors of positions
+    stay as they are. Lenses are kept.
+
+    Args:
+        fit: of the model to the positions, with their observed standard deviations and gross errors.
+
+    Returns:
+        A note; none if there are too few photographs or positions.
+    """
+    good = np.flatnonzero(fit.used)
+    if model.num_reg_images() < MANY or len(good) < model.num_reg_images() / 2:
+        return ()
+    priors = _priors(
+        model,
+        {fit.names[i]: fit.given_world[i] for i in good},
+        {fit.names[i]: _CORRELATED * fit.sigma_m[i] for i in good},
+    )
+    carry_over(_adjusted(thinned(model), priors, (), False), model)
+    return ("The model is held by the positions of its photographs, so that it does not bend over its length.",)
+
+
+def _priors(
+    model: pycolmap.Reconstruction,
+    given_world: Mapping[str, Float64[np.ndarray, " 3"]],
+    sigma_m: Mapping[str, Float64[np.ndarray, " 3"]],
+) -> dict[str, pycolmap.PosePrior]:
+    """Priors of the positions of a model's photographs, by name."""
+    priors: dict[str, pycolmap.PosePrior] = {}
+    for image in (model.image(number) for number in sorted(model.reg_image_ids())):
+        if image.name in given_world:
+            prior = priors[image.name] = pycolmap.PosePrior()
+            prior.corr_data_id, prior.position = image.data_id, given_world[image.name]
+            prior.position_covariance = np.diag(np.maximum(sigma_m[image.name], _LEAST_M) ** 2)
+            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+    return priors
 
 
 def carry_over(adjusted: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None:

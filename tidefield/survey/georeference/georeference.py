@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
-from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions
+from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions, hold_to_positions
 from tidefield.survey.georeference.gps_alignment import (
     GivenPositions,
     camera_centres,
@@ -60,7 +60,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
     fit = fit_positions(model, photographs, positions, frame)
     if fit is not None:
         _transform(model, fit.world_from_model)
-        adjusted = adjust_to_positions(model, positions, fit, progress)
+        adjusted = adjust_to_positions(model, positions, fit, progress) or hold_to_positions(model, fit)
         again = fit_positions(model, photographs, positions, frame)
         assert again is not None, "the model has just been aligned with them"
         _transform(model, again.world_from_model)

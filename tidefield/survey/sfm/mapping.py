@@ -18,6 +18,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -30,6 +31,8 @@ from tidefield.survey.sfm.features import decode_name, encode_name
 from tidefield.survey.sfm.matching import interruptible
 from tidefield.survey.survey import Photograph, Progress
 
+Mapper = Literal["incremental", "global"]
+"""pycolmap's structure from motion: one photograph after the other, or all at once."""
 FEW_FEATURES = 500
 """Photographs with fewer features show too little texture, or are blurred."""
 MIN_PHOTOGRAPHS = 3
@@ -108,14 +111,20 @@ class LensChoice:
 
 
 def reconstruct(
-    database: Path, folder: Path, names: Collection[str], progress: Progress, known: bool
+    database: Path,
+    folder: Path,
+    names: Collection[str],
+    progress: Progress,
+    known: bool,
+    mapper: Mapper = "incremental",
 ) -> list[pycolmap.Reconstruction]:
-    """Run incremental mapping on the matches of photographs of a database.
+    """Run structure from motion on the matches of photographs of a database.
 
     Args:
         names: of the photographs; others in the database take no part.
         folder: where pycolmap may write; created if it does not exist.
         known: whether all focal lengths have a prior, and are held to it.
+        mapper: of pycolmap.
 
     Returns:
         The models that nothing connects, the one with the most photographs first, with the photographs' own names.
@@ -123,12 +132,20 @@ def reconstruct(
     Raises:
         SurveyError: no three photographs fit together.
     """
-    encoded, count = sorted(map(encode_name, names)), len(names)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.image_names = encoded
-    options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
-    registered = 0
+    return large_enough(find_models(database, folder, names, progress, known, mapper), database, names)
+
+
+def find_models(
+    database: Path,
+    folder: Path,
+    names: Collection[str],
+    progress: Progress,
+    known: bool,
+    mapper: Mapper,
+    threads: int = -1,
+) -> list[pycolmap.Reconstruction]:
+    """Run `reconstruct` without the error: there may be no model, and small ones."""
+    count, registered = len(names), 0
 
     def count_image() -> None:
         nonlocal registered
@@ -136,20 +153,50 @@ def reconstruct(
         progress(min(registered, count), count)
 
     folder.mkdir(parents=True, exist_ok=True)
-    found = interruptible(
-        lambda token: pycolmap.incremental_mapping(
-            database, folder, folder, options, next_image_callback=count_image, cancellation_token=token
+    if mapper == "global":
+        found = _map_globally(database, folder, names, known, threads)
+        progress(count, count)
+    else:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.image_names, options.num_threads = sorted(map(encode_name, names)), threads
+        options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
+        found = interruptible(
+            lambda token: pycolmap.incremental_mapping(
+                database, folder, folder, options, next_image_callback=count_image, cancellation_token=token
+            )
         )
-    )
     for model in found.values():
         for image in model.images.values():
             image.name = decode_name(image.name)
-    models = sorted(found.values(), key=lambda model: -model.num_reg_images())
+    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+
+
+def _map_globally(
+    database: Path, folder: Path, names: Collection[str], known: bool, threads: int
+) -> dict[int, pycolmap.Reconstruction]:
+    """Estimate all poses at once (GLOMAP: Pan et al., Global Structure-from-Motion Revisited, ECCV 2024)."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.image_names, options.num_threads, options.random_seed = sorted(map(encode_name, names)), threads, 0
+    options.min_model_size = MIN_PHOTOGRAPHS
+    options.mapper.bundle_adjustment.refine_focal_length = not known
+    return pycolmap.global_mapping(database, folder, folder, options)
+
+
+def large_enough(
+    models: list[pycolmap.Reconstruction], database: Path, names: Collection[str]
+) -> list[pycolmap.Reconstruction]:
+    """Select the models of three photographs or more from those of `find_models`.
+
+    Raises:
+        SurveyError: there is none; with what the photographs lack.
+    """
     large = [model for model in models if model.num_reg_images() >= MIN_PHOTOGRAPHS]
     if not large:
         fit = models[0].num_reg_images() if models else 0
+        reason = _why_so_few(database, [encode_name(name) for name in names])
         raise SurveyError(
-            f"{fit or 'none'} of the {count} photographs fit together ({_why_so_few(database, encoded)}): expected "
+            f"{fit or 'none'} of the {len(names)} photographs fit together ({reason}): expected "
             f"at least {MIN_PHOTOGRAPHS} that overlap by half or more and show ground with some texture; fly with more "
             "overlap, or add the photographs in between"
         )
@@ -179,18 +226,23 @@ def registered_names(model: pycolmap.Reconstruction) -> list[str]:
 
 
 def choose_lens(
-    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], known: bool, progress: Progress
+    model: pycolmap.Reconstruction,
+    photographs: Sequence[Photograph],
+    known: bool,
+    progress: Progress,
+    part: pycolmap.Reconstruction | None = None,
 ) -> LensChoice:
     """Adjust a model, in place, with the lens model of the most terms that does not make it curved.
 
     Args:
         photographs: of the survey.
         known: whether the model's focal length has a prior.
+        part: of the model, on which lenses are tried; all of it if not given.
     """
     axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
     cosine = np.clip(axes @ axes.mean(0) / max(float(np.linalg.norm(axes.mean(0))), 1e-9), -1, 1)
     spread = float(np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())))
-    light, trials = thinned(model), []
+    light, trials = thinned(part or model), []
     try_focal = known and spread >= MIN_SPREAD_DEG
     is_fisheye = any(camera.model_name in FISHEYE_TERMS for camera in model.cameras.values())
     lenses = FISHEYE_TERMS if is_fisheye else TERMS
