@@ -28,7 +28,7 @@ RANK = {
     "commands": 8,
     "cli": 9,
 }
-FOR_ALL = {"config", "machine", "device", "errors", "files", "progress", "parallel", "processes", "pages"}
+FOR_ALL = {"cluster", "config", "machine", "device", "errors", "files", "progress", "parallel", "processes", "pages"}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 Preset = Literal["swift", "paper"]
 Device = Annotated[str, arg(help="auto, cpu, cuda, cuda:N or mps.")]
 AllowMissing = Annotated[bool, arg(help="Continue without photographs that the scene names but does not have.")]
+Cluster = Annotated[
+    str | None,
+    arg(
+        metavar="auto|ADDRESS",
+        help="Work on a Ray cluster, which sees the same folders: `auto` is the running one, or one started on this "
+        "machine; else its address, such as 10.0.0.1:6379. Needs pip install 'tidefield[cluster]'.",
+    ),
+]
 OpensplatProgram = Annotated[
     Path | None,
     arg(help="OpenSplat; if not given, the program that $TIDEFIELD_OPENSPLAT names, or opensplat of PATH."),

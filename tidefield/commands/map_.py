@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
+from tidefield.commands.common import AllowMissing, Cluster, Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from tidefield.maps.make import Job, TileMaker
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Map:
     fill: bool = False
     """Fill cells that fewer than two photographs see, and mark them in odm_dem/filled.tif."""
     device: Device = "auto"
+    cluster: Cluster = None
     overwrite: bool = False
     """Replace an existing map."""
     allow_missing: AllowMissing = False
@@ -54,16 +59,9 @@ class Map:
 
 def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
-    from shapely import union_all
-
-    from tidefield.data.georeference import read_georeference
-    from tidefield.data.load import at_width
-    from tidefield.device import choose_device
+    from tidefield.cluster import connected, on_cluster
     from tidefield.files import only_writer
-    from tidefield.maps.area import bounds_of, read_shapes
-    from tidefield.maps.check_points import check_files, read_check_points
-    from tidefield.maps.grid import make_grid, map_frame
-    from tidefield.maps.make import Job, delete_tiles, make_map
+    from tidefield.maps.make import delete_tiles, make_map
     from tidefield.maps.rasters import need
     from tidefield.progress import ProgressBar
 
@@ -71,31 +69,23 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         need(library)
     if options.contours is not None and not 0.001 <= options.contours < math.inf:
         raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
-    device = choose_device(options.device)
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
-        opened = open_source(options.source, options.zero, device, options.allow_missing, console, hold_out=False)
-        scene, render, record = stack.enter_context(opened)
-        frame = map_frame(scene, read_georeference(scene.root), options.heights)
-        area, interval = None, options.contours and options.contours * frame.metre_up
-        if options.area is not None:
-            area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
-        widest = max(file.lens.width for file in scene.photographs.files)
-        full = scene if scene.cameras.width >= widest else at_width(scene, widest)
-        grid = make_grid(frame, full, options.gsd, bounds_of(area))
-        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
-        points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
-        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points), interval, lines)
+        job, about = stack.enter_context(_open(options, console))
+        grid, frame = job.grid, job.grid.frame
         console.print(
             f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
             f"heights: {frame.heights}",
             highlight=False,
             soft_wrap=True,
         )
+        elsewhere = None
+        if options.cluster is not None:
+            ray = stack.enter_context(connected(options.cluster))
+            elsewhere = partial(on_cluster, ray, job.key, partial(_tile_maker, _absolute(options), job.key))
         result = make_map(
-            job, options.out, options.overwrite, {"scene": scene.root.resolve().name, "method": record},
-            lambda name: ProgressBar(console, name),
-        )  # fmt: skip
+            job, options.out, options.overwrite, about, lambda name: ProgressBar(console, name), elsewhere
+        )
         delete_tiles(options.out)
     console.print(
         f"{options.out}: {result['area']:,.0f} square {frame.unit}, {result['points']:,} points",
@@ -106,6 +96,63 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         found = result["check_points"]
         console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit)}", soft_wrap=True)
     return result
+
+
+@contextmanager
+def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """What a map is made of, while the block lasts, and the record of its source."""
+    from shapely import union_all
+
+    from tidefield.data.georeference import read_georeference
+    from tidefield.data.load import at_width
+    from tidefield.device import choose_device
+    from tidefield.maps.area import bounds_of, read_shapes
+    from tidefield.maps.check_points import check_files, read_check_points
+    from tidefield.maps.grid import make_grid, map_frame
+    from tidefield.maps.make import Job
+
+    device = choose_device(options.device)
+    with open_source(options.source, options.zero, device, options.allow_missing, console, hold_out=False) as (
+        scene,
+        render,
+        record,
+    ):
+        frame = map_frame(scene, read_georeference(scene.root), options.heights)
+        area, interval = None, options.contours and options.contours * frame.metre_up
+        if options.area is not None:
+            area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
+        widest = max(file.lens.width for file in scene.photographs.files)
+        full = scene if scene.cameras.width >= widest else at_width(scene, widest)
+        grid = make_grid(frame, full, options.gsd, bounds_of(area))
+        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
+        points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
+        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points), interval, lines)
+        yield job, {"scene": scene.root.resolve().name, "method": record}
+
+
+def _absolute(options: Map) -> Map:
+    """The same options for processes in other folders."""
+    weights = options.zero.weights and options.zero.weights.resolve()
+    paths = {name: value.resolve() for name, value in vars(options).items() if isinstance(value, Path)}
+    return replace(options, **paths, zero=replace(options.zero, weights=weights))
+
+
+def _tile_maker(options: Map, key: str) -> TileMaker:
+    """Open a map in a worker of a cluster, which keeps it open as long as it lives."""
+    from tidefield.maps.make import TileMaker
+    from tidefield.progress import make_console
+
+    job, _ = _WORKER.enter_context(_open(options, make_console(quiet=True)))
+    if job.key != key:
+        raise RunError(
+            f"{options.source} is something else on a worker of the cluster: expected the same files under the same "
+            "names on all machines; use a shared folder"
+        )
+    return TileMaker(job, options.out)
+
+
+_WORKER = ExitStack()
+"""What a worker of a cluster has open."""
 
 
 def _describe(found: dict[str, Any], unit: str) -> str:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
-from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
+from tidefield.maps.surface import COARSEST, GreyPhotographs, Matched, match, sparse_surface
 from tidefield.maps.terrain import blocks, write_hillshade, write_terrain
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
@@ -107,47 +108,81 @@ class Job:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
-def make_tiles(job: Job, out: Path, progress: Callable[[int, int], None]) -> None:
-    """Measure and render all tiles that are not on disk yet."""
+Elsewhere = Callable[[list[int]], Iterator[int]]
+"""Makes tiles, given by their numbers among `Job.tiles`, by other processes; yields the number of each that is done."""
+
+
+def make_tiles(job: Job, out: Path, progress: Callable[[int, int], None], elsewhere: Elsewhere | None = None) -> None:
+    """Measure and render all tiles that are not on disk yet; here, if not elsewhere."""
     folder = out / TILES
-    tiles = [tile for tile in job.tiles() if touches(job.area, tile)]
-    missing = [tile for tile in tiles if not _file(folder, tile).exists()]
-    done = len(tiles) - len(missing)
+    all_tiles = job.tiles()
+    wanted = [number for number, tile in enumerate(all_tiles) if touches(job.area, tile)]
+    missing = [number for number in wanted if not _file(folder, all_tiles[number]).exists()]
+    done = len(wanted) - len(missing)
     if done:
-        log.info(f"{done} of {len(tiles)} tiles are there already")
+        log.info(f"{done} of {len(wanted)} tiles are there already")
     if not missing:
         return
-    delete_partials(*(_file(folder, tile) for tile in missing))
-    start = sparse_surface(job.scene, job.grid.coarser(COARSEST))
-    grey = GreyPhotographs(job.scene)
-    gsd = ground_sampling_distance(job.scene) * job.grid.frame.metre
-    together = cores()
-    for first in range(0, len(missing), together):
-        part = missing[first : first + together]
-        found = in_parallel([lambda tile=tile: match(tile, start, job.scene, grey, gsd) for tile in part], "cpu")
-        for tile, matched in zip(part, found, strict=True):
-            values: dict[str, np.ndarray] = {}
-            if matched is not None:
-                wanted = inside(job.area, tile)
-                seen = (matched.count >= FEWEST_VIEWS) & wanted
-                shown = wanted if job.fill else seen
-                if shown.any():
-                    above = matched.height - np.float32(job.grid.height)
-                    colour = render_tile(job.render, tile, above, matched.sigma)
-                    values = {
-                        "height": matched.height,
-                        "sigma": matched.sigma,
-                        "score": matched.score.astype(np.float16),
-                        "count": np.minimum(matched.count, 65535).astype(np.uint16),
-                        "main": matched.main.astype(np.uint16),
-                        "seen": seen,
-                        "shown": shown,
-                        "colour": colour,
-                    }
-            with completed_file(_file(folder, tile), overwrite=True) as partial, partial.open("wb") as file:
-                np.savez(file, allow_pickle=False, **values)
-            done += 1
-            progress(done, len(tiles))
+    delete_partials(*(_file(folder, all_tiles[number]) for number in missing))
+    for _ in elsewhere(missing) if elsewhere else TileMaker(job, out).several(missing):
+        done += 1
+        progress(done, len(wanted))
+
+
+class TileMaker:
+    """Measures and renders tiles of a map, and writes each to a file.
+
+    Args:
+        job: of the map.
+        out: its folder.
+    """
+
+    def __init__(self, job: Job, out: Path) -> None:
+        self._job, self._folder, self._tiles = job, out / TILES, job.tiles()
+        self._start = sparse_surface(job.scene, job.grid.coarser(COARSEST))
+        self._grey = GreyPhotographs(job.scene)
+        self._gsd = ground_sampling_distance(job.scene) * job.grid.frame.metre
+
+    def __call__(self, number: int) -> None:
+        """Make one tile, by its number, on one core."""
+        tile = self._tiles[number]
+        self._write(tile, self._match(tile))
+
+    def several(self, numbers: list[int]) -> Iterator[int]:
+        """Make tiles, as many at a time as there are cores; yields their numbers."""
+        together = cores()
+        for first in range(0, len(numbers), together):
+            part = numbers[first : first + together]
+            found = in_parallel([partial(self._match, self._tiles[number]) for number in part], "cpu")
+            for number, matched in zip(part, found, strict=True):
+                self._write(self._tiles[number], matched)
+                yield number
+
+    def _match(self, tile: Tile) -> Matched | None:
+        return match(tile, self._start, self._job.scene, self._grey, self._gsd)
+
+    def _write(self, tile: Tile, matched: Matched | None) -> None:
+        job = self._job
+        values: dict[str, np.ndarray] = {}
+        if matched is not None:
+            wanted = inside(job.area, tile)
+            seen = (matched.count >= FEWEST_VIEWS) & wanted
+            shown = wanted if job.fill else seen
+            if shown.any():
+                above = matched.height - np.float32(job.grid.height)
+                colour = render_tile(job.render, tile, above, matched.sigma)
+                values = {
+                    "height": matched.height,
+                    "sigma": matched.sigma,
+                    "score": matched.score.astype(np.float16),
+                    "count": np.minimum(matched.count, 65535).astype(np.uint16),
+                    "main": matched.main.astype(np.uint16),
+                    "seen": seen,
+                    "shown": shown,
+                    "colour": colour,
+                }
+        with completed_file(_file(self._folder, tile), overwrite=True) as partial_file, partial_file.open("wb") as file:
+            np.savez(file, allow_pickle=False, **values)
 
 
 def _file(folder: Path, tile: Tile) -> Path:
@@ -350,7 +385,14 @@ def write_cloud(out: Path, grid: Grid) -> tuple[int, dict[str, float]]:
     return cloud.count, {name: number[value] / max(cloud.count, 1) for name, value in names.items()}
 
 
-def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
+def make_map(
+    job: Job,
+    out: Path,
+    overwrite: bool,
+    record: dict[str, Any],
+    bar: Callable[[str], Any],
+    elsewhere: Elsewhere | None = None,
+) -> dict[str, Any]:
     """Make a map in a folder: a new one, or one that was interrupted.
 
     Args:
@@ -359,6 +401,7 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
         overwrite: begin again where the folder holds another map.
         record: stored in map.json.
         bar: returns a progress bar of a name, a context manager.
+        elsewhere: makes the tiles, if not this process.
 
     Raises:
         RunError: the folder holds something else, cannot be written to, or no two photographs see any of the area.
@@ -367,7 +410,7 @@ def make_map(job: Job, out: Path, overwrite: bool, record: dict[str, Any], bar: 
     started = time.monotonic()
     before = (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
     with bar("Mapping") as meter:
-        make_tiles(job, out, meter)
+        make_tiles(job, out, meter, elsewhere)
     with bar("Writing") as meter:
         found = join(job, out, meter)
     if not found["cells"]:
