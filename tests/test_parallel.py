@@ -13,7 +13,7 @@ from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.model.network import make_network
 from tidefield.model.sampling import sample
-from tidefield.parallel import differentiable_parts
+from tidefield.parallel import differentiable_parts, in_parallel
 from tidefield.train.losses import BatchLoss
 
 CPU = torch.device("cpu")
@@ -35,6 +35,16 @@ class Layers(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         hidden = self.first(x).tanh()
         return hidden, self.second(hidden), x.sum(1)
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad, torch.enable_grad])
+def test_tasks_run_in_the_modes_of_their_caller(mode) -> None:
+    def modes() -> tuple[bool, bool]:
+        return torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    with mode():
+        assert in_parallel([modes] * 3, CPU) == [modes()] * 3
 
 
 @pytest.mark.usefixtures("two_threads")

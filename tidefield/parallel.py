@@ -23,7 +23,8 @@ _CHECK: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None
 def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> list[T]:
     """Run tasks at the same time where the device is a CPU; returns their results in their order.
 
-    Each task gets one core for all of its operations. Sharing every small operation among the cores instead costs
+    Tasks run in the caller's modes of inference and gradients, which threads do not have by themselves. Each task gets
+    one core for all of its operations. Sharing every small operation among the cores instead costs
     a hand-over per operation, several times the work itself on a busy machine; and this way the results cannot
     depend on the number of cores.
     """
@@ -33,12 +34,18 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
     if torch.device(device).type != "cpu" or _SEQUENTIAL.get():
         return [task() for task in tasks]
     cores = torch.get_num_threads()
+    in_modes = partial(_in_modes, torch.is_inference_mode_enabled(), torch.is_grad_enabled())
     try:
         # A thread's own number of cores; it becomes the default of threads yet to come, too, hence the last line.
         with ThreadPoolExecutor(cores, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(lambda task: task(), tasks))
+            return list(pool.map(in_modes, tasks))
     finally:
         torch.set_num_threads(cores)
+
+
+def _in_modes(inference: bool, gradients: bool, task: Callable[[], T]) -> T:
+    with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+        return task()
 
 
 def _checked(check: Callable[[], None], task: Callable[[], T]) -> T:

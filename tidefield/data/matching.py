@@ -93,7 +93,6 @@ class Matcher:
         known = known | ~known.any()
         found, half = torch.empty_like(start), torch.empty_like(start)
 
-        @torch.inference_mode()  # each thread needs its own
         def match(outer: _Box, inner: _Box) -> None:
             (left, top), (right, bottom) = outer
             part = replace(
@@ -240,19 +239,16 @@ class Matcher:
         """A photograph at a level of the pyramid without its local means and contrasts."""
         key = photograph, level
         with self._reading:
-            return self._image_of(key, camera)
-
-    def _image_of(self, key: tuple[int, int], camera: Cameras) -> Float[Tensor, "1 1 H W"]:
-        if key not in self._kept:
-            colours, _ = self.pyramid.read(*key)
-            grey = (colours.float() / 255 / camera.gain_of_rows()).mean(-1)
-            mean = _box(grey, CONTRAST_PX)
-            variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
-            self._kept[key] = ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
-            while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > KEPT_BYTES:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+            if key not in self._kept:
+                colours, _ = self.pyramid.read(photograph, level)
+                grey = (colours.float() / 255 / camera.gain_of_rows()).mean(-1)
+                mean = _box(grey, CONTRAST_PX)
+                variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
+                self._kept[key] = ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
+                while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > KEPT_BYTES:
+                    self._kept.popitem(last=False)
+            self._kept.move_to_end(key)
+            return self._kept[key]
 
 
 class _Look:

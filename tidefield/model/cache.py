@@ -148,20 +148,12 @@ class FeatureCache:
         for start in range(0, len(blocks), ENCODED_AT_ONCE):
             some = blocks[start : start + ENCODED_AT_ONCE]
             slots = [self._free.pop() if self._free else self._slots.popitem(last=False)[1] for _ in some]
-            # Threads start with gradients, whatever their caller has.
-            modes = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
-            tasks = [partial(self._encode, *each, *modes) for each in zip(some, slots, strict=True)]
             try:
-                in_parallel(tasks, self.device)
+                in_parallel([partial(self._encode, *each) for each in zip(some, slots, strict=True)], self.device)
             finally:
                 self._free += [slot for block, slot in zip(some, slots, strict=True) if block not in self._slots]
 
-    def _encode(self, block: Block, slot: int, inference: bool, gradients: bool) -> None:
-        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            self._encode_into(block, slot)
-        self._slots[block] = slot
-
-    def _encode_into(self, block: Block, slot: int) -> None:
+    def _encode(self, block: Block, slot: int) -> None:
         with self._reading:
             colours, mask = self.pyramid.read(block.photograph, block.level)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
@@ -181,6 +173,7 @@ class FeatureCache:
             first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(found.rows)] = found.rows.to(maps.rows.dtype)
             maps.size[slot], maps.origin_px[slot] = found.size[0], found.origin_px[0]
+        self._slots[block] = slot
 
     def _texels(self, stride: int | float) -> int:
         return math.prod(math.ceil(side / stride) for side in self._side)

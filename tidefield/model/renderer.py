@@ -155,7 +155,6 @@ class Renderer:
         ]
         return torch.cat(in_parallel(pieces, self.device) if self.tiles_in_parallel else [piece() for piece in pieces])
 
-    @torch.inference_mode()  # each thread needs its own
     def _piece(
         self, camera: Cameras, prior: DepthPrior, corners: Float[Tensor, "T 2"], views: Views
     ) -> Float[Tensor, "T R 6"]:
