@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -15,13 +16,12 @@ import torch
 from tidefield.compare.tables import Table
 from tidefield.config import Config, config_from_json
 from tidefield.data.load import load_scene
-from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.evaluation.metrics import fit_colours, flip_map, psnr, ssim_map
+from tidefield.evaluation.evaluate import evaluate
 from tidefield.files import read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import zero_shot
-from tidefield.model.rendering import to_8_bit
+from tidefield.progress import make_console
 from tidefield.train.checkpoint import read_weights_file, weights_sha256
 
 PARTS_FILE = "parts.json"
@@ -49,7 +49,7 @@ def measure_parts(
     Raises:
         RunError: a file is damaged, or holds no weights of a preset.
     """
-    record = read_json(runs / PARTS_FILE) or {"files": {}, "figures": {}}
+    record, quiet = read_json(runs / PARTS_FILE) or {"files": {}, "figures": {}}, make_console(quiet=True)
     for file in files:
         header, _ = read_weights_file(file)
         config = config_from_json(header["config"], f"{file}: config")
@@ -67,15 +67,9 @@ def measure_parts(
                 say(f"{name}: {file}")
                 scene = load_scene(folder, width=width)
                 render, _ = zero_shot(config, file, scene, device)
-                rows = []
-                for index in scene.test:
-                    truth, seen = scene.photographs[index], doubly_seen(scene, scene.cameras[index])
-                    with torch.no_grad():
-                        image = fit_colours(to_8_bit(render(scene.cameras[index]).colour), truth, seen)
-                    maps = (ssim_map(image, truth), flip_map(image, truth))
-                    rows.append((psnr(image, truth, seen), *(float(values[seen].mean()) for values in maps)))
-                means = (sum(column) / len(rows) for column in zip(*rows, strict=True))
-                record["figures"][name][own] = dict(zip(METRICS, means, strict=True))
+                with TemporaryDirectory() as temporary:
+                    mean = evaluate(render, scene, Path(temporary) / "out", configuration={}, console=quiet).mean
+                record["figures"][name][own] = {metric: mean[f"{metric}_seen_cc"] for metric in METRICS}
             command = "python -m benchmarks parts WEIGHTS... --scenes SCENE..."
             write_json(runs / PARTS_FILE, {**record, **describe(), "command": command})
     return record
@@ -90,9 +84,9 @@ def tables(record: Mapping[str, Any]) -> list[Table]:
         if all(own in found for own in columns)
     ]
     names = [f"{metric.upper()}: {label}" for metric in METRICS for label in columns.values()]
-    last = {label: record["files"][own]["validation"][-1]["psnr"] for own, label in columns.items()}
-    scenes = list(next(iter(last.values())))
-    validated = [[label, *(f"{psnr[scene]:.2f}" for scene in scenes)] for label, psnr in last.items()]
+    last = [(label, record["files"][own]["validation"][-1]["psnr"]) for own, label in columns.items()]
+    scenes = list(last[0][1])
+    validated = [[label, *(f"{psnr[scene]:.2f}" for scene in scenes)] for label, psnr in last]
     return [
         Table("Held-out photographs, doubly seen pixels, after the colour fit", ["scene", *names], rows),
         Table("PSNR in dB at the end of the training, of the scenes that it validates on", ["", *scenes], validated),
