@@ -34,16 +34,16 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
     if torch.device(device).type != "cpu" or _SEQUENTIAL.get():
         return [task() for task in tasks]
     cores = torch.get_num_threads()
-    in_modes = partial(_in_modes, torch.is_inference_mode_enabled(), torch.is_grad_enabled())
+    inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
     try:
         # A thread's own number of cores; it becomes the default of threads yet to come, too, hence the last line.
         with ThreadPoolExecutor(cores, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(in_modes, tasks))
+            return list(pool.map(lambda task: _in_modes(task, inference, gradients), tasks))
     finally:
         torch.set_num_threads(cores)
 
 
-def _in_modes(inference: bool, gradients: bool, task: Callable[[], T]) -> T:
+def _in_modes(task: Callable[[], T], inference: bool, gradients: bool) -> T:
     with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
         return task()
 
