@@ -1,5 +1,6 @@
 """Large surveys are reconstructed in blocks, which are merged by the photographs that they share."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,6 +141,22 @@ def test_finished_blocks_are_kept_by_a_run_that_continues(survey, tmp_path: Path
     assert [m.num_reg_images() for m in again] == [m.num_reg_images() for m in first]
     reconstruct_blocks(database, folder, made, True, "incremental", False, quiet)
     assert (folder / "block_0000" / DONE).stat().st_mtime_ns > kept, "a changed survey starts again"
+
+
+def test_mapping_opens_no_database_that_another_process_may_be_opening(survey, tmp_path: Path, monkeypatch):
+    flight, database = survey
+    photographs, own = flight.survey.photographs, shutil.copy(database, tmp_path / "database.db")
+    made = cut(photographs, matched_pairs(own, [p.name for p in photographs]), whole=10, most=10)
+    split = module._split
+
+    def split_and_hide(*arguments) -> None:
+        split(*arguments)
+        own.unlink()
+
+    monkeypatch.setattr(module, "_split", split_and_hide)
+    parts = reconstruct_blocks(own, tmp_path / "blocks", made, True, "incremental", False, quiet)
+    assert [part.num_reg_images() for part in parts] == [len(block.names) for block in made]
+    assert merge(parts, database)[0].num_reg_images() == len(photographs), "photographs keep their numbers"
 
 
 def test_a_killed_process_is_one_error_that_says_how_to_go_on(survey, tmp_path: Path, monkeypatch):

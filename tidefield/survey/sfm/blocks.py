@@ -153,11 +153,15 @@ def reconstruct_blocks(
     done = count - sum(size[k] for k in missing)
     workers = max(1, min(cores(), len(missing)))
     threads = max(1, cores() // workers)
+    for k in missing:
+        shutil.rmtree(places[k], ignore_errors=True)
+        (places[k] / "work").mkdir(parents=True)
+    # COLMAP locks a database while it opens it, and a second process that opens it then fails.
+    _split(database, {places[k] / "work" / "database.db": blocks[k].names for k in missing})
     try:
         with worker_processes(workers, set_up_pycolmap) as pool:
             running = {
-                pool.submit(_reconstruct, database, places[k], blocks[k].names, known, mapper, threads): k
-                for k in missing
+                pool.submit(_reconstruct, places[k], blocks[k].names, known, mapper, threads): k for k in missing
             }
             for future in as_completed(running):
                 future.result()
@@ -172,14 +176,38 @@ def reconstruct_blocks(
     return [model for place in places for model in _read(place)]
 
 
-def _reconstruct(database: Path, folder: Path, names: list[str], known: bool, mapper: Mapper, threads: int) -> None:
+def _split(database: Path, parts: Mapping[Path, Collection[str]]) -> None:
+    """Write what mapping reads of some photographs to databases of their own, with the numbers of the common one."""
+    with pycolmap.Database.open(database) as db:
+        cameras, rigs = db.read_all_cameras(), db.read_all_rigs()
+        frames = {frame.frame_id: frame for frame in db.read_all_frames()}
+        images = {decode_name(image.name): image for image in db.read_all_images()}
+        pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in db.read_two_view_geometry_num_inliers()[0]]
+        for path, names in parts.items():
+            members = [images[name] for name in names]
+            numbers = {image.image_id for image in members}
+            with pycolmap.Database.open(path) as part, pycolmap.DatabaseTransaction(part):
+                for camera in cameras:
+                    part.write_camera(camera, use_camera_id=True)
+                for rig in rigs:
+                    part.write_rig(rig, use_rig_id=True)
+                for image in members:
+                    part.write_frame(frames[image.frame_id], use_frame_id=True)
+                    part.write_image(image, use_image_id=True)
+                    part.write_keypoints(image.image_id, db.read_keypoints(image.image_id))
+                for first, second in pairs:
+                    if first in numbers and second in numbers:
+                        part.write_two_view_geometry(first, second, db.read_two_view_geometry(first, second))
+
+
+def _reconstruct(folder: Path, names: list[str], known: bool, mapper: Mapper, threads: int) -> None:
     """Reconstruct one block, and write its models and then a file that says that they are complete."""
-    shutil.rmtree(folder, ignore_errors=True)
-    found = find_models(database, folder / "work", names, lambda done, whole: None, known, mapper, threads)
+    work = folder / "work"
+    found = find_models(work / "database.db", work, names, lambda done, whole: None, known, mapper, threads)
     for number, model in enumerate(found):
         write_model(model, folder / str(number))
     write_json(folder / DONE, {"models": len(found)})
-    shutil.rmtree(folder / "work", ignore_errors=True)
+    shutil.rmtree(work, ignore_errors=True)
 
 
 def _read(folder: Path) -> list[pycolmap.Reconstruction]:

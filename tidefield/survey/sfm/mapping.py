@@ -142,7 +142,7 @@ def find_models(
     progress: Progress,
     known: bool,
     mapper: Mapper,
-    threads: int = -1,
+    threads: int | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Run `reconstruct` without the error: there may be no model, and small ones."""
     count, registered = len(names), 0
@@ -158,7 +158,8 @@ def find_models(
         progress(count, count)
     else:
         options = pycolmap.IncrementalPipelineOptions()
-        options.image_names, options.num_threads = sorted(map(encode_name, names)), threads
+        options.image_names = sorted(map(encode_name, names))
+        options.num_threads = options.num_threads if threads is None else threads
         options.min_model_size, options.extract_colors, options.random_seed = MIN_PHOTOGRAPHS, False, 0
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
         found = interruptible(
@@ -173,11 +174,12 @@ def find_models(
 
 
 def _map_globally(
-    database: Path, folder: Path, names: Collection[str], known: bool, threads: int
+    database: Path, folder: Path, names: Collection[str], known: bool, threads: int | None
 ) -> dict[int, pycolmap.Reconstruction]:
     """Estimate all poses at once (GLOMAP: Pan et al., Global Structure-from-Motion Revisited, ECCV 2024)."""
     options = pycolmap.GlobalPipelineOptions()
-    options.image_names, options.num_threads, options.random_seed = sorted(map(encode_name, names)), threads, 0
+    options.image_names, options.random_seed = sorted(map(encode_name, names)), 0
+    options.num_threads = options.num_threads if threads is None else threads
     options.min_model_size = MIN_PHOTOGRAPHS
     options.mapper.bundle_adjustment.refine_focal_length = not known
     return pycolmap.global_mapping(database, folder, folder, options)
