@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,6 @@ from PIL import Image
 from rich.console import Console
 
 from tidefield.data.load import load_scene
-from tidefield.survey.georeference import bundle_adjustment
 from tidefield.survey.import_project import import_project
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
@@ -29,29 +28,6 @@ def run(folder: Path, scene: Path, holdout: bool = True) -> Prepared:
     return prepare(
         read_survey(folder), scene, FeatureOptions(count=1500), pycolmap.Device.cpu, console, holdout=holdout
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """With several threads, pycolmap adds up in an order that changes with the load of the machine."""
-    pipeline, adjustment = pycolmap.IncrementalPipelineOptions, bundle_adjustment.adjustment_options
-
-    def of_mapping() -> pycolmap.IncrementalPipelineOptions:
-        options = pipeline()
-        options.num_threads = 1
-        return options
-
-    def of_adjustment() -> pycolmap.BundleAdjustmentOptions:
-        options = adjustment()
-        solver = options.ceres.solver_options
-        solver.num_threads = 1
-        options.ceres.solver_options = solver
-        return options
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pycolmap, "IncrementalPipelineOptions", of_mapping)
-        patch.setattr(bundle_adjustment, "adjustment_options", of_adjustment)
-        yield
 
 
 @pytest.fixture(scope="module")
