@@ -1,17 +1,23 @@
 """Work on a Ray cluster, a real one on this machine: the same results as without, and nothing but tasks is lost."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 
-from tidefield.cluster import connected, on_cluster
+from tidefield.cluster import Share, connected, on_cluster, share_of
+from tidefield.compare.run import Settings, scene_runner
 from tidefield.errors import RunError
 from tidefield.synthetic import make_survey, write_survey
 
@@ -23,11 +29,13 @@ pytestmark = [
 ]
 
 
+ROOT = Path(__file__).parents[1]
+
+
 @pytest.fixture(scope="module")
 def address():
     """A cluster with two cores, whose workers find this tree."""
-    root = str(Path(__file__).parents[1])
-    runtime = {"env_vars": {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"}}
+    runtime = {"env_vars": {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}}
     context = ray.init(
         address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, runtime_env=runtime,
         object_store_memory=100_000_000,
@@ -37,27 +45,55 @@ def address():
 
 
 def test_every_item_is_worked_on_and_a_worker_prepares_once(address, tmp_path: Path):
+    @contextmanager
     def prepare():
         (tmp_path / f"prepared {os.getpid()} {time.time_ns()}").touch()
-        return lambda item: (tmp_path / f"item {item}").write_text(str(item**2))
+        yield lambda item: item**2
 
-    assert sorted(on_cluster(ray, "squares", prepare, range(12))) == list(range(12))
-    assert [(tmp_path / f"item {k}").read_text() for k in range(12)] == [str(k**2) for k in range(12)]
+    assert sorted(on_cluster(ray, "squares", prepare, range(12))) == [(k, k**2) for k in range(12)]
     assert 1 <= len(list(tmp_path.glob("prepared *"))) <= 4
 
 
+def test_items_come_in_their_order_if_that_is_wanted(address):
+    @contextmanager
+    def prepare():
+        def work(item):
+            time.sleep(0.3 if item == 0 else 0)
+            return item
+
+        yield work
+
+    found = [item for item, _ in on_cluster(ray, "order", prepare, range(6))]
+    assert sorted(found) == list(range(6))
+    assert found != list(range(6))
+    assert [item for item, _ in on_cluster(ray, "order", prepare, range(6), in_order=True)] == list(range(6))
+
+
+def test_what_a_worker_has_open_is_closed_before_it_opens_something_else(address, tmp_path: Path):
+    @contextmanager
+    def prepare(name):
+        (tmp_path / f"open {os.getpid()}").touch(exist_ok=False)
+        yield lambda item: name
+        (tmp_path / f"open {os.getpid()}").unlink()
+
+    for name in ("first", "second"):
+        assert {made for _, made in on_cluster(ray, name, partial(prepare, name), range(6))} == {name}
+
+
 def test_an_error_of_the_function_is_raised_as_it_is(address):
+    @contextmanager
     def prepare():
         def work(item):
             raise RunError(f"{item} is wrong: expected another; choose one")
 
-        return work
+        yield work
 
     with pytest.raises(RunError, match="7 is wrong"):
         list(on_cluster(ray, "wrong", prepare, [7]))
 
 
 def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path):
+    @contextmanager
     def prepare():
         def work(item):
             with (tmp_path / f"attempts {item}").open("a") as file:
@@ -65,7 +101,7 @@ def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path
             time.sleep(0.6)
             (tmp_path / f"done {item}").touch()
 
-        return work
+        yield work
 
     killed: list[int] = []
 
@@ -84,28 +120,114 @@ def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path
 
     thread = threading.Thread(target=kill)
     thread.start()
-    assert sorted(on_cluster(ray, "killed", prepare, range(10))) == list(range(10))
+    assert sorted(item for item, _ in on_cluster(ray, "killed", prepare, range(10))) == list(range(10))
     thread.join(timeout=10)
     assert len(killed) == 3
     attempts = sum(len(path.read_text().split()) for path in tmp_path.glob("attempts *"))
     assert attempts == 10 + 3
 
 
+def tidefield(folder: Path, *words: object) -> None:
+    """Run a command with a cache of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache")}
+    subprocess.run([sys.executable, "-m", "tidefield.cli", *map(str, words)], check=True, env=environment)
+
+
 @pytest.mark.slow
 def test_a_map_of_a_cluster_is_that_of_one_process_to_the_last_byte(address, tmp_path: Path):
     scene = tmp_path / "scene"
     write_survey(make_survey("ground_textures", seed=4, views=9, width=240), scene)
-    root = Path(__file__).parents[1]
     for name, cluster in (("here", []), ("there", ["--cluster", address])):
-        words = ["map", scene, tmp_path / name, "--zero-shot", "--gsd", "0.5", "--device", "cpu", *cluster]
-        environment = {**os.environ, "PYTHONPATH": str(root), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-        subprocess.run([sys.executable, "-m", "tidefield.cli", *map(str, words)], check=True, env=environment)
+        tidefield(tmp_path, "map", scene, tmp_path / name, "--zero-shot", "--gsd", "0.5", "--device", "cpu", *cluster)
     files = sorted(path.relative_to(tmp_path / "here") for path in (tmp_path / "here").rglob("*") if path.is_file())
     assert len(files) >= 20
     rasters = [file for file in files if file.suffix in (".tif", ".laz", ".geojson")]
     assert len(rasters) > 10
     for file in rasters:
         assert (tmp_path / "here" / file).read_bytes() == (tmp_path / "there" / file).read_bytes(), file
+
+
+@pytest.mark.slow
+def test_the_frames_of_a_cluster_are_those_of_one_process(address, tmp_path: Path):
+    scene = tmp_path / "scene"
+    write_survey(make_survey("ground_textures", seed=4, views=9, width=160), scene)
+    for name, cluster in (("here", []), ("there", ["--cluster", address])):
+        words = ["render", scene, tmp_path / f"{name}.mp4", "--zero-shot", "--frames", "18", "--device", "cpu"]
+        tidefield(tmp_path, *words, *cluster)
+    here, there = (frames(tmp_path / f"{name}.mp4") for name in ("here", "there"))
+    assert here.shape == (18, 120, 160, 3)
+    assert len(np.unique(here[0] - here[17])) > 10, "the path moves"
+    np.testing.assert_array_equal(here, there)
+
+
+def frames(video: Path) -> np.ndarray:
+    with av.open(str(video)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+@pytest.mark.slow
+def test_a_comparison_of_a_cluster_has_the_figures_of_one_process(address, tmp_path: Path):
+    scenes = [tmp_path / name for name in ("first", "second")]
+    for seed, scene in enumerate(scenes):
+        write_survey(make_survey("ground_textures", seed=seed, views=9, width=120), scene)
+    for name, cluster in (("here", []), ("there", ["--cluster", address])):
+        words = ["--methods", "nearest", "tidefield", "--steps", "2", "--device", "cpu"]
+        tidefield(tmp_path, "compare", *scenes, *words, "--out", tmp_path / name, *cluster)
+    for scene in scenes:
+        for method in ("nearest", "tidefield"):
+            files = [tmp_path / name / "runs" / scene.name / method for name in ("here", "there")]
+            here, there = (json.loads((file / "evaluation.json").read_text())["mean"]["psnr"] for file in files)
+            assert here == pytest.approx(there, abs=1e-4)
+            process = json.loads((files[1] / "process.json").read_text())
+            assert process["evaluate"]["seconds"] > 0
+    assert (tmp_path / "there" / "tables.md").exists()
+
+
+def test_a_command_that_fails_on_a_worker_is_its_own_error(tmp_path: Path):
+    settings = Settings(None, 2, None, "cpu", 0)
+    with (
+        scene_runner({"a": tmp_path / "none"}, ["nearest"], settings, tmp_path / "out", {}) as work,
+        pytest.raises(RunError, match=r"^[^:]*none is missing: expected one of"),
+    ):
+        work("a")
+
+
+def test_a_scene_waits_until_the_child_of_a_dead_worker_has_ended(tmp_path: Path, monkeypatch):
+    folder = tmp_path / "out" / "runs" / "a" / "nearest"
+    code = f"""
+import time
+from pathlib import Path
+from tidefield.files import only_writer
+with only_writer(Path({str(folder)!r})):
+    Path({str(tmp_path / "locked")!r}).touch()
+    time.sleep(1.5)
+    Path({str(tmp_path / "saved")!r}).touch()
+"""
+    child = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)})
+    while not (tmp_path / "locked").exists():
+        time.sleep(0.05)
+    saved = []
+    monkeypatch.setattr("tidefield.compare.run.compare", lambda *_: saved.append((tmp_path / "saved").exists()))
+    with scene_runner({"a": tmp_path}, ["nearest"], Settings(None, 2, None, "cpu", 0), tmp_path / "out", {}) as work:
+        work("a")
+    assert child.wait() == 0
+    assert saved == [True]
+
+
+def test_tasks_ask_for_what_the_machines_have():
+    def cluster(*machines):
+        nodes = [{"Alive": alive, "Resources": {"CPU": c, **({"GPU": g} if g else {})}} for alive, c, g in machines]
+        return SimpleNamespace(nodes=lambda: nodes)
+
+    processors = cluster((True, 2.0, 0), (True, 8.0, 0), (False, 64.0, 8))
+    assert share_of(processors, "auto", "core") == Share(1.0, 0.0)
+    assert share_of(processors, "auto", "gpu") == Share(1.0, 0.0)
+    assert share_of(processors, "auto", "machine") == Share(8.0, 0.0)
+    mixed = cluster((True, 32.0, 0), (True, 12.0, 4.0), (True, 8.0, 4.0))
+    assert share_of(mixed, "auto", "core") == Share(1.0, 0.3333)
+    assert share_of(mixed, "cuda", "gpu") == Share(1.0, 1.0)
+    assert share_of(mixed, "cuda", "machine") == Share(12.0, 4.0)
+    assert share_of(mixed, "cpu", "machine") == Share(32.0, 0.0)
 
 
 def test_a_cluster_that_does_not_answer_is_one_error(monkeypatch):

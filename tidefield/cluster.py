@@ -1,7 +1,7 @@
-"""Run a function on many items: here, or as tasks of a Ray cluster.
+"""Run a function on many items as tasks of a Ray cluster.
 
-Ray schedules, and repeats the tasks of a worker that dies; what a task makes is a file, so nothing else is lost. A
-worker prepares once (opens a scene, loads a network), and works on as many items as it gets.
+Ray schedules, and repeats the tasks of a worker that dies: nothing else is lost. A worker prepares once (opens a scene,
+loads a network), and works on as many items as it gets.
 """
 
 from __future__ import annotations
@@ -10,18 +10,27 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 from tidefield.errors import RunError
 from tidefield.machine import cores
 
 Item = TypeVar("Item")
-Work = Callable[[Any], object]
+Options = TypeVar("Options")
+Work = Callable[[Any], Any]
 RETRIES = 20
 """Times that a task is repeated whose worker died."""
-_READY: dict[str, Work] = {}
-"""What workers have prepared, by the key of the job; the one of the running job only."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """What a task has to itself: cores, and GPUs, of which several tasks may share one."""
+
+    cores: float = 1.0
+    gpus: float = 0.0
 
 
 @contextmanager
@@ -37,8 +46,7 @@ def connected(address: str) -> Iterator[Any]:
         raise RunError(
             "--cluster needs Ray, which is not installed: expected the extra; pip install 'tidefield[cluster]'"
         ) from error
-    # Tasks ask for cores alone, and may use the machine's GPU all the same.
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's default from its next version on
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     try:
@@ -61,26 +69,54 @@ def connected(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def on_cluster(ray: Any, key: str, prepare: Callable[[], Work], items: Sequence[Item]) -> Iterator[Item]:
-    """Work on items as tasks of a cluster, one core each; yields each item when it is done.
+def share_of(ray: Any, device: str, of: Literal["core", "gpu", "machine"]) -> Share:
+    """What a task asks the cluster for.
+
+    Args:
+        ray: of `connected`.
+        device: as in --device; tasks on a CPU ask for no GPU.
+        of: a core with its part of its machine's GPUs, a core with a GPU, or a whole machine: where machines differ,
+            one with the most GPUs, else the most cores.
+    """
+    machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    all_gpus = [0.0 if device == "cpu" else machine.get("GPU", 0.0) for machine in machines]
+    gpus, own_cores = max((g, machine.get("CPU", 1.0)) for g, machine in zip(all_gpus, machines, strict=True))
+    if of == "machine":
+        return Share(own_cores, gpus)
+    if of == "gpu":
+        return Share(1.0, min(1.0, gpus))
+    return Share(1.0, int(1e4 * min(1.0, gpus / own_cores)) / 1e4)  # Ray counts in steps of 1e-4
+
+
+def on_cluster(
+    ray: Any,
+    key: str,
+    prepare: Callable[[], AbstractContextManager[Work]],
+    items: Sequence[Item],
+    share: Share = Share(),
+    in_order: bool = False,
+) -> Iterator[tuple[Item, Any]]:
+    """Work on items as tasks of a cluster; yields each item with what was made of it, when it is done.
 
     Args:
         ray: of `connected`.
         key: identifies the job.
-        prepare: returns the function of an item; called once in each worker process. Both run on other machines, so
-            files that they name must be there under the same names.
+        prepare: opens the function of an item; called once in each worker process, in which it stays open. Both run on
+            other machines, so files that they name must be there under the same names.
+        share: of a task.
+        in_order: yield in the order of the items. What is made early waits in Ray's memory, or on its disk.
 
     Raises:
         RunError: workers died again and again with one item. Errors of the function itself are raised as they are.
     """
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(_work)
+    task = ray.remote(num_cpus=share.cores, num_gpus=share.gpus, max_retries=RETRIES)(_work)
     shared = ray.put(prepare)
     waiting = {task.remote(key, shared, item): item for item in items}
     while waiting:
-        done, _ = ray.wait(list(waiting), num_returns=1)
-        item = waiting.pop(done[0])
+        done = next(iter(waiting)) if in_order else ray.wait(list(waiting), num_returns=1)[0][0]
+        item = waiting.pop(done)
         try:
-            ray.get(done[0])
+            made = ray.get(done)
         except ray.exceptions.RayTaskError as error:
             raise error.cause from error
         except ray.exceptions.RayError as error:
@@ -88,14 +124,38 @@ def on_cluster(ray: Any, key: str, prepare: Callable[[], Work], items: Sequence[
                 f"workers of the cluster died {RETRIES + 1} times with {item} ({type(error).__name__}): expected them "
                 "to go on, with memory enough for it; repeat the command, which continues from there"
             ) from error
-        yield item
+        yield item, made
 
 
-def _work(key: str, prepare: Callable[[], Work], item: Any) -> None:
+_OPEN = ExitStack()
+_READY: dict[str, Work] = {}
+"""What this worker has prepared, by the key of the job; of the running job only."""
+
+
+def _work(key: str, prepare: Callable[[], AbstractContextManager[Work]], item: Any) -> Any:
     if key not in _READY:
-        import torch
-
-        torch.set_num_threads(1)  # a task has one core
         _READY.clear()
-        _READY[key] = prepare()
-    _READY[key](item)
+        _OPEN.close()
+        _READY[key] = _OPEN.enter_context(prepare())
+    return _READY[key](item)
+
+
+def require_same(source: Path, key: str, own_key: str) -> None:
+    """Raises: RunError when a worker's own key of a job differs: its files are others."""
+    if own_key != key:
+        raise RunError(
+            f"{source} is something else on a worker of the cluster: expected the same files under the same names on "
+            "all machines; use a shared folder"
+        )
+
+
+def absolute(options: Options) -> Options:
+    """The same options, for processes in other folders: the paths of a dataclass, and of those in it, are absolute."""
+    changed = {}
+    for name in (field.name for field in fields(options)):  # type: ignore[arg-type]
+        value = getattr(options, name)
+        if isinstance(value, Path):
+            changed[name] = value.resolve()
+        elif is_dataclass(value):
+            changed[name] = absolute(value)
+    return replace(options, **changed)  # type: ignore[type-var]

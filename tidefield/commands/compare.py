@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AnyMethod, Device, OpensplatProgram, Verbosity
+from tidefield.commands.common import AnyMethod, Cluster, Device, OpensplatProgram, Verbosity
 from tidefield.config import Budget, checked_seed
 from tidefield.errors import RunError
 from tidefield.files import require_writable
@@ -20,10 +22,13 @@ from tidefield.processes import worker_processes
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from tidefield.cluster import Share
     from tidefield.compare.results import Results
     from tidefield.compare.run import Settings, Usage
 
 SYNTHETIC_WIDTH = 400
+Elsewhere = Callable[[Callable[[], Any], list[str]], Iterator[str]]
+"""Works on scenes, given by what a worker prepares and their names; yields the name of each that is done."""
 
 
 @dataclass(frozen=True)
@@ -53,33 +58,62 @@ class Compare:
     device: Device = "auto"
     seed: int = 0
     opensplat: OpensplatProgram = None
+    cluster: Annotated[
+        Cluster,
+        arg(
+            help="Scenes as tasks of a Ray cluster, which sees the same folders: `auto` is the running one, or one "
+            "started on this machine; else its address. A scene has a whole machine to itself, all its cores and GPUs, "
+            "so that minutes and seconds mean the same as without: among equal machines. Needs pip install "
+            "'tidefield[cluster]'."
+        ),
+    ] = None
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
 def compare(options: Compare, console: Console) -> None:
     """Run `tidefield compare`."""
-    from tidefield.baselines import opensplat
-    from tidefield.baselines.nerfstudio import driver
+    from tidefield.cluster import connected, share_of
     from tidefield.compare.tables import write_comparison
-    from tidefield.device import choose_device
-    from tidefield.train.checkpoint import given_or_shipped
 
     if not options.methods:
         raise RunError("nothing to compare: expected methods; name some, or leave --methods out")
+    with ExitStack() as stack:
+        here = options.device if options.cluster is None else "cpu"
+        settings, elsewhere = (
+            make_settings(options.budget, options.width, here, options.seed, options.from_scratch),
+            None,
+        )
+        if options.cluster is not None:
+            ray = stack.enter_context(connected(options.cluster))
+            share = share_of(ray, options.device, "machine")
+            auto = "cuda:0" if share.gpus else "cpu"
+            settings = replace(settings, device=auto if options.device == "auto" else options.device)
+            elsewhere = partial(_on_cluster, ray, share)
+        environment = _require_software(options, settings.device)
+        scenes = _scenes(options)
+        results = run_all(scenes, options.methods, settings, options.out, console, environment, elsewhere)
+    print_lines(console, write_comparison(results, scenes, settings, options.out))
+
+
+def _require_software(options: Compare, device: str) -> dict[str, str]:
+    """Look for what the methods need, before anything is trained; returns additional variables of the environment."""
+    import torch
+
+    from tidefield.baselines import opensplat
+    from tidefield.baselines.nerfstudio import driver
+    from tidefield.train.checkpoint import given_or_shipped
+
     environment = {}
-    for method in options.methods:  # before anything is trained
+    for method in options.methods:
         if method in ("nerfacto", "splatfacto"):
-            driver.require(method, choose_device(options.device))
+            driver.require(method, torch.device(device))
         elif METHODS[method].kind == "zero-shot":
             given_or_shipped(None, str(METHODS[method].preset))
         elif method == "opensplat":
             program = opensplat.find(options.opensplat)
             opensplat.version(program)
             environment[opensplat.VARIABLE] = str(program)
-    scenes = _scenes(options)
-    settings = make_settings(options.budget, options.width, options.device, options.seed, options.from_scratch)
-    results = run_all(scenes, options.methods, settings, options.out, console, environment)
-    print_lines(console, write_comparison(results, scenes, settings, options.out))
+    return environment
 
 
 def make_settings(
@@ -102,27 +136,51 @@ def run_all(
     out: Path,
     console: Console,
     variables: Mapping[str, str] = MappingProxyType({}),
+    elsewhere: Elsewhere | None = None,
 ) -> Results:
     """Train and evaluate what has not been done yet, and read all results.
 
     Args:
         variables: additional ones of the environment of all processes.
+        elsewhere: works on the scenes, if not this machine.
     """
     from tidefield.compare.results import read_results
-    from tidefield.compare.run import PROCESS_FILE, check_scene, compare, run_measured
+    from tidefield.compare.run import (
+        PROCESS_FILE,
+        check_scene,
+        compare,
+        require_same_settings,
+        run_measured,
+        scene_runner,
+    )
 
     require_writable(out / PROCESS_FILE, overwrite=True)
     # In a process of its own, because the memory of a scene would be charged to every process that this one starts.
     with worker_processes(1) as pool:
         for scene in scenes.values():
             pool.submit(check_scene, scene, settings.width).result()
-    quiet = ["--quiet"] if console.quiet else []
+    if elsewhere is None:
+        quiet = ["--quiet"] if console.quiet else []
 
-    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
-        return run_measured([*command, *quiet], {**variables, **environment})
+        def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+            return run_measured([*command, *quiet], {**variables, **environment})
 
-    compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]))
+        compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]))
+    else:
+        require_same_settings(scenes, methods, settings, out)
+        found = {name: scene.resolve() for name, scene in scenes.items()}
+        opened = partial(scene_runner, found, methods, settings, out.resolve(), variables)
+        for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
+            print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
     return read_results(out, list(scenes), methods)
+
+
+def _on_cluster(ray: Any, share: Share, prepare: Callable[[], Any], names: list[str]) -> Iterator[str]:
+    """Work on scenes on a cluster; yields the name of each that is done."""
+    from tidefield.cluster import on_cluster
+
+    for name, _ in on_cluster(ray, "compare", prepare, names, share):
+        yield name
 
 
 def print_lines(console: Console, lines: Iterable[object]) -> None:

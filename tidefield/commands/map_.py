@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -59,7 +59,7 @@ class Map:
 
 def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
-    from tidefield.cluster import connected, on_cluster
+    from tidefield.cluster import absolute, connected, on_cluster, share_of
     from tidefield.files import only_writer
     from tidefield.maps.make import delete_tiles, make_map
     from tidefield.maps.rasters import need
@@ -82,7 +82,9 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         elsewhere = None
         if options.cluster is not None:
             ray = stack.enter_context(connected(options.cluster))
-            elsewhere = partial(on_cluster, ray, job.key, partial(_tile_maker, _absolute(options), job.key))
+            opened = partial(_tile_maker, absolute(options), job.key)
+            share = share_of(ray, options.device, "core")
+            elsewhere = lambda numbers: (n for n, _ in on_cluster(ray, job.key, opened, numbers, share))  # noqa: E731
         result = make_map(
             job, options.out, options.overwrite, about, lambda name: ProgressBar(console, name), elsewhere
         )
@@ -130,29 +132,19 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]
         yield job, {"scene": scene.root.resolve().name, "method": record}
 
 
-def _absolute(options: Map) -> Map:
-    """The same options for processes in other folders."""
-    weights = options.zero.weights and options.zero.weights.resolve()
-    paths = {name: value.resolve() for name, value in vars(options).items() if isinstance(value, Path)}
-    return replace(options, **paths, zero=replace(options.zero, weights=weights))
+@contextmanager
+def _tile_maker(options: Map, key: str) -> Iterator[TileMaker]:
+    """Open a map in a worker of a cluster."""
+    import torch
 
-
-def _tile_maker(options: Map, key: str) -> TileMaker:
-    """Open a map in a worker of a cluster, which keeps it open as long as it lives."""
+    from tidefield.cluster import require_same
     from tidefield.maps.make import TileMaker
     from tidefield.progress import make_console
 
-    job, _ = _WORKER.enter_context(_open(options, make_console(quiet=True)))
-    if job.key != key:
-        raise RunError(
-            f"{options.source} is something else on a worker of the cluster: expected the same files under the same "
-            "names on all machines; use a shared folder"
-        )
-    return TileMaker(job, options.out)
-
-
-_WORKER = ExitStack()
-"""What a worker of a cluster has open."""
+    torch.set_num_threads(1)  # a task has one core
+    with _open(options, make_console(quiet=True)) as (job, _):
+        require_same(options.source, key, job.key)
+        yield TileMaker(job, options.out)
 
 
 def _describe(found: dict[str, Any], unit: str) -> str:

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from tidefield.commands.common import AllowMissing, Device, Footprint, Verbosity, ZeroShot, open_source
+from tidefield.commands.common import AllowMissing, Cluster, Device, Footprint, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError, TidefieldError
 from tidefield.files import require_writable
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import Console
 
+    from tidefield.data.scene import Scene
     from tidefield.geometry.cameras import Cameras
+
+FRAMES_AT_ONCE = 8
+"""Frames of a task on a cluster: frames that follow each other read the same encoded photographs."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +58,7 @@ class Render:
     height: int | None = None
     """Height of the picture in pixels; in proportion to the width if not given."""
     device: Device = "auto"
+    cluster: Cluster = None
     overwrite: bool = False
     """Replace existing files."""
     allow_missing: AllowMissing = False
@@ -56,6 +67,7 @@ class Render:
 
 def render(options: Render, console: Console) -> None:
     """Run `tidefield render`."""
+    from tidefield.cluster import connected
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
     from tidefield.render.camera_paths import make_trajectory
@@ -68,10 +80,12 @@ def render(options: Render, console: Console) -> None:
         raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
     if options.with_itself and camera is None:
         raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
+    if options.cluster is not None and camera is not None:
+        raise RunError("--cluster shares the frames of a path among machines: --camera NAME is one view; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
     device, sampling = choose_device(options.device), options.footprint.sampling
     opened = open_source(options.source, options.zero, device, options.allow_missing, console, sampling)
-    with opened as (scene, view, _):
+    with opened as (scene, view, record):
         if camera is not None:
             own = scene.cameras[scene.index(camera)]
             own = own.resized(*_size(own, options.width, options.height))
@@ -84,9 +98,15 @@ def render(options: Render, console: Console) -> None:
         cameras = trajectory.cameras
         from tidefield.render.video import write_video
 
-        with ProgressBar(console, "Rendering") as bar:
+        with ExitStack() as stack:
+            bar = stack.enter_context(ProgressBar(console, "Rendering"))
+            if options.cluster is None:
+                frames = (view(cameras[k]) for k in range(len(cameras)))
+            else:
+                ray = stack.enter_context(connected(options.cluster))
+                frames = _frames_of_cluster(ray, options, cameras, _key(scene, record))
             write_video(
-                (view(cameras[k]) for k in range(len(cameras))),
+                frames,
                 out,
                 trajectory.frames_per_second,
                 title=title(scene, Path(options.path).name),
@@ -107,3 +127,41 @@ def _size(camera: Cameras, width: int | None, height: int | None) -> tuple[int, 
         assert height is not None
         return max(16, round(height * camera.width / camera.height)), height
     return width, height if height is not None else max(16, round(width * camera.height / camera.width))
+
+
+def _frames_of_cluster(ray: Any, options: Render, cameras: Cameras, key: str) -> Iterator[np.ndarray]:
+    """Render the frames of a path on a cluster; 8-bit pictures in their order."""
+    from tidefield.cluster import absolute, on_cluster, share_of
+
+    count = len(cameras)
+    parts = [range(first, min(first + FRAMES_AT_ONCE, count)) for first in range(0, count, FRAMES_AT_ONCE)]
+    prepare = partial(_frame_maker, absolute(options), cameras, key)
+    for _, pictures in on_cluster(ray, key, prepare, parts, share_of(ray, options.device, "gpu"), in_order=True):
+        yield from pictures
+
+
+@contextmanager
+def _frame_maker(options: Render, cameras: Cameras, key: str) -> Iterator[Callable[[range], np.ndarray]]:
+    """Open a scene in a worker of a cluster; a function from numbers of frames to their pictures."""
+    import numpy as np
+    import torch
+
+    from tidefield.cluster import require_same
+    from tidefield.device import choose_device
+    from tidefield.progress import make_console
+    from tidefield.render.stills import colour_picture
+
+    torch.set_num_threads(1)  # a task has one core
+    device, console = choose_device(options.device), make_console(quiet=True)
+    opened = open_source(
+        options.source, options.zero, device, options.allow_missing, console, options.footprint.sampling
+    )
+    with opened as (scene, view, record):
+        require_same(options.source, key, _key(scene, record))
+        yield lambda numbers: np.stack([colour_picture(view(cameras[k])) for k in numbers])
+
+
+def _key(scene: Scene, record: dict[str, Any]) -> str:
+    """Identifies what frames are rendered from."""
+    about = [list(scene.names), scene.cameras.T_world_camera.tolist(), scene.cameras.size_px.tolist(), record]
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()

@@ -1,5 +1,7 @@
 """Scenes to compare on; and every method on every scene, run in a process of its own, one after another, measured.
 
+Scenes may be on machines of a cluster at the same time; on a machine all is one after another.
+
 OUT/runs/SCENE/METHOD/ holds what `tidefield train` and `tidefield evaluate` write there, and process.json: the time and
 memory that they used. What has an evaluation.json is not repeated; an interrupted training is started again, so that
 its figures are those of one process.
@@ -15,21 +17,25 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from tidefield.config import PROTOCOL
 from tidefield.errors import RunError, SceneError
-from tidefield.files import completed_folder, read_json, write_json
+from tidefield.files import completed_folder, only_writer, read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import METHODS
 from tidefield.processes import Ended, end_with_parent
 
 WHOLE, OTHER_SEED = "tidefield", "another-seed"
 """Our network, and the same with another seed, for the noise of an ablation."""
+WRITER_SECONDS = 120.0
+"""More than a training needs to save, and a shared folder to release the lock of a machine that died."""
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
 MIPNERF360 = {
     "bicycle": "images_4",
@@ -148,15 +154,17 @@ def check_scene(scene: Path, width: int | None) -> None:
         raise SceneError(f"{scene} holds no photograph out: expected at least one to compare with; add photographs")
 
 
-def run_measured(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
-    """Run a command in a process of its own; it prints to our output.
+def run_measured(command: Sequence[str], environment: Mapping[str, str], output: IO[bytes] | None = None) -> Usage:
+    """Run a command in a process of its own; it prints to `output`, to ours if that is not given.
 
     Raises:
         SystemExit: it failed, and has said why; with its status.
         RunError: a signal ended it.
     """
     start = time.perf_counter()
-    process = subprocess.Popen(command, env={**os.environ, **environment}, preexec_fn=end_with_parent)
+    process = subprocess.Popen(
+        command, env={**os.environ, **environment}, stdout=output, stderr=output, preexec_fn=end_with_parent
+    )
     try:
         # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
         _, status, usage = os.wait4(process.pid, 0)
@@ -229,14 +237,8 @@ def compare(
     Raises:
         RunError: a command failed, or the folder holds results of other settings.
     """
-    jobs = [(out / RUNS / name / method, name, scene, method) for name, scene in scenes.items() for method in methods]
-    for folder, _, scene, method in jobs:
-        read_evaluation(folder)  # a damaged one is reported before anything is trained
-        wanted, found = _record(scene, method, settings), read_process(folder).get("settings")
-        if found not in (None, wanted):
-            was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
-            asked = {key: wanted[key] for key in was}
-            raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
+    require_same_settings(scenes, methods, settings, out)
+    jobs = _jobs(scenes, methods, out)
     for number, (folder, name, scene, method) in enumerate(jobs, start=1):
         title = f"{name}, {method} ({number} of {len(jobs)})"
         if read_evaluation(folder) is not None and "evaluate" in read_process(folder):
@@ -253,6 +255,69 @@ def compare(
             usage = run(tidefield(*words, *again), {})
             command = shlex.join(["tidefield", *portable[step]])
             write_json(folder / PROCESS_FILE, {**record, step: {"command": command, **asdict(usage), **describe()}})
+
+
+def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], settings: Settings, out: Path) -> None:
+    """Raises: RunError when the folder of a comparison holds damaged results, or such of other settings."""
+    for folder, _, scene, method in _jobs(scenes, methods, out):
+        read_evaluation(folder)
+        wanted, found = _record(scene, method, settings), read_process(folder).get("settings")
+        if found not in (None, wanted):
+            was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
+            asked = {key: wanted[key] for key in was}
+            raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
+
+
+def _jobs(scenes: Mapping[str, Path], methods: Sequence[str], out: Path) -> list[tuple[Path, str, Path, str]]:
+    """Folder, name of the scene, scene and method of each result."""
+    return [(out / RUNS / name / method, name, scene, method) for name, scene in scenes.items() for method in methods]
+
+
+@contextmanager
+def scene_runner(
+    scenes: Mapping[str, Path],
+    methods: Sequence[str],
+    settings: Settings,
+    out: Path,
+    environment: Mapping[str, str],
+) -> Iterator[Callable[[str], None]]:
+    """`compare` in a worker of a cluster: a function of a scene's name, for all methods.
+
+    Args:
+        scenes, methods, settings, out: as for `compare`; the paths are absolute.
+        environment: additional variables of all processes.
+    """
+
+    def run(command: Sequence[str], own: Mapping[str, str]) -> Usage:
+        with tempfile.TemporaryFile() as output:
+            try:
+                return run_measured([*command, "--quiet"], {**environment, **own}, output)
+            except SystemExit as error:  # it would end the worker
+                output.seek(max(0, output.tell() - 2000))
+                said = output.read().decode(errors="replace").strip().removeprefix("tidefield: ")
+                raise RunError(
+                    said or f"`{shlex.join(command)}` failed: expected it to end well; run it alone"
+                ) from error
+
+    def work(name: str) -> None:
+        for folder, *_ in _jobs({name: scenes[name]}, methods, out):
+            _wait_for_writer(folder)
+        compare({name: scenes[name]}, methods, settings, out, run, lambda _: None)
+
+    yield work
+
+
+def _wait_for_writer(folder: Path) -> None:
+    """Wait until the child of a worker that died has saved and ended, too."""
+    end = time.monotonic() + WRITER_SECONDS
+    while True:
+        try:
+            with only_writer(folder):
+                return
+        except RunError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(1)
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
