@@ -79,10 +79,8 @@ def compare(options: Compare, console: Console) -> None:
         raise RunError("nothing to compare: expected methods; name some, or leave --methods out")
     with ExitStack() as stack:
         here = options.device if options.cluster is None else "cpu"
-        settings, elsewhere = (
-            make_settings(options.budget, options.width, here, options.seed, options.from_scratch),
-            None,
-        )
+        settings = make_settings(options.budget, options.width, here, options.seed, options.from_scratch)
+        elsewhere = None
         if options.cluster is not None:
             ray = stack.enter_context(connected(options.cluster))
             share = share_of(ray, options.device, "machine")
