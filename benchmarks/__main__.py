@@ -21,6 +21,7 @@ from tidefield.machine import tune_process
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
+WIDTHS = tuple(MEASURED / f"{name}.json" for name in ("strict_400", "strict_400_scenes", "strict_800", "strict_1600"))
 LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
 DESCRIPTION = """Measure speed, views, memory, surveys and robustness, and write the pages of results. Without a name,
 it is speed. `tidefield compare` and `tidefield ablate` measure quality.
@@ -598,6 +599,7 @@ def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
     lengths: tuple[Path, ...] = LENGTHS,
+    widths: tuple[Path, ...] = WIDTHS,
     runs: Path = MEASURED,
     out: Path = Path("docs/results.md"),
 ) -> None:
@@ -607,12 +609,13 @@ def table(
         comparison: Files of `tidefield compare`; of a result in several files the last one counts.
         ablation: Files of `tidefield ablate`, likewise.
         lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
+        widths: Files of `tidefield compare` with the scenes at several widths.
         runs: Folder of speed, frames, memory, depth, points and parts.
         out: The Markdown file to write; replaced if it is there.
     """
     from benchmarks.table import write_page
 
-    write_page(comparison, ablation, lengths, runs, out)
+    write_page(comparison, ablation, lengths, widths, runs, out)
     print(out)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +74,16 @@ class Stored:
 
 
 def write_page(
-    comparison: Sequence[Path], ablation: Sequence[Path], lengths: Sequence[Path], runs: Path, out: Path
+    comparison: Sequence[Path],
+    ablation: Sequence[Path],
+    lengths: Sequence[Path],
+    widths: Sequence[Path],
+    runs: Path,
+    out: Path,
 ) -> None:
-    """Read the stored measurements and write the page as Markdown; `lengths` are comparisons with other trainings.
+    """Read the stored measurements and write the page as Markdown.
+
+    `lengths` are comparisons with other trainings, `widths` such of the same scenes at several widths.
 
     Raises:
         RunError: when there is no measurement at all.
@@ -86,26 +93,31 @@ def write_page(
         read_figures(ablation, SCENES, (WHOLE, OTHER_SEED, *VARIANTS)),
     )
     others = [read_figures([file], SCENES, (WHOLE,)) for file in lengths]
+    sized = by_width(widths)
     files = (SPEED_FILE, MEMORY_FILE, FRAMES_FILE, depth.DEPTH_FILE, points.POINTS_FILE, paper_parts.PARTS_FILE)
     stored = Stored(*(read_json(runs / file) for file in files))
-    if not (compared.by or ablated.by or any(vars(stored).values())):
-        places = ", ".join(map(str, (*comparison, *ablation, runs)))
+    if not (compared.by or ablated.by or sized or any(vars(stored).values())):
+        places = ", ".join(map(str, (*comparison, *ablation, *widths, runs)))
         raise RunError(
             f"{places} hold no results: expected files of `tidefield compare`, `tidefield ablate` and the benchmarks; "
             "run them"
         )
-    write_text(out, page(compared, ablated, others, stored))
+    write_text(out, page(compared, ablated, others, sized, stored))
 
 
-def page(compared: Results, ablated: Results, others: Sequence[Results], stored: Stored) -> str:
+def page(
+    compared: Results, ablated: Results, others: Sequence[Results], sized: Mapping[int, Results], stored: Stored
+) -> str:
     """The whole page: results first, circumstances and commands last."""
-    records = _records(compared, ablated, others, stored)
+    records = _records(compared, ablated, others, sized, stored)
     marks = scene_marks(learned_from())
     lengths = [marked(table, marks) for table in length_tables(by_length(compared, others))]
     parts = [
         "# Results",
         "## Quality",
         *(_quality(compared) or ["Not measured."]),
+        "## Quality by width, under the strict protocol",
+        *(_widths(sized) or ["Not measured."]),
         "## Quality against training time",
         *([table.markdown() for table in lengths] or ["Not measured."]),
         "## Ablation",
@@ -176,6 +188,38 @@ def notes(results: Results, marks: Sequence[Mark]) -> list[str]:
     return [*limits, *([trained] if trained else []), *legend(results.scenes, marks)]
 
 
+def by_width(files: Sequence[Path]) -> dict[int, Results]:
+    """Read comparisons of one width each; several of one width are joined."""
+    groups: dict[int, list[Path]] = {}
+    for file in files:
+        if (record := read_json(file)) is not None:
+            groups.setdefault(int(record["settings"]["width"]), []).append(file)
+    return {width: read_figures(group, SCENES, names()) for width, group in sorted(groups.items())}
+
+
+def _widths(sized: Mapping[int, Results]) -> list[str]:
+    """Tables of quality and costs, of one width after another."""
+    suffix = SHOWN_REGIONS[-1]
+    parts = [
+        "Nothing of a held-out photograph had a part in what it was compared with, its observations of sparse points "
+        "included. `sparse-depth` blends the same neighbours on the surface of the sparse points, with the same cubic "
+        "reading of photographs: the floor."
+    ]
+    for width, results in sized.items():
+        there = tuple(method for method in results.methods if any(m == method for _, m in results.by))
+        shown_results = Results(results.scenes, there, results.by)
+        marks = marks_of(shown_results, learned_from())
+        tables = quality_tables(shown_results, {suffix: REGIONS[suffix]})
+        costs = cost_table(shown_results)
+        parts += [
+            f"### {width} px",
+            *notes(shown_results, marks),
+            *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),
+            replace(costs, title=f"{width} px: {costs.title}").markdown(),
+        ]
+    return parts if sized else []
+
+
 ByLength = Mapping[str, Mapping[str, Result]]
 """Results by the name of the length of training, and by scene."""
 
@@ -221,13 +265,18 @@ def length_tables(lengths: ByLength) -> list[Table]:
 
 
 def _records(
-    compared: Results, ablated: Results, others: Sequence[Results], stored: Stored
+    compared: Results,
+    ablated: Results,
+    others: Sequence[Results],
+    sized: Mapping[int, Results],
+    stored: Stored,
 ) -> list[tuple[str, Mapping[str, Any]]]:
     """Everything with a date, a machine and a command, with its name."""
     named = [
         *((method, result) for (_, method), result in compared.by.items()),
         *(("ablation", result) for result in ablated.by.values()),
         *((length_of(result), result) for results in others for result in results.by.values()),
+        *((f"{width} px", result) for width, results in sized.items() for result in results.by.values()),
     ]
     steps = [(name, result.process.get(step)) for name, result in named for step in ("train", "evaluate")]
     return [(name, record) for name, record in (*vars(stored).items(), *steps) if record]

@@ -99,7 +99,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     kept = {"first": {"seconds": 25.0}, "further_seconds": 9.5, "by_photographs": {"18": 8.0, "200": 8.4}}
     views = {"preset": "swift", "size_px": [800, 600], "device": "cpu", "command": "frames"}
     write_json(runs / "frames.json", {**views, **kept, **this_machine.describe()})
-    table.write_page([comparison], [ablation], lengths, runs, out)
+    table.write_page([comparison], [ablation], lengths, [], runs, out)
     text = out.read_text()
     for line in (
         "A frame of 4000 x 3000 px from 12 photographs of that size, decoding and encoding included (swift, cpu): "
@@ -124,7 +124,25 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     assert "1,024 rays a batch instead of its default of 4,096" in text
     assert "### FLIP" in text
     with pytest.raises(RunError, match="no results"):
-        table.write_page([], [ablation.with_name("none.json")], [], tmp_path / "docs", tmp_path / "other.md")
+        table.write_page([], [ablation.with_name("none.json")], [], [], tmp_path / "docs", tmp_path / "other.md")
+
+
+def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) -> None:
+    files, out = [tmp_path / f"{name}.json" for name in ("wide", "narrow", "others")], tmp_path / "page.md"
+    kinds = ((800, "swindale", 24.0), (400, "swindale", 26.0), (400, "fern", 23.0))
+    for file, (width, scene, psnr) in zip(files, kinds, strict=True):
+        keep_result(file, scene, "tidefield", psnr)
+        keep_result(file, scene, "sparse-depth", psnr - 1)
+        write_json(file, {"settings": {"width": width}, **(read_json(file) or {})})
+    table.write_page([], [], [], [*files, tmp_path / "none.json"], tmp_path, out)
+    text = out.read_text()
+    narrow, wide = text.index("### 400 px\n"), text.index("### 800 px\n")
+    assert (
+        narrow < text.index("| swindale ² | **26.00** | 25.00 |") < text.index("| fern ² | **23.00** | 22.00 |") < wide
+    )
+    assert wide < text.index("| swindale ² | **24.00** | 23.00 |")
+    assert text.count("| fern ² |") == 4, "PSNR, SSIM, LPIPS and FLIP of one width"
+    assert "### 800 px: Time and memory" in text
 
 
 def test_the_page_names_what_each_machine_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,12 +150,12 @@ def test_the_page_names_what_each_machine_measured(tmp_path: Path, monkeypatch: 
     keep_result(file, "swindale", "tidefield", 24.0)
     keep_result(file, "swindale", "nerfacto", 21.0)
     out = tmp_path / "results.md"
-    table.write_page([file], [], [minute], tmp_path, out)
+    table.write_page([file], [], [minute], [], tmp_path, out)
     machine = next(line for line in out.read_text().splitlines() if line.startswith("- Machine: "))
     assert machine.endswith(f"torch {torch.__version__}.")
     move_to_another_machine(monkeypatch)
     keep_result(minute, "swindale", "tidefield", 23.5, minutes=1)
-    table.write_page([file], [], [minute], tmp_path, out)
+    table.write_page([file], [], [minute], [], tmp_path, out)
     machines = [line for line in out.read_text().splitlines() if line.startswith("- Machine: ")]
     assert machines == [
         machine.removesuffix(".") + ": tidefield, nerfacto.",
@@ -150,7 +168,7 @@ def test_a_shorter_comparison_may_count_steps(tmp_path: Path, monkeypatch: pytes
     keep_result(file, "swindale", "tidefield", 24.0)
     move_to_another_machine(monkeypatch)
     keep_result(steps, "swindale", "tidefield", 23.5, minutes=None, steps=2000)
-    table.write_page([file], [], [steps], tmp_path, tmp_path / "results.md")
+    table.write_page([file], [], [steps], [], tmp_path, tmp_path / "results.md")
     assert ": 2000 steps." in (tmp_path / "results.md").read_text()
 
 
@@ -209,7 +227,7 @@ def test_without_lpips_the_page_says_how_to_get_it(tmp_path: Path) -> None:
         del mean[name]
     mean["reasons"] = {}
     write_json(file, stored)
-    table.write_page([file], [file], [], tmp_path, out)
+    table.write_page([file], [file], [], [], tmp_path, out)
     assert table.NO_LPIPS in out.read_text()
     assert "LPIPS, VGG" not in out.read_text()
 
