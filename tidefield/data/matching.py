@@ -26,7 +26,7 @@ from tidefield.data.depth_prior import STRIDE, DepthPrior
 from tidefield.data.neighbours import BORDER, from_border
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
-from tidefield.data.surface import in_frame
+from tidefield.data.surface import CAMERAS_AT_ONCE, in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 from tidefield.parallel import in_parallel
 
@@ -149,10 +149,14 @@ class Matcher:
         """The photographs to compare, and their weights at pixels: of each pixel's `VIEWS` photographs from the most
         similar directions, as in unstructured lumigraph rendering (Buehler et al., 2001)."""
         indices = torch.tensor(self.scene.sources(camera), dtype=torch.long)
-        sources = self.scene.cameras[indices]
         shape = inverse_depth.shape
         rays = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
         points = camera.position_world[0] + rays / inverse_depth.reshape(-1, 1)
+        if len(indices) > CAMERAS_AT_ONCE:  # most photographs of a large survey see nothing of this
+            indices = indices[which_see(self.scene.cameras[indices], points)]
+        if not len(indices):
+            return inverse_depth.new_zeros(0, *shape), indices
+        sources = self.scene.cameras[indices]
         uv, z = sources.project(points)
         seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
         theirs = F.normalize(points - sources.position_world[:, None], dim=-1)
