@@ -9,7 +9,7 @@ import textured_wall as wall
 import torch
 from networks import SMALL
 
-from tidefield.data.areas import Area, cut, halves, select
+from tidefield.data.areas import PLACES, Area, _ground, cut, halves, select
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.matching import Matcher
@@ -76,12 +76,25 @@ def test_an_area_has_its_photographs_and_all_that_see_their_ground(scene: Scene,
             assert whole in scene.train, "what is held out stays so"
             assert torch.equal(area.scene.photographs[own], scene.photographs[whole])
             assert torch.equal(area.scene.cameras[own].T_world_camera, scene.cameras[whole].T_world_camera)
+            apart = (area.scene.cameras.position_world[list(area.targets)] - scene.cameras.position_world[whole]).abs()
+            assert bool(((apart[:, 0] < 6) & (apart[:, 1] < 4.5)).any()), "its frame, 5 x 3.75, meets that of a target"
         points = scene.points
         assert points is not None
         observed = torch.isin(points.camera_index, torch.tensor(targets))
         shared = torch.isin(points.point_index, points.point_index[observed])
         others = {scene.names[i] for i in points.camera_index[shared].tolist() if i in scene.train}
         assert others <= set(area.scene.names)
+
+
+def test_the_ground_of_each_photograph_is_looked_at_in_its_own_frame(scene: Scene):
+    cameras = scene.cameras[[3, 17, 40]]
+    points = _ground(cameras)
+    assert len(points) == 3 * 3 * len(PLACES) ** 2
+    uv, z = cameras.project(points)
+    inside = ((uv > 0) & (uv < torch.tensor([48, 36]))).all(-1).reshape(3, 3, 3, -1)  # camera, depth, photograph, place
+    assert inside[[0, 1, 2], :, [0, 1, 2]].all()
+    torch.testing.assert_close(z.amin(), torch.tensor(4.5))
+    torch.testing.assert_close(z.amax(), torch.tensor(5.5))
 
 
 def test_points_of_an_area_are_observed_where_they_were(scene: Scene, areas: list[Area]):
@@ -132,14 +145,14 @@ def test_which_cameras_see_points_is_found_in_parts(scene: Scene, monkeypatch: p
     points = torch.tensor([[-10.0, 0.0, wall.DEPTH], [-9.0, 4.0, wall.DEPTH]])
     whole = which_see(scene.cameras, points)
     assert 0 < whole.sum() < 20
-    monkeypatch.setattr("tidefield.data.surface.CAMERAS_AT_ONCE", 5)
+    monkeypatch.setattr("tidefield.data.surface.PROJECTED_AT_ONCE", 10)
     assert torch.equal(which_see(scene.cameras, points), whole)
 
 
 def test_a_surface_is_matched_with_the_same_photographs_in_parts(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     cells = DepthPriors(scene)[20].cells
     whole = Matcher(scene)(scene.cameras[20], cells)
-    monkeypatch.setattr("tidefield.data.matching.CAMERAS_AT_ONCE", 5)
+    monkeypatch.setattr("tidefield.data.matching.SELECT_ABOVE", 5)
     part = Matcher(scene)(scene.cameras[20], cells)
     assert torch.equal(part.cells, whole.cells)
     assert part.detail is not None

@@ -110,8 +110,8 @@ def _ground(cameras: Cameras) -> Float[Tensor, "K 3"]:
     """Points that some cameras see."""
     place = torch.tensor(PLACES)
     uv = torch.cartesian_prod(place, place)[None] * cameras.size_px[:, None]
-    near, far = (1 / cameras.near_far[:, None, None]).unbind(-1)
-    depth = 1 / torch.stack([near, (near + far) / 2, far])
+    near, far = (1 / cameras.near_far[:, None]).unbind(-1)
+    depth = 1 / torch.stack([near, (near + far) / 2, far])  # 3 T 1
     points = cameras.position_world[:, None] + cameras.directions_world(uv) * depth[..., None]
     return points.reshape(-1, 3)
 

@@ -89,7 +89,7 @@ def make_large_flight(
     if min(plan.strips, plan.each) < 1:
         raise SceneError(f"{plan.strips} strips of {plan.each} photographs: expected one or more of each")
     _refuse_other(plan, folder)
-    cameras, error, names, make = _planned(plan)
+    cameras, error, names, make = planned_flight(plan)
     true = cameras.position_world.double().numpy()
     files = [folder / PHOTOGRAPHS / name for name in names]
     frame = LocalFrame.at(WGS84, _ORIGIN, "mean sea level")
@@ -125,7 +125,7 @@ def write_large_scene(plan: LargeFlight, flight: Path, folder: Path) -> None:
         flight: folder of `make_large_flight`.
         folder: a new one.
     """
-    cameras, _, names, make = _planned(plan)
+    cameras, _, names, make = planned_flight(plan)
     surface, random = make().surface, np.random.default_rng([plan.seed, 20271])
     place = torch.from_numpy(random.uniform(0, 1, (len(cameras), _POINTS_EACH, 2))).float()
     direction = cameras.directions_world(place * cameras.size_px[:, None])
@@ -161,8 +161,8 @@ def write_large_scene(plan: LargeFlight, flight: Path, folder: Path) -> None:
         (partial_folder / "images").symlink_to((flight / PHOTOGRAPHS).resolve(), target_is_directory=True)
 
 
-def _planned(plan: LargeFlight) -> tuple[Cameras, Float64[np.ndarray, "V 3"], list[str], Callable[[], TidalFlat]]:
-    """Cameras of a flight, the errors of their stated positions, their names, and what makes the flat."""
+def planned_flight(plan: LargeFlight) -> tuple[Cameras, Float64[np.ndarray, "V 3"], list[str], Callable[[], TidalFlat]]:
+    """Plan a flight: cameras, errors of their stated positions, names, and what makes the flat, to be called once."""
     random = np.random.default_rng([plan.seed, 20270])
     settings = settings_for(plan.category, random)
     cameras = fly(plan.flight, plan.strips * plan.each, plan.width, random, plan.strips)

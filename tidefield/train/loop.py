@@ -48,7 +48,8 @@ PICTURE_SECONDS = 300.0
 FINAL_RATE = 0.02
 """Learning rate at the end, as a share of its peak; it falls along half a cosine."""
 STEPS_EACH = 200
-"""Steps in an area before the next one: a depth prior, which takes longer than a step, is then used several times."""
+"""Steps in an area before the next one: each depth prior, which takes as long as a step where photographs are large, is
+then used a dozen times."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
 
@@ -170,14 +171,21 @@ class SceneTrainer(Trainer):
 
     A large scene is learned area by area, `STEPS_EACH` steps in one, so that memory does not grow with the photographs.
 
-    `seed` is that of weights and batches; `weights` is a file to start from, None for random ones.
+    `seed` is that of weights and batches; `weights` is a file to start from, None for random ones; `areas` are those of
+    the scene, by `data.areas.cut` if not given.
     """
 
     network: Network
     _open: OpenArea | None
 
     def __init__(
-        self, config: Config, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
+        self,
+        config: Config,
+        scene: Scene,
+        seed: int,
+        device: torch.device,
+        weights: Path | None = None,
+        areas: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -185,7 +193,7 @@ class SceneTrainer(Trainer):
         if weights is not None:
             read_weights(weights, network)
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
-        self.config, self.areas = config, cut(scene)
+        self.config, self.areas = config, areas or cut(scene)
         self._seed, self._open = seed, None
         self.batch_loss: nn.Module = BatchLoss(network, config.train)
 
