@@ -175,6 +175,7 @@ def flight(
     side_overlap: float = 0.7,
     gps: float = 1.5,
     seed: int = 0,
+    scene: Path | None = None,
 ) -> None:
     """Make the photographs of a large flight over a built-in flat, as a drone writes them (minutes; continues).
 
@@ -192,16 +193,19 @@ def flight(
         side_overlap: Share of a strip that the next one shows again.
         gps: Standard deviation of the stated positions in each horizontal direction, in metres; twice that vertically.
         seed: Of everything random.
+        scene: Also write this folder: the scene that a perfect `tidefield prepare` would make, with the true poses.
     """
     tune_process()
     from tidefield.progress import ProgressBar, make_console
     from tidefield.synthetic import Flight
-    from tidefield.synthetic.large import LargeFlight, make_large_flight
+    from tidefield.synthetic.large import LargeFlight, make_large_flight, write_large_scene
 
     own = Flight(altitude_m=altitude, forward_overlap=forward_overlap, side_overlap=side_overlap)
     plan = LargeFlight(category, seed, strips, each, width, gps_m=gps, flight=own)
     with ProgressBar(make_console(quiet=False), "Photographing") as bar:
         make_large_flight(plan, out, bar)
+    if scene is not None:
+        write_large_scene(plan, out, scene)
 
 
 def large(
@@ -227,6 +231,32 @@ def large(
         name = " ".join([folder.resolve().name, *options])
         found = measure_flight(folder, work / name.replace(" ", "_"), runs, name, words, threads)
         print("\n".join([name, *lines(found)]), flush=True)
+
+
+def areas(
+    work: Path,
+    runs: Path = MEASURED,
+    counts: tuple[int, ...] = (500, 1000, 2000),
+    width: int = 160,
+    steps: int = 600,
+    compared_steps: int = 1600,
+) -> None:
+    """Training by areas: memory against the number of photographs, quality, and seams (an hour).
+
+    Args:
+        work: Folder for flights, scenes and runs; what is there is not made again.
+        runs: Store the figures in this folder's areas.json; what it holds is not measured again.
+        counts: Photographs of the flights, multiples of 50.
+        width: Of a photograph, in pixels.
+        steps: Of the trainings whose memory is measured.
+        compared_steps: Of the trainings at once and by areas that are compared.
+    """
+    tune_process()
+    from benchmarks.areas import measure_areas, tables
+
+    record = measure_areas(work, runs, counts, width, steps, compared_steps, partial(print, flush=True))
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
 
 
 def kills(runs: Path = MEASURED, train: int = 20, prepare: int = 10, compare: int = 10, seed: int = 0) -> None:
@@ -639,7 +669,7 @@ def main(words: Sequence[str] | None = None) -> None:
     mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
-    surveyed = (surveys, flight, large)
+    surveyed = (surveys, flight, large, areas)
     measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}

@@ -113,8 +113,9 @@ def measure_speed(
 def measure_training(trainer: SceneTrainer, effort: Effort) -> dict[str, Any]:
     """Steps of training, batches included."""
     device, rays = trainer.device, trainer.rays_per_step
-    for index in trainer.scene.train:
-        trainer.priors[index]  # made once in a training
+    own = trainer.open_area()
+    for index in own.area.targets:
+        own.priors[index]  # made once in a training
     trainer.step(BUDGET)
     times = _repeated(lambda: trainer.step(BUDGET), device, effort)
     with stage_clock(trainer.network, device, trainer.optimizer) as clock:

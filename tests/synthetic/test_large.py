@@ -6,11 +6,19 @@ import pytest
 import torch
 from PIL import Image
 
+from tidefield.data.load import load_scene
 from tidefield.errors import SceneError
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.survey.io.photographs import read_survey
 from tidefield.synthetic import Flight, make_survey
-from tidefield.synthetic.large import PHOTOGRAPHS, TRUTH_FILE, LargeFlight, make_large_flight, true_positions
+from tidefield.synthetic.large import (
+    PHOTOGRAPHS,
+    TRUTH_FILE,
+    LargeFlight,
+    make_large_flight,
+    true_positions,
+    write_large_scene,
+)
 
 PLAN = LargeFlight("vegetation", seed=3, strips=2, each=4, width=64, gps_m=2.0, flight=Flight(altitude_m=20.0))
 
@@ -87,3 +95,31 @@ def test_a_folder_of_another_flight_or_of_something_else_is_refused(flight, tmp_
     with pytest.raises(SceneError, match="one or more"):
         make_large_flight(replace(PLAN, strips=0), tmp_path / "new")
     assert json.loads((flight / TRUTH_FILE).read_text())["plan"]["seed"] == 3
+
+
+def test_the_scene_of_a_flight_has_its_true_poses_and_points_on_the_mud(flight, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_large_scene(PLAN, flight, tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", calibrate=False)
+    assert list(scene.names) == sorted(true_positions(flight))
+    frame = LocalFrame.at(WGS84, (8.3, 53.7, 0.0), "mean sea level")
+    true = frame.from_geographic(np.array([true_positions(flight)[name] for name in scene.names]))
+    own = scene.cameras.position_world.double().numpy() + scene.origin_world.numpy()
+    np.testing.assert_allclose(own, true, atol=1e-3)
+    points = scene.points
+    assert points is not None
+    assert len(points.xyz_world) > 200
+    uv, _ = scene.cameras.project(points.xyz_world)
+    off = (uv[points.camera_index.long(), points.point_index.long()] - points.uv_px).norm(dim=1)
+    assert 0.1 < off.median() < 0.6
+    height = points.xyz_world[:, 2] + scene.origin_world[2]
+    assert height.abs().median() < 1
+    # Two photographs show the same at the same point.
+    both = [set(points.point_index[points.camera_index == i].tolist()) for i in (2, 3)]
+    which = sorted(both[0] & both[1])
+    assert len(which) > 10
+    shown = []
+    for i in (2, 3):
+        column, row = uv[i, which].long().clamp(min=0).unbind(1)
+        shown.append(scene.photographs[i][row.clamp(max=47), column.clamp(max=63)].float())
+    assert (shown[0] - shown[1]).abs().mean() < 0.7 * (shown[0] - shown[1].flip(0)).abs().mean()

@@ -7,10 +7,15 @@ import math
 import os
 import re
 import signal
+import subprocess
+import sys
+import weakref
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import textured_wall as wall
 import torch
@@ -18,7 +23,7 @@ from networks import SMALL, SMALL_PAPER
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import save_file
-from scenes_on_disk import PINHOLE, survey, write_colmap
+from scenes_on_disk import PINHOLE, Truth, survey, write_colmap
 
 from tidefield.commands import train as train_command
 from tidefield.commands.train import Train
@@ -33,8 +38,10 @@ from tidefield.config import (
     config_from_json,
     config_to_json,
 )
+from tidefield.data.areas import cut
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
+from tidefield.geometry.lenses import Lens
 from tidefield.model.network import make_network
 from tidefield.train import checkpoint
 from tidefield.train.checkpoint import (
@@ -77,6 +84,137 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: S
         assert torch.equal(value, weights(second)[name]), name
     assert second.progress.step == 6
     assert second.progress.losses == unbroken.progress.losses
+
+
+def in_areas(monkeypatch: pytest.MonkeyPatch, each: int = 2) -> None:
+    """Have scenes of more than six photographs trained in areas of at most four, a few steps in each."""
+    monkeypatch.setattr("tidefield.train.loop.cut", partial(cut, whole=6, most=4))
+    monkeypatch.setattr("tidefield.train.loop.STEPS_EACH", each)
+
+
+def test_a_large_scene_is_learned_area_by_area_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_areas(monkeypatch)
+    trainer = SceneTrainer(SMALL, wall.scene(wall.cameras(14, step=1.2)), seed=3, device=CPU)
+    assert len(trainer.areas) == 4
+    visits, first = [], weights(trainer)
+    for _ in range(2):
+        opened, names = [], set[str]()
+        for _ in range(4 * 2):
+            own = trainer.open_area()
+            opened.append(own.number)
+            names |= {own.area.scene.names[i] for i in own.area.targets}
+            trainer.step(Budget(steps=16))
+        assert opened[::2] == opened[1::2], "two steps in each"
+        assert sorted(opened[::2]) == [0, 1, 2, 3]
+        assert names == {trainer.scene.names[i] for i in trainer.scene.train}
+        visits.append(opened)
+    assert visits[0] != visits[1], "another order"
+    assert any(not torch.equal(value, weights(trainer)[name]) for name, value in first.items())
+
+
+def test_a_training_by_areas_is_resumed_bit_for_bit_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_areas(monkeypatch)
+    scene, budget = wall.scene(wall.cameras(14, step=1.2)), Budget(steps=12)
+    unbroken, first, second = (SceneTrainer(SMALL, scene, seed=3, device=CPU) for _ in range(3))
+    for _ in range(12):
+        unbroken.step(budget)
+    for _ in range(5):
+        first.step(budget)
+    first.save(tmp_path)
+    second.resume(tmp_path)
+    for _ in range(7):
+        second.step(budget)
+    for name, value in weights(unbroken).items():
+        assert torch.equal(value, weights(second)[name]), name
+
+
+def test_what_an_area_needed_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_areas(monkeypatch, each=1)
+    trainer = SceneTrainer(SMALL, wall.scene(wall.cameras(14, step=1.2)), seed=3, device=CPU)
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
+    for _ in range(8):
+        own = trainer.open_area()
+        own.priors[own.area.targets[0]]
+        alive.update([own.priors, own.priors[own.area.targets[0]], own.area.scene, own.cameras, own.priors.match])
+        del own
+        trainer.step(Budget(steps=8))
+        assert len(alive) <= 5, "one area's at a time"
+
+
+HELD = """
+import re, sys
+import torch
+from pathlib import Path
+from functools import partial
+from networks import SMALL
+from tidefield.data.areas import cut
+from tidefield.data.depth_prior import DepthPrior
+from tidefield.data.load import load_scene
+from tidefield.train import loop
+
+torch.set_num_threads(1)
+whole = int(sys.argv[2])
+loop.cut, loop.STEPS_EACH = partial(cut, whole=whole, most=16), 1
+
+
+class Match:  # quick, and as large as the real one
+    def __init__(self, scene):
+        pass
+
+    def __call__(self, camera, cells):
+        return DepthPrior(cells, torch.zeros(camera.height, camera.width) + 1e-9)
+
+
+loop.Matcher = Match
+scene = load_scene(Path(sys.argv[1]), calibrate=False)
+trainer = loop.SceneTrainer(SMALL, scene, 0, torch.device("cpu"))
+for _ in range(len(trainer.areas)):
+    own = trainer.open_area()
+    for target in own.area.targets:
+        own.priors[target]
+        own.area.scene.photographs[target].sum()
+    trainer.step(loop.Budget(steps=100))
+# Not that of `getrusage`, which begins with the memory of the process that started this one.
+print(len(trainer.areas), 1024 * int(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]))
+"""
+
+
+def peak_bytes(folder: Path, count: int, whole: int) -> tuple[int, int]:
+    """Areas of a training on a flight of so many photographs, and the memory of its process."""
+    scene = folder / f"{count}"
+    if not scene.exists():
+        write_colmap(scene, flight(count))
+    code = [sys.executable, "-c", HELD, str(scene), str(whole)]
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}", "OMP_NUM_THREADS": "1"}
+    environment["XDG_CACHE_HOME"] = str(folder / "cache")
+    areas, peak = subprocess.run(code, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout.split()
+    return int(areas), int(peak)
+
+
+def flight(count: int) -> Truth:
+    """A flight of strips of 16 photographs over flat ground."""
+    lens, random = Lens(400, 300, 320.0, 320.0, 200.0, 150.0), np.random.default_rng(5)
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    place = np.array([(3.5 * (i // 16), 2.5 * (i % 16), 10.0) for i in range(count)])
+    poses = np.stack([np.column_stack([down, p + random.normal(0, 0.1, 3)]) for p in place])
+    ground = np.column_stack([random.uniform(-4, place.max(0)[:2] + 4, (12 * count, 2)), np.zeros(12 * count)])
+    picture = random.integers(0, 255, (300, 400, 3), dtype=np.uint8)
+    names = tuple(f"{i:04d}.jpg" for i in range(count))
+    return Truth(names, (lens,) * count, poses, ground, (picture,) * count)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="measured on Linux only")
+def test_memory_of_training_does_not_grow_with_the_photographs(tmp_path: Path) -> None:
+    """A photograph of 400 x 300 pixels has 0.36 MB, and its depth prior 0.57 MB."""
+    few, many = (peak_bytes(tmp_path, count, whole=20) for count in (192, 320))
+    assert (few[0], many[0]) == (16, 32)
+    each = (many[1] - few[1]) / (320 - 192)
+    assert each < 0.2e6, f"{each / 1e6:.2f} MB more for each photograph"
+    together = peak_bytes(tmp_path, 320, whole=1000)
+    assert together[0] == 1
+    assert (together[1] - few[1]) / (320 - 192) > 0.6e6, "this test would notice"
 
 
 def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

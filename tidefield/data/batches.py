@@ -5,6 +5,7 @@ Alphabet: T tiles of S x S pixels, R = S^2 rays, N neighbours, K crops or photog
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -111,18 +112,27 @@ def _sparse_depth(
     return inverse / total.clamp(min=1e-12), total.clamp(max=1)
 
 
-def draw_batch(scene: Scene, priors: DepthPriors, config: TrainConfig, views: int, generator: torch.Generator) -> Batch:
+def draw_batch(
+    scene: Scene,
+    priors: DepthPriors,
+    config: TrainConfig,
+    views: int,
+    generator: torch.Generator,
+    of: Sequence[int] | None = None,
+) -> Batch:
     """Draw random tiles of random training photographs.
 
     Args:
         priors: of the scene.
         views: neighbouring views at each corner of a tile; 0 encodes nothing.
+        of: training photographs to draw from; all of them if not given.
     """
     side = config.tile_px
     train = torch.tensor(scene.train)
+    drawn_from = train if of is None else torch.tensor(of)
     per_photograph = config.tiles if config.crop_px is None else 1
-    picks = torch.randint(len(train), (config.tiles // per_photograph,), generator=generator)
-    targets = train[picks].repeat_interleave(per_photograph)
+    picks = torch.randint(len(drawn_from), (config.tiles // per_photograph,), generator=generator)
+    targets = drawn_from[picks].repeat_interleave(per_photograph)
     free = (scene.cameras.size_px[targets] - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * free).floor()
     tiles = []

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import errno
 import logging
+import mmap
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -54,6 +56,7 @@ class Photographs:
             photographs without a mask. Empty if no photograph has one.
         files: where they were read; empty where they come from no files. Without them photographs have no other size.
         background_rgb: colour on which photographs with alpha are composited, in [0, 1].
+        mapped: the file of the cache that the pixels are read from when they are used; None where they are in memory.
     """
 
     colours: tuple[UInt8[Tensor, "_ _ 3"], ...]
@@ -61,6 +64,7 @@ class Photographs:
     masks: tuple[Bool[Tensor, "_ _"] | None, ...] = ()
     files: tuple[PhotographFile, ...] = ()
     background_rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mapped: mmap.mmap | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         assert len(self.alphas) in (0, len(self.colours)), "one alpha (or None) per photograph"
@@ -71,6 +75,14 @@ class Photographs:
 
     def __getitem__(self, index: int) -> UInt8[Tensor, "H W 3"]:
         return self.colours[index]
+
+    def release(self) -> None:
+        """Give back the memory of pixels that were read from the cache's file; they are read again when they are used.
+
+        What was changed in them is lost.
+        """
+        if self.mapped is not None and sys.platform != "win32":  # which knows no such advice
+            self.mapped.madvise(mmap.MADV_DONTNEED)
 
     def finest_width(self, index: int) -> int:
         """Return the width of a photograph's file, or of the photograph where it comes from none."""
@@ -239,7 +251,8 @@ def _views(
         masks.append(single.pop().view(torch.bool) if file.mask is not None else None)
         start += file.bytes
     masks = masks if any(mask is not None for mask in masks) else ()
-    return Photographs(tuple(colours), tuple(alphas), tuple(masks), tuple(files), background_rgb)
+    mapped = store.base if isinstance(store.base, mmap.mmap) else None
+    return Photographs(tuple(colours), tuple(alphas), tuple(masks), tuple(files), background_rgb, mapped)
 
 
 def _decoded(

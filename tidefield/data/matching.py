@@ -26,7 +26,7 @@ from tidefield.data.depth_prior import STRIDE, DepthPrior
 from tidefield.data.neighbours import BORDER, from_border
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
-from tidefield.data.surface import in_frame
+from tidefield.data.surface import in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 from tidefield.parallel import in_parallel
 
@@ -62,6 +62,8 @@ FRAME_PX, OVERLAP_PX = 768, 96
 """Side of the parts of a camera that are matched at once, and how far they overlap."""
 MARGIN_PX = 2.0
 """Pixels at the borders of photographs that are not compared: other depths would be read outside of them."""
+SELECT_ABOVE = 256
+"""With more photographs than this, those that see the camera's surface are found first."""
 KEPT_BYTES = 300_000_000
 """Memory for photographs without their means and contrasts; those that were not read for the longest time go first."""
 
@@ -149,10 +151,14 @@ class Matcher:
         """The photographs to compare, and their weights at pixels: of each pixel's `VIEWS` photographs from the most
         similar directions, as in unstructured lumigraph rendering (Buehler et al., 2001)."""
         indices = torch.tensor(self.scene.sources(camera), dtype=torch.long)
-        sources = self.scene.cameras[indices]
         shape = inverse_depth.shape
         rays = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
         points = camera.position_world[0] + rays / inverse_depth.reshape(-1, 1)
+        if len(indices) > SELECT_ABOVE:  # most photographs of a large survey see nothing of this
+            indices = indices[which_see(self.scene.cameras[indices], points)]
+        if not len(indices):
+            return inverse_depth.new_zeros(0, *shape), indices
+        sources = self.scene.cameras[indices]
         uv, z = sources.project(points)
         seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
         theirs = F.normalize(points - sources.position_world[:, None], dim=-1)

@@ -23,6 +23,7 @@ FRAME_MARGIN = 0.3  # points up to this share of the image size outside the imag
 NEIGHBOURS = 16  # nearest points in the image that a point is compared with
 OUTLIER_SPREADS = 12.0  # a point farther from its neighbours' median than this many spreads is occluded or mismatched
 WIDEST_ANGLE_DEG = 60.0  # a point observed only from directions farther off may be occluded
+PROJECTED_AT_ONCE = 500_000  # points times cameras
 
 _Pixels = Float64[np.ndarray, "P 2"]
 _Values = Float64[np.ndarray, " P"]
@@ -96,6 +97,12 @@ def in_frame(
         if mask is not None:
             inside[k] &= is_used(mask, uv_px[k])
     return inside
+
+
+def which_see(cameras: Cameras, points_world: Float[Tensor, "P 3"]) -> Bool[Tensor, " V"]:
+    """Decide which cameras have any of some points in their frames; memory does not grow with their number."""
+    parts = [cameras[some] for some in torch.arange(len(cameras)).split(max(1, PROJECTED_AT_ONCE // len(points_world)))]
+    return torch.cat([in_frame(part, *part.project(points_world)).any(1) for part in parts])
 
 
 def _mean_depth(camera: Cameras) -> Float[Tensor, "H W"]:

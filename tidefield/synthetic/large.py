@@ -17,13 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import torch
 from jaxtyping import Float64
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from scipy.spatial import KDTree
 
 from tidefield.errors import SceneError
-from tidefield.files import completed_file, delete_partials, read_json, write_json
+from tidefield.files import completed_file, completed_folder, delete_partials, read_json, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.parallel import in_parallel
@@ -43,6 +45,8 @@ _SECONDS = 3.0
 """Between two photographs."""
 _START = datetime(2026, 5, 1, 6, 0, tzinfo=UTC)
 _FULL_FRAME_DIAGONAL_MM = 43.2666
+_POINTS_EACH, _NOISE_PX = 40, 0.3
+"""Of `write_large_scene`: points per photograph, and the standard deviation of an observation per axis."""
 
 
 @dataclass(frozen=True)
@@ -85,13 +89,8 @@ def make_large_flight(
     if min(plan.strips, plan.each) < 1:
         raise SceneError(f"{plan.strips} strips of {plan.each} photographs: expected one or more of each")
     _refuse_other(plan, folder)
-    random = np.random.default_rng([plan.seed, 20270])
-    settings = settings_for(plan.category, random)
-    cameras = fly(plan.flight, plan.strips * plan.each, plan.width, random, plan.strips)
+    cameras, error, names, make = planned_flight(plan)
     true = cameras.position_world.double().numpy()
-    error = random.normal(0, plan.gps_m, true.shape) * [1, 1, 2]
-    digits = max(4, len(str(len(cameras))))
-    names = [f"{plan.category}_{i + 1:0{digits}d}.jpg" for i in range(len(cameras))]
     files = [folder / PHOTOGRAPHS / name for name in names]
     frame = LocalFrame.at(WGS84, _ORIGIN, "mean sea level")
     stated, exact = frame.to_geographic(true + error), frame.to_geographic(true)
@@ -103,10 +102,7 @@ def make_large_flight(
     if not missing:
         return
     delete_partials(*(files[i] for i in missing))
-    extent = _extent(cameras, plan.flight)
-    elevation, azimuth = float(random.uniform(42, 60)), float(random.uniform(0, 360))
-    [flat] = in_parallel([partial(make_flat, settings, extent, elevation, azimuth, random)], "cpu")
-
+    flat = make()
     for first in range(0, len(missing), _PIECE):
         piece = missing[first : first + _PIECE]
         below = ground_extent(cameras[piece], plan.flight)
@@ -117,6 +113,70 @@ def make_large_flight(
         ]
         in_parallel(tasks, "cpu")
         progress(len(files) - len(missing) + first + len(piece), len(files))
+
+
+def write_large_scene(plan: LargeFlight, flight: Path, folder: Path) -> None:
+    """Write the scene that a perfect `prepare` would make of a flight: links to its photographs, true poses, points.
+
+    The points lie on mud and water, and are seen wherever they are in a frame.
+
+    Args:
+        plan: of the flight.
+        flight: folder of `make_large_flight`.
+        folder: a new one.
+    """
+    cameras, _, names, make = planned_flight(plan)
+    surface, random = make().surface, np.random.default_rng([plan.seed, 20271])
+    place = torch.from_numpy(random.uniform(0, 1, (len(cameras), _POINTS_EACH, 2))).float()
+    direction = cameras.directions_world(place * cameras.size_px[:, None])
+    points = cameras.position_world[:, None] - direction * (cameras.position_world[:, None, 2:] / direction[..., 2:])
+    for _ in range(3):  # the mud is flat: the height where a ray meets it hardly depends on where exactly
+        height = surface.sample(points.reshape(-1, 3)[:, :2].T)[0].reshape(points.shape[:2])
+        away = (height - cameras.position_world[:, None, 2]) / direction[..., 2]
+        points = cameras.position_world[:, None] + direction * away[..., None]
+    points = points.reshape(-1, 3)
+    model = pycolmap.Reconstruction()
+    lens = [*cameras.focal_px[0].tolist(), *cameras.principal_px[0].tolist()]
+    camera = pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=lens, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    tracks = [pycolmap.Track() for _ in range(len(points))]
+    tree, reach = KDTree(points[:, :2].numpy()), plan.flight.altitude_m / plan.flight.focal_ratio
+    for i, name in enumerate(names):
+        near = np.array(tree.query_ball_point(cameras.position_world[i, :2].numpy(), reach), dtype=np.int64)
+        uv = cameras[i].project(points[near])[0][0].double().numpy() + random.normal(0, _NOISE_PX, (len(near), 2))
+        inside = ((uv > 0) & (uv < (cameras.width, cameras.height))).all(1)
+        pose = cameras.T_world_camera[i].double().numpy()
+        rotation = pose[:, :3].T
+        image = pycolmap.Image(name=name, keypoints=uv[inside], camera_id=1, image_id=i + 1)
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        model.add_image_with_trivial_frame(image, rigid)
+        for slot, point in enumerate(near[inside].tolist()):
+            tracks[point].add_element(i + 1, slot)
+    for xyz, track in zip(points.double().numpy(), tracks, strict=True):
+        if track.length() >= 2:
+            model.point3D(model.add_point3D(xyz, track)).error = _NOISE_PX
+    with completed_folder(folder) as partial_folder:
+        (partial_folder / "sparse" / "0").mkdir(parents=True)
+        model.write_binary(str(partial_folder / "sparse" / "0"))
+        (partial_folder / "images").symlink_to((flight / PHOTOGRAPHS).resolve(), target_is_directory=True)
+
+
+def planned_flight(plan: LargeFlight) -> tuple[Cameras, Float64[np.ndarray, "V 3"], list[str], Callable[[], TidalFlat]]:
+    """Plan a flight: cameras, errors of their stated positions, names, and what makes the flat, to be called once."""
+    random = np.random.default_rng([plan.seed, 20270])
+    settings = settings_for(plan.category, random)
+    cameras = fly(plan.flight, plan.strips * plan.each, plan.width, random, plan.strips)
+    error = random.normal(0, plan.gps_m, cameras.position_world.shape) * [1, 1, 2]
+    digits = max(4, len(str(len(cameras))))
+    names = [f"{plan.category}_{i + 1:0{digits}d}.jpg" for i in range(len(cameras))]
+
+    def make() -> TidalFlat:
+        elevation, azimuth = float(random.uniform(42, 60)), float(random.uniform(0, 360))
+        task = partial(make_flat, settings, _extent(cameras, plan.flight), elevation, azimuth, random)
+        [flat] = in_parallel([task], "cpu")
+        return flat
+
+    return cameras, error, names, make
 
 
 def _refuse_other(plan: LargeFlight, folder: Path) -> None:

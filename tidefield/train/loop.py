@@ -9,6 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,6 +20,7 @@ from tensorboardX import SummaryWriter
 from torch import nn
 
 from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
+from tidefield.data.areas import Area, cut, select
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.matching import Matcher
 from tidefield.data.scene import Scene
@@ -45,6 +47,9 @@ SAVE_SECONDS = 60.0
 PICTURE_SECONDS = 300.0
 FINAL_RATE = 0.02
 """Learning rate at the end, as a share of its peak; it falls along half a cosine."""
+STEPS_EACH = 200
+"""Steps in an area before the next one: each depth prior, which takes as long as a step where photographs are large, is
+then used a dozen times."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
 
@@ -144,16 +149,43 @@ class Trainer(ABC):
         return value
 
 
+@dataclass(frozen=True)
+class OpenArea:
+    """An area of a scene that is being learned from.
+
+    Attributes:
+        number: among the scene's areas.
+        area: its part of the scene.
+        priors: depth priors of the part.
+        cameras: of the part, on the network's device.
+    """
+
+    number: int
+    area: Area
+    priors: DepthPriors
+    cameras: Cameras
+
+
 class SceneTrainer(Trainer):
     """Trains a network over neighbouring views on tiles of one scene's photographs.
 
-    `seed` is that of weights and batches; `weights` is a file to start from, None for random ones.
+    A large scene is learned area by area, `STEPS_EACH` steps in one, so that memory does not grow with the photographs.
+
+    `seed` is that of weights and batches; `weights` is a file to start from, None for random ones; `areas` are those of
+    the scene, by `data.areas.cut` if not given.
     """
 
     network: Network
+    _open: OpenArea | None
 
     def __init__(
-        self, config: Config, scene: Scene, seed: int, device: torch.device, weights: Path | None = None
+        self,
+        config: Config,
+        scene: Scene,
+        seed: int,
+        device: torch.device,
+        weights: Path | None = None,
+        areas: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -161,8 +193,8 @@ class SceneTrainer(Trainer):
         if weights is not None:
             read_weights(weights, network)
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
-        self.config = config
-        self.priors = DepthPriors(scene, match=Matcher(scene) if network.matches_surface else None)
+        self.config, self.areas = config, areas or cut(scene)
+        self._seed, self._open = seed, None
         self.batch_loss: nn.Module = BatchLoss(network, config.train)
 
     @property
@@ -175,9 +207,25 @@ class SceneTrainer(Trainer):
         return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.batch_loss(
-            self.scene, self.priors, self.cameras, self.config.network.views, self.generator, self.precision
-        )
+        own, views = self.open_area(), self.config.network.views
+        scene, targets = own.area.scene, own.area.targets
+        return self.batch_loss(scene, own.priors, own.cameras, views, self.generator, self.precision, targets)
+
+    def open_area(self) -> OpenArea:
+        """Open the area that the next step learns from; what the one before needed is given back."""
+        turn, place = divmod(self.progress.step // STEPS_EACH, len(self.areas))
+        order = torch.randperm(len(self.areas), generator=torch.Generator().manual_seed(self._seed + turn))
+        number = int(order[place])
+        if self._open is None or self._open.number != number:
+            if self._open is not None:
+                self._open = None
+                self.scene.photographs.release()
+            whole, targets = len(self.areas) == 1, self.areas[number]
+            area = Area(self.scene, targets) if whole else select(self.scene, targets)
+            match = Matcher(area.scene) if self.network.matches_surface else None
+            cameras = area.scene.cameras.to(self.device)
+            self._open = OpenArea(number, area, DepthPriors(area.scene, match=match), cameras)
+        return self._open
 
     def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
         return Renderer(self.network, self.scene, self.config, self.device, sampling)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -50,6 +51,7 @@ class BatchLoss(nn.Module):
         views: int,
         generator: torch.Generator,
         precision: torch.dtype | None = None,
+        of: Sequence[int] | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """The loss of a random batch, and the mean squared error of its colours.
 
@@ -60,9 +62,10 @@ class BatchLoss(nn.Module):
             views: neighbours of each tile.
             generator: of everything random.
             precision: of the encoder's convolutions; that of `choose_precision` if None.
+            of: training photographs to draw from; all of them if not given.
         """
         network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
-        batch = draw_batch(scene, priors, config, views, generator).to(device)
+        batch = draw_batch(scene, priors, config, views, generator, of).to(device)
         own = torch.stack([priors[i].cells for i in batch.targets.tolist()]).to(device)
         opaque = scene.background_rgb is None
         parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]

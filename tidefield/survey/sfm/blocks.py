@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
 
+from tidefield.data.areas import halves
 from tidefield.errors import RunError, SceneError
 from tidefield.files import write_json
 from tidefield.machine import cores
@@ -98,7 +98,7 @@ def cut(
     degrees = np.array([(p.position.longitude_deg, p.position.latitude_deg) for p in located if p.position])
     degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180  # all on one side of the date line
     xy = degrees * [np.cos(np.radians(np.median(degrees[:, 1]))), 1.0]
-    area = {located[i].name: k for k, members in enumerate(_halves(xy, most)) for i in members}
+    area = {located[i].name: k for k, members in enumerate(halves(xy, most)) for i in members}
     best: dict[str, list[tuple[int, str]]] = {name: [] for name in names}
     for (first, second), count in pairs.items():
         best[first].append((-count, second))
@@ -114,19 +114,6 @@ def cut(
         Block(tuple(name for name in names if area[name] == number), tuple(sorted(of)))
         for number, of in sorted(shared.items())
     ]
-
-
-def _halves(xy: Float64[np.ndarray, "N 2"], most: int) -> list[list[int]]:
-    """Halve a set of points across its longer side until no part has more than `most`."""
-
-    def parts(members: np.ndarray) -> list[list[int]]:
-        if len(members) <= most:
-            return [members.tolist()]
-        along = xy[members, int(np.argmax(np.ptp(xy[members], axis=0)))]
-        order = members[np.argsort(along, kind="stable")]
-        return [*parts(order[: len(order) // 2]), *parts(order[len(order) // 2 :])]
-
-    return parts(np.arange(len(xy)))
 
 
 def reconstruct_blocks(
