@@ -20,15 +20,19 @@ import torch
 
 from tidefield.compare.run import Runner, run_measured, tidefield
 from tidefield.compare.tables import Table
+from tidefield.config import PRESETS, Budget, warm_start
 from tidefield.data.areas import cut
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.evaluation.metrics import psnr_from_mse
 from tidefield.files import read_json, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.machine import describe
 from tidefield.model.rendering import Render
 from tidefield.synthetic.flat import TidalFlat
 from tidefield.synthetic.large import LargeFlight, make_large_flight, planned_flight, write_large_scene
+from tidefield.train.checkpoint import given_or_shipped
+from tidefield.train.loop import SceneTrainer
 
 AREAS_FILE = "areas.json"
 EACH = 50
@@ -108,11 +112,6 @@ def compare(folder: Path, plan: LargeFlight, by_areas: bool, steps: int) -> dict
         by_areas: train by the areas of `data.areas.cut`; otherwise on all photographs at once.
         steps: of the training.
     """
-    from tidefield.config import PRESETS, Budget, warm_start
-    from tidefield.evaluation.metrics import psnr_from_mse
-    from tidefield.train.checkpoint import given_or_shipped
-    from tidefield.train.loop import SceneTrainer
-
     scene = load_scene(folder)
     areas, budget = cut(scene), Budget(steps=steps)
     config, weights = warm_start(PRESETS["swift"]), given_or_shipped(None, "swift")
@@ -177,11 +176,9 @@ def border_cameras(scene: Scene, areas: Sequence[tuple[int, ...]], count: int) -
             pairs.append((float(distance.min()), first, others[int(distance.argmin())]))
     # Those that lie closest to each other are neighbours across a border; spread over all borders.
     nearest = sorted(pairs)[: max(count, len(pairs) // 2)]
-    chosen = sorted(nearest, key=lambda pair: (of[pair[1]], of[pair[2]], pair))[:: max(1, len(nearest) // count)][
-        :count
-    ]
+    by_border = sorted(nearest, key=lambda pair: (of[pair[1]], of[pair[2]], pair))
     cameras = []
-    for _, first, second in chosen:
+    for _, first, second in by_border[:: max(1, len(nearest) // count)][:count]:
         across = position[second] - position[first]
         turn = math.atan2(across[1], across[0])
         right, down = [math.cos(turn), math.sin(turn), 0.0], [math.sin(turn), -math.cos(turn), 0.0]

@@ -155,8 +155,7 @@ def _quality(compared: Results) -> list[str]:
     """Tables of quality with the sentences that one must know to read them."""
     if not compared.by:
         return []
-    methods = tuple(method for method in compared.methods if any(m == method for _, m in compared.by))
-    results = Results(compared.scenes, methods, compared.by)
+    results = _without_empty_columns(compared)
     marks = marks_of(results, learned_from())
     tables = quality_tables(results, {suffix: REGIONS[suffix] for suffix in SHOWN_REGIONS})
     papers = paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic")
@@ -172,6 +171,12 @@ def _quality(compared: Results) -> list[str]:
         *(lpips_weights(results) if measured else [NO_LPIPS]),
         *missing_metrics(results),
     ]
+
+
+def _without_empty_columns(results: Results) -> Results:
+    """The same results, with those methods that have any."""
+    there = {method for _, method in results.by}
+    return Results(results.scenes, tuple(method for method in results.methods if method in there), results.by)
 
 
 def marks_of(results: Results, learned: Collection[str]) -> tuple[Mark, ...]:
@@ -194,7 +199,9 @@ def by_width(files: Sequence[Path]) -> dict[int, Results]:
     for file in files:
         if (record := read_json(file)) is not None:
             groups.setdefault(int(record["settings"]["width"]), []).append(file)
-    return {width: read_figures(group, SCENES, names()) for width, group in sorted(groups.items())}
+    return {
+        width: _without_empty_columns(read_figures(group, SCENES, names())) for width, group in sorted(groups.items())
+    }
 
 
 def _widths(sized: Mapping[int, Results]) -> list[str]:
@@ -206,14 +213,12 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         "reading of photographs: the floor."
     ]
     for width, results in sized.items():
-        there = tuple(method for method in results.methods if any(m == method for _, m in results.by))
-        shown_results = Results(results.scenes, there, results.by)
-        marks = marks_of(shown_results, learned_from())
-        tables = quality_tables(shown_results, {suffix: REGIONS[suffix]})
-        costs = cost_table(shown_results)
+        marks = marks_of(results, learned_from())
+        tables = quality_tables(results, {suffix: REGIONS[suffix]})
+        costs = cost_table(results)
         parts += [
             f"### {width} px",
-            *notes(shown_results, marks),
+            *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),
             replace(costs, title=f"{width} px: {costs.title}").markdown(),
         ]

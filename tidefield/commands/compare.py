@@ -22,7 +22,6 @@ from tidefield.processes import worker_processes
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tidefield.cluster import Share
     from tidefield.compare.results import Results
     from tidefield.compare.run import Settings, Usage
 
@@ -72,7 +71,7 @@ class Compare:
 
 def compare(options: Compare, console: Console) -> None:
     """Run `tidefield compare`."""
-    from tidefield.cluster import connected, share_of
+    from tidefield.cluster import connected, done_on_cluster, share_of
     from tidefield.compare.tables import write_comparison
 
     if not options.methods:
@@ -86,7 +85,7 @@ def compare(options: Compare, console: Console) -> None:
             share = share_of(ray, options.device, "machine")
             auto = "cuda:0" if share.gpus else "cpu"
             settings = replace(settings, device=auto if options.device == "auto" else options.device)
-            elsewhere = partial(_on_cluster, ray, share)
+            elsewhere = partial(done_on_cluster, ray, "compare", share=share)
         environment = _require_software(options, settings.device)
         scenes = _scenes(options)
         results = run_all(scenes, options.methods, settings, options.out, console, environment, elsewhere)
@@ -171,14 +170,6 @@ def run_all(
         for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
             print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
     return read_results(out, list(scenes), methods)
-
-
-def _on_cluster(ray: Any, share: Share, prepare: Callable[[], Any], names: list[str]) -> Iterator[str]:
-    """Work on scenes on a cluster; yields the name of each that is done."""
-    from tidefield.cluster import on_cluster
-
-    for name, _ in on_cluster(ray, "compare", prepare, names, share):
-        yield name
 
 
 def print_lines(console: Console, lines: Iterable[object]) -> None:

@@ -59,7 +59,7 @@ class Map:
 
 def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
-    from tidefield.cluster import absolute, connected, on_cluster, share_of
+    from tidefield.cluster import absolute, connected, done_on_cluster, share_of
     from tidefield.files import only_writer
     from tidefield.maps.make import delete_tiles, make_map
     from tidefield.maps.rasters import need
@@ -84,7 +84,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             ray = stack.enter_context(connected(options.cluster))
             opened = partial(_tile_maker, absolute(options), job.key)
             share = share_of(ray, options.device, "core")
-            elsewhere = lambda numbers: (n for n, _ in on_cluster(ray, job.key, opened, numbers, share))  # noqa: E731
+            elsewhere = partial(done_on_cluster, ray, job.key, opened, share=share)
         result = make_map(
             job, options.out, options.overwrite, about, lambda name: ProgressBar(console, name), elsewhere
         )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -163,5 +161,6 @@ def _frame_maker(options: Render, cameras: Cameras, key: str) -> Iterator[Callab
 
 def _key(scene: Scene, record: dict[str, Any]) -> str:
     """Identifies what frames are rendered from."""
-    about = [list(scene.names), scene.cameras.T_world_camera.tolist(), scene.cameras.size_px.tolist(), record]
-    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+    from tidefield.data.cache import key
+
+    return key([list(scene.names), scene.cameras.T_world_camera.tolist(), scene.cameras.size_px.tolist(), record])

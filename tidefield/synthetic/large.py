@@ -33,6 +33,7 @@ from tidefield.synthetic.flat import TidalFlat, make_flat
 from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.settings import settings_for
 from tidefield.synthetic.survey import LARGEST_CELL_M, Flight, fly, ground_extent
+from tidefield.synthetic.write import add_photograph, model_of_lens
 
 TRUTH_FILE, PHOTOGRAPHS = "truth.json", "photographs"
 _MOST_NODES = 4_000_000
@@ -135,21 +136,14 @@ def write_large_scene(plan: LargeFlight, flight: Path, folder: Path) -> None:
         away = (height - cameras.position_world[:, None, 2]) / direction[..., 2]
         points = cameras.position_world[:, None] + direction * away[..., None]
     points = points.reshape(-1, 3)
-    model = pycolmap.Reconstruction()
-    lens = [*cameras.focal_px[0].tolist(), *cameras.principal_px[0].tolist()]
-    camera = pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=lens, camera_id=1)
-    model.add_camera_with_trivial_rig(camera)
+    model = model_of_lens(cameras)
     tracks = [pycolmap.Track() for _ in range(len(points))]
     tree, reach = KDTree(points[:, :2].numpy()), plan.flight.altitude_m / plan.flight.focal_ratio
     for i, name in enumerate(names):
         near = np.array(tree.query_ball_point(cameras.position_world[i, :2].numpy(), reach), dtype=np.int64)
         uv = cameras[i].project(points[near])[0][0].double().numpy() + random.normal(0, _NOISE_PX, (len(near), 2))
         inside = ((uv > 0) & (uv < (cameras.width, cameras.height))).all(1)
-        pose = cameras.T_world_camera[i].double().numpy()
-        rotation = pose[:, :3].T
-        image = pycolmap.Image(name=name, keypoints=uv[inside], camera_id=1, image_id=i + 1)
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
-        model.add_image_with_trivial_frame(image, rigid)
+        add_photograph(model, cameras, i, name, uv[inside])
         for slot, point in enumerate(near[inside].tolist()):
             tracks[point].add_element(i + 1, slot)
     for xyz, track in zip(points.double().numpy(), tracks, strict=True):

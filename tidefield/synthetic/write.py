@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pycolmap
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from tidefield.errors import SceneError
+from tidefield.geometry.cameras import Cameras
 from tidefield.synthetic.flat import TidalFlat
 from tidefield.synthetic.grids import Extent
 from tidefield.synthetic.survey import Survey
@@ -54,23 +55,36 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
         raise SceneError(f"cannot write to {folder}: {error}; free some space or name another folder") from error
 
 
-def _reconstruction(survey: Survey, names: list[str]) -> pycolmap.Reconstruction:
-    """Build the COLMAP model: true poses, one PINHOLE camera, the sparse points and their tracks."""
-    cameras, points, photographs = survey.cameras, survey.points, survey.photographs.numpy()
+def model_of_lens(cameras: Cameras) -> pycolmap.Reconstruction:
+    """Start a COLMAP model whose one PINHOLE camera, number 1, is that of all cameras."""
     model = pycolmap.Reconstruction()
     params = [*cameras.focal_px[0].tolist(), *cameras.principal_px[0].tolist()]
     lens = pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(lens)
+    return model
+
+
+def add_photograph(
+    model: pycolmap.Reconstruction, cameras: Cameras, index: int, name: str, uv_px: Float64[np.ndarray, "K 2"]
+) -> None:
+    """Add a photograph with its true pose and its keypoints to such a model, with number `index` + 1."""
+    image = pycolmap.Image(name=name, keypoints=uv_px, camera_id=1, image_id=index + 1)
+    pose = cameras.T_world_camera[index].double().numpy()
+    rotation = pose[:, :3].T
+    T_camera_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+    model.add_image_with_trivial_frame(image, T_camera_world)
+
+
+def _reconstruction(survey: Survey, names: list[str]) -> pycolmap.Reconstruction:
+    """Build the COLMAP model: true poses, one PINHOLE camera, the sparse points and their tracks."""
+    cameras, points, photographs = survey.cameras, survey.points, survey.photographs.numpy()
+    model = model_of_lens(cameras)
     point, camera, uv = points.point_index.numpy(), points.camera_index.numpy(), points.uv_px.numpy()
     slot = np.zeros(len(point), dtype=int)
     for i, name in enumerate(names):
         rows = np.nonzero(camera == i)[0]
         slot[rows] = np.arange(len(rows))
-        image = pycolmap.Image(name=name, keypoints=uv[rows].astype(np.float64), camera_id=1, image_id=i + 1)
-        pose = cameras.T_world_camera[i].double().numpy()
-        rotation = pose[:, :3].T
-        T_camera_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
-        model.add_image_with_trivial_frame(image, T_camera_world)
+        add_photograph(model, cameras, i, name, uv[rows].astype(np.float64))
     order = np.argsort(point, kind="stable")
     tracks = np.split(order, np.nonzero(np.diff(point[order]))[0] + 1) if len(order) else []
     for track, xyz, error in zip(tracks, points.xyz_world.double().numpy(), points.error_px.tolist(), strict=True):
