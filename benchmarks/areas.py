@@ -209,6 +209,8 @@ def tables(record: Mapping[str, Any]) -> list[Table]:
     about = record["about"]
     memory = [(f"{int(count):,}", f"{of['peak_memory_bytes'] / 1e9:.2f}") for count, of in record["memory"].items()]
     title = f"Memory of `tidefield train`, {about['steps']} steps, photographs of {about['width']} px"
+    if len(memory) > 1:
+        memory.append(("each further one", f"{slope_bytes(record) / 1e9:.6f}"))
     result = [Table(title, ["photographs", "peak, GB"], memory)]
     if record["compared"]:
         rows = []

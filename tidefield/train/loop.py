@@ -169,7 +169,7 @@ class OpenArea:
 class SceneTrainer(Trainer):
     """Trains a network over neighbouring views on tiles of one scene's photographs.
 
-    A large scene is learned area by area, `STEPS_EACH` steps in one, so that memory does not grow with the photographs.
+    A large scene is learned area by area, `STEPS_EACH` steps in one; the depth priors of one area are in memory.
 
     `seed` is that of weights and batches; `weights` is a file to start from, None for random ones; `areas` are those of
     the scene, by `data.areas.cut` if not given.
