@@ -114,13 +114,15 @@ def page(
     lengths = [marked(table, marks) for table in length_tables(by_length(compared, others))]
     parts = [
         "# Results",
-        "## Quality",
-        *(_quality(compared) or ["Not measured."]),
-        "## Quality by width, under the strict protocol",
+        "## Quality, by width",
         *(_widths(sized) or ["Not measured."]),
+        "## Quality beside other methods",
+        *(_quality(compared) or ["Not measured."]),
         "## Quality against training time",
+        *(_age([result for of in (compared, *others) for result in of.by.values()]) if lengths else []),
         *([table.markdown() for table in lengths] or ["Not measured."]),
         "## Ablation",
+        *_age([*ablated.by.values()]),
         *(summarise(ablated) or ["Not measured."]),
         *(table.markdown() for table in ablation_tables(ablated)),
         "## What the paper's parts bring",
@@ -163,6 +165,7 @@ def _quality(compared: Results) -> list[str]:
         of.metric(metric) is not None for of in results.by.values() for metric in ("lpips_alex", "lpips_vgg")
     )
     return [
+        *_age([*compared.by.values()]),
         "Means over the held-out photographs. Every method had the same photographs, split, resolution, machine and "
         "minutes of training; bold is the best.",
         *notes(results, marks),
@@ -170,6 +173,20 @@ def _quality(compared: Results) -> list[str]:
         *([papers.markdown()] if papers else []),
         *(lpips_weights(results) if measured else [NO_LPIPS]),
         *missing_metrics(results),
+    ]
+
+
+def _age(results: Sequence[Result]) -> list[str]:
+    """What measurements without the strict protocol were made with, as a sentence; nothing if all have it."""
+    older = [result for result in results if "protocol" not in result.evaluation]
+    if not older:
+        return []
+    records = [record for result in older for record in (result.process.get("train"), result.process.get("evaluate"))]
+    versions = sorted({record["version"] for record in records if record})
+    return [
+        f"Measured with Tidefield {', '.join(versions) or 'of unknown version'}, with the networks and weights of that "
+        "time, before the strict protocol: sparse points and ranges of depths owed something to held-out photographs, "
+        "too. Do not set these figures beside those by width."
     ]
 
 

@@ -145,6 +145,20 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
     assert "### 800 px: Time and memory" in text
 
 
+def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
+    file, out = tmp_path / "comparison.json", tmp_path / "page.md"
+    keep_result(file, "swindale", "tidefield", 24.0)
+    table.write_page([file], [], [], [], tmp_path, out)
+    older = f"Measured with Tidefield {this_machine.describe()['version']}, with the networks and weights of that time"
+    assert older in out.read_text()
+    record = read_json(file)
+    assert record is not None
+    record["results"][0]["evaluation"]["protocol"] = "strict"
+    write_json(file, record)
+    table.write_page([file], [], [], [], tmp_path, out)
+    assert older not in out.read_text()
+
+
 def test_the_page_names_what_each_machine_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here, file, minute = this_machine.describe(), tmp_path / "comparison.json", tmp_path / "minute.json"
     keep_result(file, "swindale", "tidefield", 24.0)
