@@ -14,6 +14,7 @@ from tidefield.evaluation.metrics import (
     psnr,
     psnr_from_mse,
     score,
+    similarity,
     ssim_map,
 )
 
@@ -78,6 +79,12 @@ def test_ssim_is_the_formula_with_an_11_by_11_gaussian():
     image = (image // 2 + truth // 2).to(torch.uint8)
     expected = [brute_force_ssim(image[..., c].numpy() / 255, truth[..., c].numpy() / 255) for c in range(3)]
     np.testing.assert_allclose(ssim_map(image, truth).numpy(), np.mean(expected, axis=0), atol=1e-6)
+
+
+def test_ssim_is_what_the_differentiable_one_is_on_bright_even_ground_too():
+    pair = [(230 + noise(40, 50, seed=seed) // 64).to(torch.uint8) for seed in (1, 2)]
+    first, second = (image.permute(2, 0, 1)[None].double() / 255 for image in pair)
+    np.testing.assert_allclose(ssim_map(*pair), similarity(first, second)[0].mean(0), atol=1e-7)
 
 
 def test_flip_is_largest_where_the_images_differ():

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from tidefield.evaluation.lpips import BACKBONES, SMALLEST_PX, Lpips, prepare_torchvision
@@ -131,9 +132,22 @@ def psnr(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"] | None = None) 
 
 
 def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
-    """Return the SSIM (eq. 13) around each pixel, mean over the channels; for its borders see `similarity`."""
-    first, second = (x.permute(2, 0, 1)[None].double() / 255 for x in (image, truth))
-    return similarity(first, second)[0].mean(0).float()
+    """Return the SSIM (eq. 13) around each pixel, mean over the channels, as `similarity` has it to 1e-13.
+
+    SciPy's separable filters take a fiftieth of the time that `similarity` takes in double precision on CPUs; in single
+    precision bright, even ground is off by up to 2e-3.
+    """
+    first, second = (x.double().numpy() / 255 for x in (image, truth))
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter(values, (1.5, 1.5, 0), radius=(5, 5, 0), mode="mirror")
+
+    c1, c2 = 0.01**2, 0.03**2
+    means = mean(first), mean(second)
+    variances = mean(first * first) - means[0] ** 2 + mean(second * second) - means[1] ** 2
+    covariance = mean(first * second) - means[0] * means[1]
+    light = (2 * means[0] * means[1] + c1) / (means[0] ** 2 + means[1] ** 2 + c1)
+    return torch.from_numpy((light * (2 * covariance + c2) / (variances + c2)).mean(-1)).float()
 
 
 def similarity(first: Float[Tensor, "T C H W"], second: Float[Tensor, "T C H W"]) -> Float[Tensor, "T C H W"]:
