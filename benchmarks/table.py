@@ -54,6 +54,15 @@ WITHOUT_ALPHA = Mark(
     "over Nerfacto here rests on that.",
 )
 """Of figures without a protocol, which are older than alpha in what nerfstudio gets."""
+PUBLISHED = (
+    ("IBRNet (Wang et al., CVPR 2021)", "LLFF", 25.13, 26.73),
+    ("NeuRay (Liu et al., CVPR 2022)", "LLFF", 25.35, 27.06),
+    ("GNT (Varma et al., ICLR 2023)", "LLFF", 25.86, 27.24),
+    ("Quark (Flynn et al., SIGGRAPH Asia 2024)", "LLFF", 26.03, None),
+    ("Quark (Flynn et al., SIGGRAPH Asia 2024)", "DL3DV", 31.31, None),
+    ("Zip-NeRF, in Quark's comparison", "DL3DV", None, 31.22),
+)
+"""Methods of the same kind, and a peer: data, PSNR in dB without and with optimisation on each scene, as published."""
 NO_LPIPS = (
     "There is no LPIPS column: earlier figures were made with backbone files other than the published ones; the column "
     "comes back when the measurements are repeated after `tidefield evaluate --download-lpips`, which fetches the "
@@ -118,6 +127,11 @@ def page(
         *(_widths(sized) or ["Not measured."]),
         "## Quality beside other methods",
         *(_quality(compared) or ["Not measured."]),
+        "## The field, as published",
+        "PSNR in dB, all pixels, from the methods' own publications: other scenes, splits, GPUs and hours of training. "
+        "Nothing of it was measured here, and it cannot be set beside figures of this page; it tells how far methods "
+        "over neighbouring views get without training on a scene, and what that training adds.",
+        published_table().markdown(),
         "## Quality against training time",
         *(_age([result for of in (compared, *others) for result in of.by.values()]) if lengths else []),
         *([table.markdown() for table in lengths] or ["Not measured."]),
@@ -188,6 +202,15 @@ def _age(results: Sequence[Result]) -> list[str]:
         "time, before the strict protocol: sparse points and ranges of depths owed something to held-out photographs, "
         "too. Do not set these figures beside those by width."
     ]
+
+
+def published_table() -> Table:
+    """What others published of methods of this kind."""
+    rows = []
+    for name, data, zero_shot, trained in PUBLISHED:
+        gain = None if zero_shot is None or trained is None else trained - zero_shot
+        rows.append([name, data, *(shown(value, "{:.2f}") for value in (zero_shot, trained, gain))])
+    return Table("", ["method", "data", "zero-shot", "trained on each scene", "gain"], rows)
 
 
 def _without_empty_columns(results: Results) -> Results:
