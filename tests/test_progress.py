@@ -64,10 +64,12 @@ def test_a_terminal_gets_a_bar_that_goes_away_and_no_lines(clock: list[float], c
     assert caplog.messages == []
 
 
-def test_a_quiet_console_shows_nothing(clock: list[float]):
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_quiet_console_shows_nothing(terminal: bool, clock: list[float], caplog: pytest.LogCaptureFixture):
     file = io.StringIO()
-    work(Console(file=file, force_terminal=True, quiet=True), clock, pieces=10, seconds=60)
+    work(Console(file=file, force_terminal=terminal, quiet=True), clock, pieces=10, seconds=60)
     assert file.getvalue() == ""
+    assert caplog.messages == []
 
 
 def test_no_colour_is_shown_to_those_who_want_none(clock: list[float], monkeypatch: pytest.MonkeyPatch):

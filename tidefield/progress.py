@@ -43,7 +43,7 @@ class ProgressBar:
             TimeElapsedColumn(),
             TextColumn("{task.fields[rest]}", markup=False),
         ]
-        self._job, self._bar_shows = job, console.is_interactive
+        self._job, self._bar_shows, self._quiet = job, console.is_interactive, console.quiet
         self._bar = Progress(*columns, console=console, disable=not self._bar_shows, transient=True)
         self._task = self._bar.add_task(job, total=None, rest="")
         self._first: tuple[float, float] | None = None
@@ -72,7 +72,7 @@ class ProgressBar:
             line += f"  {_clock((now - since) * (1 - share) / (share - share_then))} left"
         self._bar.update(self._task, completed=done, total=whole, rest=line)
         due = now - self._spoken >= LINE_SECONDS or (share >= 1 and self._has_spoken)
-        if due and not self._bar_shows:
+        if due and not self._bar_shows and not self._quiet:
             log.info(f"{self._job}: {line}")
             self._spoken, self._has_spoken = now, True
 
