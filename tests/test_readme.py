@@ -4,13 +4,13 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 from importlib.metadata import metadata
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from command_lines import blocks, read_by_command
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
@@ -22,10 +22,6 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
 GENERATED = {"results.md", "surveys.md", "change-results.md"}
-
-
-def blocks(text: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
 
 
 def command_lines(program: str, *documents: Path) -> list[str]:
@@ -42,17 +38,6 @@ def command_lines(program: str, *documents: Path) -> list[str]:
     )
 
 
-def read_by_command(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
-    """How many commands were called with the options of a command line."""
-    words, called = shlex.split(line), []
-    module, _, function = cli.COMMANDS[words[1]]
-    monkeypatch.setattr(module, function, lambda options, console: called.append(options))
-    monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
-    monkeypatch.setattr(sys, "argv", words)
-    cli.main()
-    return len(called)
-
-
 WRITTEN = [page for page in PAGES if page.name not in GENERATED]
 TIDEFIELD_LINES = [
     line for line in command_lines("tidefield", ROOT / "README.md", *WRITTEN) if line.split()[1:] != [line.split()[1]]
@@ -61,7 +46,7 @@ TIDEFIELD_LINES = [
 
 @pytest.mark.parametrize("line", TIDEFIELD_LINES)
 def test_every_command_line_is_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert read_by_command(line, monkeypatch) == 1
+    assert read_by_command(shlex.split(line), monkeypatch) == 1
 
 
 def test_every_command_is_shown() -> None:
