@@ -29,16 +29,14 @@ SHOWN = [line[1:] for line in IGNORED if line.startswith("!")]
 
 def is_ignored(path: str) -> bool:
     """As engines decide: the last pattern that fits the path, or a folder that it is in, counts."""
-    parts = path.split("/")
-    ways = ["/".join(parts[:k]) for k in range(1, len(parts) + 1)]
-    ignored = False
-    for pattern in IGNORED:
-        own = pattern.lstrip("!")
-        deep = own.removeprefix("**/")
-        fits = any(fnmatch(part, deep) for part in parts) if deep != own else any(
-            way.count("/") == own.count("/") and fnmatch(way, own) for way in ways
-        )  # fmt: skip
-        ignored = not pattern.startswith("!") if fits else ignored
+    parts, ignored = path.split("/"), False
+    for line in IGNORED:
+        pattern = line.removeprefix("!")
+        anywhere = pattern.startswith("**/")
+        pattern = pattern.removeprefix("**/")
+        assert "/" not in pattern, "only names in the root, or anywhere, are understood here"
+        if any(fnmatch(part, pattern) for part in (parts if anywhere else parts[:1])):
+            ignored = not line.startswith("!")
     return ignored
 
 
