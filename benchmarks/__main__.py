@@ -233,6 +233,49 @@ def large(
         print("\n".join([name, *lines(found)]), flush=True)
 
 
+def cost(
+    flights: tyro.conf.Positional[tuple[Path, ...]] = (),
+    work: Path = Path("runs/cost"),
+    runs: Path = MEASURED,
+    out: Path = Path("docs/cost.md"),
+    photographs: int | None = None,
+    megapixels: float = 20.0,
+    cells: float = 0.0,
+    minutes: float = 10.0,
+    cores: int = 2,
+    gpus: int = 0,
+    machines: int = 1,
+    device: Literal["cpu", "cuda"] = "cpu",
+) -> None:
+    """Hours, memory and disk of a survey, by a model fitted to flights that are measured; writes the page on costs.
+
+    Args:
+        flights: Folders of `python -m benchmarks flight` to prepare, train on and map first (minutes each).
+        work: Folder for their scenes, runs and maps.
+        runs: Store the figures in this folder's cost.json; what it holds is not measured again.
+        out: The Markdown file to write; replaced if it is there.
+        photographs: Answer for a survey of so many, and write no page.
+        megapixels: Of each photograph.
+        cells: Of its map.
+        minutes: Of training.
+        cores: Of each machine.
+        gpus: Of each machine; expects measurements with --device cuda.
+        machines: That make the map.
+        device: Where flights are trained on and mapped.
+    """
+    tune_process()
+    from benchmarks.cost import Machines, Survey, estimate_table, fit_model, measure_costs, write_page
+
+    record = measure_costs(flights, work, runs, device, partial(print, flush=True))
+    if photographs is None:
+        write_page(runs, out)
+        print(out)
+        return
+    model = fit_model(list(record["measured"].values()), "cuda" if gpus else "cpu")
+    asked = Survey(photographs, megapixels, cells, minutes), Machines(cores, gpus, machines)
+    print(estimate_table(model, {"the survey": asked}).markdown())
+
+
 def areas(
     work: Path,
     runs: Path = MEASURED,
@@ -669,7 +712,7 @@ def main(words: Sequence[str] | None = None) -> None:
     mapped = (maps, map_control, map_views, map_memory)
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
-    surveyed = (surveys, flight, large, areas)
+    surveyed = (surveys, flight, large, cost, areas)
     measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}

@@ -1,0 +1,334 @@
+"""What a survey costs in hours, memory and disk, stage by stage: a model fitted to what was measured.
+
+CPU seconds and memory of a stage are a constant and shares of the photographs, of their pixels or of the map's cells,
+none negative, by least squares on relative errors. More cores shorten what is not serial (Amdahl, "Validity of the
+single processor approach to achieving large scale computing capabilities", 1967); how much of a stage is serial follows
+from its seconds and CPU seconds. Each measurement is also predicted from the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.optimize import nnls
+
+from benchmarks.large import run_by_stage, total
+from tidefield.compare.run import tidefield
+from tidefield.compare.tables import Table
+from tidefield.errors import RunError
+from tidefield.files import read_json, write_json, write_text
+from tidefield.machine import cores, describe
+
+COST_FILE = "cost.json"
+MAP = "map"
+TRAIN = "train"
+TRAINED_STEPS = 100
+GROUND_SHARE = (1 - 0.8) * (1 - 0.7)
+"""Of a photograph's ground that is its own, at the overlaps of 80% and 70% that surveys are flown with."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is asked for.
+
+    Attributes:
+        photographs: their number.
+        megapixels: of each.
+        cells: of its map.
+        minutes: of training; 0 for maps and views without.
+    """
+
+    photographs: int
+    megapixels: float
+    cells: float
+    minutes: float = 0.0
+
+
+def survey_of_area(square_km: float, megapixels: float, gsd_m: float, cell_m: float, minutes: float = 0.0) -> Survey:
+    """A survey flown with overlaps of 80% and 70%: area, ground sampling of photographs and side of a map's cell."""
+    area = square_km * 1e6
+    own = megapixels * 1e6 * gsd_m**2 * GROUND_SHARE
+    return Survey(max(round(area / own), 1), megapixels, area / cell_m**2, minutes)
+
+
+@dataclass(frozen=True)
+class Machines:
+    """Machines that are alike: their number, cores and GPUs of each."""
+
+    cores: int
+    gpus: int = 0
+    number: int = 1
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Hours and bytes of memory of each stage, and bytes of disk."""
+
+    hours: dict[str, float]
+    memory_bytes: dict[str, float]
+    disk_bytes: float
+
+
+def measure_costs(
+    flights: Sequence[Path], work: Path, runs: Path, device: str, say: Callable[[str], object]
+) -> dict[str, Any]:
+    """Prepare, train for some steps and map each flight; store seconds, memory and disk in RUNS/cost.json.
+
+    Args:
+        flights: folders of `python -m benchmarks flight`, at least four, of different numbers and sizes of photographs.
+        work: folder for the scenes, runs and maps.
+        runs: folder of the record; what it holds is not measured again.
+        device: of training and maps.
+        say: reports progress.
+    """
+    record = read_json(runs / COST_FILE) or {"measured": {}}
+    for flight in flights:
+        name = f"{flight.resolve().name} {device}"
+        if name in record["measured"]:
+            continue
+        photographs = sorted((flight / "photographs").iterdir())
+        with Image.open(photographs[0]) as first:
+            megapixels = first.width * first.height / 1e6
+        scene, run, out = (work / f"{name.replace(' ', '_')}_{kind}" for kind in ("scene", TRAIN, MAP))
+        say(f"{name}: prepare")
+        stages = run_by_stage(tidefield("prepare", flight / "photographs", scene), cores())
+        say(f"{name}: train")
+        train = tidefield("train", scene, run, "--steps", TRAINED_STEPS, "--device", device)
+        stages[TRAIN] = total(run_by_stage(train, cores()))
+        say(f"{name}: map")
+        stages[MAP] = total(run_by_stage(tidefield("map", run, out, "--device", device), cores()))
+        record["measured"][name] = {
+            "photographs": len(photographs),
+            "megapixels": megapixels,
+            "cells": read_json(out / "map.json")["cells"],
+            "device": device,
+            "stages": stages,
+            "scene_bytes": _size(scene),
+            "map_bytes": _size(out),
+            **describe(),
+        }
+        write_json(runs / COST_FILE, record)
+    return record
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _terms(stage: str, survey: Survey) -> list[float]:
+    """What a stage may depend on."""
+    size = survey.cells / 1e6 if stage == MAP else survey.photographs * survey.megapixels
+    return [1.0, survey.photographs, size]
+
+
+def _fit(rows: Sequence[Sequence[float]], values: Sequence[float]) -> np.ndarray:
+    """Factors of the terms that are not negative; each measurement counts by its relative error."""
+    found = np.array(values)
+    weight = 1 / np.maximum(found, 1e-3 * found.max() + 1e-12)
+    return nnls(np.array(rows) * weight[:, None], found * weight)[0]
+
+
+@dataclass(frozen=True)
+class Model:
+    """Costs of surveys on one kind of device.
+
+    Attributes:
+        seconds: factors of `_terms` of each stage, for CPU seconds, or for seconds of what a GPU does.
+        serial: share of each stage that more cores do not shorten.
+        memory: factors of `_terms` of each stage, bytes on the cores it was measured on.
+        disk: bytes of each megapixel of photographs, and of each cell.
+        cores: it was measured on.
+        device: of training and maps.
+        largest: photographs, megapixels of each and cells of the largest measurements.
+    """
+
+    seconds: dict[str, np.ndarray]
+    serial: dict[str, float]
+    memory: dict[str, np.ndarray]
+    disk: tuple[float, float]
+    cores: int
+    device: str
+    largest: tuple[int, float, float]
+
+    def estimate(self, survey: Survey, machines: Machines) -> Estimate:
+        """Hours, memory and disk of a survey; a map is shared among the machines, the rest is done by one."""
+        hours, memory = {}, {}
+        for stage, factors in self.seconds.items():
+            terms = np.array(_terms(stage, survey))
+            memory[stage] = float(self.memory[stage] @ terms) * max(machines.cores / self.cores, 1.0)
+            if stage == TRAIN:
+                hours[stage] = survey.minutes / 60
+                memory[stage] = memory[stage] if survey.minutes else 0.0
+                continue
+            number = machines.number if stage == MAP else 1
+            seconds = float(factors @ terms) / number
+            if stage == MAP and self.device != "cpu":
+                hours[stage] = seconds / machines.gpus / 3600
+            else:
+                serial = self.serial[stage]
+                hours[stage] = seconds * (serial + (1 - serial) / machines.cores) / 3600
+        photographs = self.disk[0] * survey.photographs * survey.megapixels
+        return Estimate(hours, memory, photographs + self.disk[1] * survey.cells)
+
+
+def fit_model(measured: Sequence[dict[str, Any]], device: str) -> Model:
+    """Fit the model to the measurements of a device.
+
+    Raises:
+        RunError: there are fewer than four, as many as the terms and one.
+    """
+    measured = [of for of in measured if of["device"] == device]
+    if len(measured) < 4:
+        raise RunError(
+            f"{len(measured)} measurements of costs on {device}: expected four or more; make flights with "
+            f"`python -m benchmarks flight` and name them: python -m benchmarks cost FLIGHT... --device {device}"
+        )
+    surveys = [_survey(of) for of in measured]
+    number = measured[0]["machine"]["cores"]
+    seconds, serial, memory = {}, {}, {}
+    for stage in measured[0]["stages"]:
+        rows = [_terms(stage, survey) for survey in surveys]
+        of_stage = [of["stages"].get(stage, {"seconds": 0.0, "cpu_seconds": 0.0, "peak_bytes": 0.0}) for of in measured]
+        counted = "cpu_seconds" if device == "cpu" or stage != MAP else "seconds"
+        seconds[stage] = _fit(rows, [of[counted] for of in of_stage])
+        memory[stage] = _fit(rows, [of["peak_bytes"] for of in of_stage])
+        whole, cpu = (sum(of[key] for of in of_stage) for key in ("seconds", "cpu_seconds"))
+        serial[stage] = float(np.clip((number * whole / cpu - 1) / (number - 1), 0, 1)) if cpu and number > 1 else 1.0
+    pixels = sum(survey.photographs * survey.megapixels for survey in surveys)
+    disk = (
+        sum(of["scene_bytes"] for of in measured) / pixels,
+        sum(of["map_bytes"] for of in measured) / sum(survey.cells for survey in surveys),
+    )
+    largest = max(s.photographs for s in surveys), max(s.megapixels for s in surveys), max(s.cells for s in surveys)
+    return Model(seconds, serial, memory, disk, number, device, largest)
+
+
+def _survey(of: dict[str, Any]) -> Survey:
+    return Survey(of["photographs"], of["megapixels"], of["cells"])
+
+
+def predicted_from_others(measured: Sequence[dict[str, Any]], device: str) -> dict[str, tuple[float, float]]:
+    """Seconds of prepare and map of each measurement but training: as measured, and by the model of all others."""
+    measured = [of for of in measured if of["device"] == device]
+    found = {}
+    for i, of in enumerate(measured):
+        model = fit_model([*measured[:i], *measured[i + 1 :]], device)
+        hours = model.estimate(_survey(of), Machines(model.cores, int(device != "cpu"))).hours
+        truth = sum(stage["seconds"] for name, stage in of["stages"].items() if name != TRAIN)
+        name = f"{of['photographs']:,} of {of['megapixels']:.2f} megapixels, {of['cells'] / 1e6:.1f} million cells"
+        found[name] = truth, 3600 * sum(hours.values())
+    return found
+
+
+def estimate_table(model: Model, surveys: dict[str, tuple[Survey, Machines]]) -> Table:
+    """Hours by stage, memory and disk; what is beyond the largest measurement by more than twice is marked."""
+    names = ("prepare", TRAIN, MAP)
+    rows = []
+    for name, (survey, machines) in surveys.items():
+        found = model.estimate(survey, machines)
+        grouped = {key: found.hours.get(key, 0.0) for key in (TRAIN, MAP)}
+        grouped["prepare"] = sum(found.hours.values()) - sum(grouped.values())
+        whole = sum(grouped.values())
+        sizes = survey.photographs, survey.megapixels, survey.cells
+        beyond = any(size > 2 * most for size, most in zip(sizes, model.largest, strict=True))
+        rows.append(
+            [
+                f"{name}{' *' if beyond else ''}",
+                f"{survey.photographs:,}",
+                f"{survey.megapixels:g}",
+                f"{survey.cells / 1e6:,.0f}",
+                _of_machines(machines),
+                *(f"{grouped[key]:,.1f} ({grouped[key] / whole:.0%})" for key in names),
+                f"{whole:,.1f}",
+                f"{max(found.memory_bytes.values()) / 1e9:,.1f}",
+                f"{found.disk_bytes / 1e9:,.1f}",
+            ]
+        )
+    columns = ["survey", "photographs", "megapixels", "cells of the map, million", "on", *(f"{n}, h" for n in names)]
+    return Table("", [*columns, "all, h", "memory of a machine, GB", "disk, GB"], rows)
+
+
+def _of_machines(machines: Machines) -> str:
+    each = f"{machines.cores} cores" + (f", {machines.gpus} GPUs" if machines.gpus else "")
+    return each if machines.number == 1 else f"{machines.number} x {each}"
+
+
+def stage_table(model: Model) -> Table:
+    """What each stage costs."""
+    rows = []
+    for stage, factors in model.seconds.items():
+        if stage == TRAIN:
+            continue
+        of_map = stage == MAP
+        rows.append(
+            [
+                f"{stage}",
+                f"{factors[0]:.1f}",
+                f"{factors[1]:.3f}",
+                "-" if of_map else f"{factors[2]:.3f}",
+                f"{factors[2]:.1f}" if of_map else "-",
+                f"{model.serial[stage]:.0%}",
+            ]
+        )
+    columns = [
+        "stage",
+        "CPU s",
+        "each photograph, CPU s",
+        "each megapixel, CPU s",
+        "each million cells, CPU s",
+        "serial",
+    ]
+    return Table("", columns, rows)
+
+
+def write_page(runs: Path, out: Path) -> None:
+    """Write the page from what was stored."""
+    measured = list((read_json(runs / COST_FILE) or {"measured": {}})["measured"].values())
+    model = fit_model(measured, "cpu")
+    check = [
+        [name, f"{a:.0f}", f"{b:.0f}", f"{b / a:.2f}"]
+        for name, (a, b) in predicted_from_others(measured, "cpu").items()
+    ]
+    two, many = Machines(2), Machines(16)
+    surveys = {
+        "a creek": (survey_of_area(0.05, 20, 0.03, 0.05, 10), two),
+        "a flat, 1 km2": (survey_of_area(1, 20, 0.03, 0.05, 10), two),
+        "a flat, 1 km2 ": (survey_of_area(1, 20, 0.03, 0.05, 10), many),
+        "5,000 photographs of 400 px": (Survey(5000, 0.12, 1e6 / 0.15**2, 0), two),
+        "a coast, 10 km2": (survey_of_area(10, 20, 0.03, 0.05, 60), Machines(16, number=10)),
+        "a coast, 1,000 km2": (survey_of_area(1000, 20, 0.03, 0.1, 600), Machines(16, number=100)),
+    }
+    machine = measured[0]["machine"]
+    photographs, megapixels, cells = model.largest
+    most = f"{photographs:,} photographs, {megapixels:.2f} megapixels, {cells / 1e6:.1f} million cells"
+    parts = [
+        "# What a survey costs",
+        "`python -m benchmarks cost` wrote this page. A model of seconds, memory and disk is fitted to built-in "
+        f"flights that were prepared, trained on and mapped on {machine['cores']} cores ({machine['processor']}). It "
+        "answers for others:",
+        "```sh\npython -m benchmarks cost --photographs 1200 --megapixels 20 --cells 400e6 --cores 16\n```",
+        "## Estimates",
+        estimate_table(model, surveys).markdown(),
+        f"\\* Beyond twice the largest measurement ({most}): the model takes costs to go on growing in proportion, "
+        "which nothing here has shown.",
+        "Areas are flown with overlaps of 80% and 70% at a ground sampling of 3 cm, and mapped at 5 cm, the 1,000 km2 "
+        "at 10 cm. `prepare` and training run on one machine; only maps are shared among several. Training takes the "
+        "time it is given: 10 minutes, 1 and 10 hours for the coasts. Memory is what was measured on "
+        f"{model.cores} cores, times the ratio of cores, because each core works on a block or tile of its own. "
+        "GPUs: " + _gpus(measured),
+        "## The model",
+        stage_table(model).markdown(),
+        "## Each measurement, predicted from the others",
+        Table("", ["flight", "prepare and map, s", "by the model, s", "ratio"], check).markdown(),
+    ]
+    write_text(out, "\n\n".join(parts) + "\n")
+
+
+def _gpus(measured: Sequence[dict[str, Any]]) -> str:
+    devices = {of["device"] for of in measured} - {"cpu"}
+    return f"measured on {', '.join(sorted(devices))}." if devices else "not measured."

@@ -1,0 +1,71 @@
+from pathlib import Path
+
+import pytest
+
+from benchmarks.cost import Machines, Survey, fit_model, predicted_from_others, survey_of_area, write_page
+from tidefield.errors import RunError
+from tidefield.files import write_json
+from tidefield.machine import describe
+
+MEASURED = ((40, 0.1, 1e6), (80, 0.1, 3e6), (200, 0.1, 5e6), (40, 0.5, 9e6), (60, 0.2, 2e6))
+
+
+def measurement(photographs: int, megapixels: float, cells: float) -> dict:
+    """Of a machine with two cores: poses 2 s + 0.5 s each, all serial; images 3 s a megapixel, none; a map 7 s + 60 s
+    a million cells, half of it serial."""
+    poses, images, mapped = 2 + 0.5 * photographs, 3 * photographs * megapixels, 7 + 60 * cells / 1e6
+    return {
+        "photographs": photographs, "megapixels": megapixels, "cells": cells, "device": "cpu",
+        "stages": {
+            "poses": {"seconds": poses, "cpu_seconds": poses, "peak_bytes": 1e8 + 1e6 * photographs},
+            "images": {"seconds": images / 2, "cpu_seconds": images, "peak_bytes": 1e8},
+            "train": {"seconds": 100.0, "cpu_seconds": 200.0, "peak_bytes": 1e9},
+            "map": {"seconds": 0.75 * mapped, "cpu_seconds": mapped, "peak_bytes": 2e8},
+        },
+        "scene_bytes": 5e5 * photographs * megapixels, "map_bytes": 40 * cells,
+        **describe(), "machine": {**describe()["machine"], "cores": 2},
+    }  # fmt: skip
+
+
+def test_the_model_of_costs_finds_what_each_stage_depends_on_and_what_more_cores_bring():
+    model = fit_model([measurement(*of) for of in MEASURED], "cpu")
+    found = model.estimate(Survey(1000, 20.0, 1e8, minutes=30), Machines(16))
+    assert found.hours == pytest.approx(
+        {
+            "poses": (2 + 0.5 * 1000) / 3600,
+            "images": 3 * 1000 * 20 / 16 / 3600,
+            "train": 0.5,
+            "map": (7 + 60 * 100) * (0.5 + 0.5 / 16) / 3600,
+        },
+        rel=1e-3,
+    )
+    assert found.memory_bytes["poses"] == pytest.approx((1e8 + 1e6 * 1000) * 8, rel=1e-3)
+    assert found.disk_bytes == pytest.approx(5e5 * 1000 * 20 + 40 * 1e8, rel=1e-3)
+    alone, shared = (model.estimate(Survey(1000, 20.0, 1e8), Machines(16, number=n)).hours for n in (1, 10))
+    assert shared["map"] == pytest.approx(alone["map"] / 10)
+    assert shared["poses"] == alone["poses"]
+
+
+def test_each_measurement_of_costs_is_predicted_without_itself():
+    odd = measurement(*MEASURED[0])
+    odd["stages"]["poses"] = {"seconds": 500.0, "cpu_seconds": 500.0, "peak_bytes": 1e8}
+    checks = predicted_from_others([odd, *(measurement(*of) for of in MEASURED[1:])], "cpu")
+    truth, predicted = next(iter(checks.values()))
+    assert truth > 500 > 3 * predicted
+
+
+def test_an_area_has_the_photographs_that_its_overlaps_need():
+    assert survey_of_area(1.0, 20.0, 0.03, 0.05) == Survey(926, 20.0, pytest.approx(4e8))  # type: ignore[arg-type]
+
+
+def test_costs_on_a_gpu_that_nobody_measured_are_refused():
+    with pytest.raises(RunError, match="0 measurements of costs on cuda"):
+        fit_model([measurement(*of) for of in MEASURED], "cuda")
+
+
+def test_the_page_of_costs_marks_what_was_not_measured(tmp_path: Path):
+    write_json(tmp_path / "cost.json", {"measured": {str(of): measurement(*of) for of in MEASURED}})
+    write_page(tmp_path, tmp_path / "cost.md")
+    text = (tmp_path / "cost.md").read_text()
+    assert "| a coast, 1,000 km2 * |" in text
+    assert "GPUs: not measured." in text
