@@ -1,7 +1,7 @@
 """Gaussians of a scene, for viewers that cannot run a network: from the colours and depths of its photographs' views.
 
-Each pixel of the rendered views is a flat Gaussian on the surface, as wide as what the pixel shows; those that share a
-cell of space are averaged. Nothing is optimised. The file is in the layout of Kerbl et al., "3D Gaussian Splatting for
+Each pixel of the rendered views is a flat Gaussian on the surface, as wide as what the pixel shows, unless other views
+see through it (`consistency`); those that share a cell of space are averaged. Nothing is optimised. The file is in the layout of Kerbl et al., "3D Gaussian Splatting for
 Real-Time Radiance Field Rendering" (2023), which SuperSplat, gsplat and others open.
 
 Alphabet: G Gaussians, P pixels of a view.
@@ -16,13 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.rendering import Render, Rendering
+from tidefield.render.consistency import ViewPoints, choose_points
 from tidefield.render.stills import MIN_OPACITY, SOFTWARE
 
 SH_0 = math.sqrt(1 / (4 * math.pi))
@@ -54,6 +55,23 @@ class Gaussians:
     sigma: float
 
 
+@dataclass(frozen=True)
+class SurfaceView:
+    """What one view shows of the surface, a point per pixel.
+
+    Attributes:
+        points: where they are.
+        normal_world: unit normals, towards the camera.
+        rgb: colours at the common exposure, in [0, 1].
+        footprint: how much of the surface a pixel shows, world units.
+    """
+
+    points: ViewPoints
+    normal_world: Float64[np.ndarray, "P 3"]
+    rgb: Float64[np.ndarray, "P 3"]
+    footprint: Float64[np.ndarray, " P"]
+
+
 def make_gaussians(
     render: Render, cameras: Cameras, width: int, progress: Callable[[int, int], None] | None = None
 ) -> Gaussians:
@@ -68,6 +86,14 @@ def make_gaussians(
     Raises:
         RunError: the views show nothing, or too much.
     """
+    views = render_surfaces(render, cameras, width, progress)
+    return fuse(views, choose_points([view.points for view in views]))
+
+
+def render_surfaces(
+    render: Render, cameras: Cameras, width: int, progress: Callable[[int, int], None] | None = None
+) -> list[SurfaceView]:
+    """Render the views of cameras, and find the surface in each; the arguments are those of `make_gaussians`."""
     views = []
     for k in range(len(cameras)):
         own = cameras[k]
@@ -78,22 +104,11 @@ def make_gaussians(
         views.append(_of_view(render(camera), camera))
         if progress is not None:
             progress(k + 1, len(cameras))
-    mean, normal, rgb, footprint = (np.concatenate(parts) for parts in zip(*views, strict=True))
-    if not len(mean):
-        raise RunError("the views show nothing: expected a scene with a surface; look at it with `tidefield view`")
-    cell = float(np.median(footprint))
-    found = _fused(mean, normal, rgb, cell)
-    if len(found[0]) > MOST:
-        raise RunError(f"{len(found[0]):,} Gaussians: expected at most {MOST:,}; choose a smaller --width")
-    return Gaussians(*found, sigma=WIDTH * cell)
+    return views
 
 
-def _of_view(
-    rendering: Rendering, camera: Cameras
-) -> tuple[
-    Float64[np.ndarray, "P 3"], Float64[np.ndarray, "P 3"], Float64[np.ndarray, "P 3"], Float64[np.ndarray, " P"]
-]:
-    """Points, normals, colours and sizes of the pixels that show a surface."""
+def _of_view(rendering: Rendering, camera: Cameras) -> SurfaceView:
+    """Find the surface in one view."""
     height, width = rendering.depth.shape
     directions = camera.directions_world(pixel_grid(width, height)[None])[0].double().numpy()
     depth = rendering.depth.double().cpu().numpy()
@@ -106,10 +121,35 @@ def _of_view(
     ray = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     cosine = -(normal * ray).sum(1)
     normal *= np.sign(cosine)[:, None]
-    shown = (rendering.opacity.cpu().numpy().reshape(-1) >= MIN_OPACITY) & (np.abs(cosine) > STEEPEST)
+    known = rendering.opacity.cpu().numpy().reshape(-1) >= MIN_OPACITY
+    shown = known & (np.abs(cosine) > STEEPEST)
     footprint = depth.reshape(-1) / float(camera.focal_px[0].mean())
     rgb = rendering.colour.double().cpu().numpy().reshape(-1, 3)
-    return xyz[shown], normal[shown], rgb[shown], footprint[shown]
+    points = ViewPoints(camera, xyz, depth.reshape(-1).astype(np.float32), known, shown)
+    return SurfaceView(points, normal, rgb, footprint)
+
+
+def fuse(views: Sequence[SurfaceView], chosen: Sequence[Bool[np.ndarray, " P"]]) -> Gaussians:
+    """Make Gaussians of the chosen points of views: one for each cell of space that holds any.
+
+    A cell is as large as what half the shown pixels show at most.
+
+    Raises:
+        RunError: the views show nothing, or too much.
+    """
+    footprint = np.concatenate([view.footprint[view.points.shown] for view in views])
+    if not len(footprint):
+        raise RunError("the views show nothing: expected a scene with a surface; look at it with `tidefield view`")
+    cell = float(np.median(footprint))
+    parts = [
+        (view.points.xyz_world[own], view.normal_world[own], view.rgb[own])
+        for view, own in zip(views, chosen, strict=True)
+    ]
+    mean, normal, rgb = (np.concatenate(part) for part in zip(*parts, strict=True))
+    found = _fused(mean, normal, rgb, cell)
+    if len(found[0]) > MOST:
+        raise RunError(f"{len(found[0]):,} Gaussians: expected at most {MOST:,}; choose a smaller --width")
+    return Gaussians(*found, sigma=WIDTH * cell)
 
 
 def _fused(
