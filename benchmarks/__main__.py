@@ -668,6 +668,29 @@ def view(scene: Path, runs: Path | None = None, moves: int = 100, rests: int = 5
     print("\n".join(lines(measure_view(scene, runs, moves=moves, rests=rests))))
 
 
+def gaussians(
+    sources: tyro.conf.Positional[tuple[Path, ...]],
+    runs: Path = MEASURED,
+    widths: tuple[int, ...] = (400,),
+    device: str = "auto",
+) -> None:
+    """What `tidefield export` loses against held-out photographs, with points chosen in several ways (minutes).
+
+    Args:
+        sources: Runs, or scenes for the trained weights.
+        runs: Store the figures in this folder's gaussians.json, after each; what it holds is not measured again.
+        widths: Of the views that are exported and of the photographs, in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+    """
+    tune_process()
+    from benchmarks.gaussians import measure_gaussians, tables
+    from tidefield.device import choose_device
+
+    record = measure_gaussians(sources, runs, widths, choose_device(device), partial(print, flush=True))
+    for made in tables(record):
+        print(made.markdown(), end="\n\n")
+
+
 def table(
     comparison: tuple[Path, ...] = COMPARISON,
     ablation: tuple[Path, ...] = ABLATION,
@@ -713,7 +736,7 @@ def main(words: Sequence[str] | None = None) -> None:
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
     surveyed = (surveys, flight, large, cost, areas)
-    measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, kills, fuzz)
+    measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, gaussians, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
     try:

@@ -1,8 +1,9 @@
 """Gaussians of a scene, for viewers that cannot run a network: from the colours and depths of its photographs' views.
 
 Each pixel of the rendered views is a flat Gaussian on the surface, as wide as what the pixel shows, unless other views
-see through it (`consistency`); those that share a cell of space are averaged. Nothing is optimised. The file is in the layout of Kerbl et al., "3D Gaussian Splatting for
-Real-Time Radiance Field Rendering" (2023), which SuperSplat, gsplat and others open.
+see through it (`consistency`); those that share a cell of space are averaged. Nothing is optimised. The file is in the
+layout of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023), which SuperSplat, gsplat
+and others open.
 
 Alphabet: G Gaussians, P pixels of a view.
 """

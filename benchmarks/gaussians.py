@@ -1,0 +1,167 @@
+"""What `tidefield export` loses: Gaussians against held-out photographs, chosen in several ways, and the method itself.
+
+The files that are written are rendered with `baselines.splats`, on black, at the photographs' own gains. A pixel is
+covered where the Gaussians stop at least half of the light; what is not covered is black, so it counts among all pixels.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from rich.console import Console
+from torch import Tensor
+
+from tidefield.baselines.splats import read_splats, render_splats
+from tidefield.commands.common import ZeroShot, open_source
+from tidefield.compare.tables import Table
+from tidefield.config import Sampling
+from tidefield.data.load import at_width
+from tidefield.data.scene import Scene
+from tidefield.errors import RunError
+from tidefield.evaluation.metrics import Image8, flip_map, psnr, ssim_map
+from tidefield.files import read_json, write_json
+from tidefield.machine import describe
+from tidefield.model.rendering import Render, to_8_bit
+from tidefield.render.consistency import PASSES, choose_points
+from tidefield.render.gaussians import SurfaceView, fuse, render_surfaces, write_gaussians
+from tidefield.render.stills import MIN_OPACITY
+from tidefield.train.checkpoint import RUN_FILE
+
+GAUSSIANS_FILE = "gaussians.json"
+METHOD = "the method itself"
+BLACK = (0.0, 0.0, 0.0)
+METRICS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}"}
+Choice = Callable[[Sequence[SurfaceView]], "list[Bool[np.ndarray, ' P']]"]
+WAYS: Mapping[str, Choice] = {
+    "every point": lambda views: [view.points.shown for view in views],
+    "uncontradicted": lambda views: choose_points([view.points for view in views], PASSES[:1]),
+    "uncontradicted, then filled": lambda views: choose_points([view.points for view in views]),
+}
+"""Ways to choose points; the last one is that of `tidefield export`."""
+
+
+def measure_gaussians(
+    sources: Sequence[Path], runs: Path, widths: Iterable[int], device: torch.device, say: Callable[[str], object]
+) -> dict[str, Any]:
+    """Export runs, or scenes with the trained weights, and compare with held-out photographs; what was measured is kept.
+
+    Args:
+        sources: folders of runs, or of scenes.
+        runs: folder for gaussians.json.
+        widths: of the exported views and of the photographs that they are compared with, pixels.
+        device: to render on.
+        say: reports progress.
+
+    Raises:
+        RunError: a source holds no photograph out.
+    """
+    record = read_json(runs / GAUSSIANS_FILE) or {"figures": {}}
+    for source in sources:
+        name = source.resolve().name
+        missing = [width for width in widths if f"{name}, {width} px" not in record["figures"]]
+        if not missing:
+            continue
+        zero = ZeroShot(zero_shot=not (source / RUN_FILE).exists())
+        opened = open_source(source, zero, device, False, Console(quiet=True), Sampling(rays_per_side=1))
+        with opened as (scene, render, about):
+            if not scene.test:
+                raise RunError(f"{source} holds no photograph out: expected at least one to compare with; add some")
+            for width in missing:
+                say(f"{name}, {width} px")
+                found = compare_ways(scene, render, width, device)
+                record["figures"][f"{name}, {width} px"] = {"ways": found, "method": about}
+                command = "python -m benchmarks gaussians SCENE|RUN..."
+                write_json(runs / GAUSSIANS_FILE, {**record, **describe(), "command": command})
+    return record
+
+
+def compare_ways(scene: Scene, render: Render, width: int, device: torch.device) -> dict[str, dict[str, Any]]:
+    """Export the training photographs' views in every way, and compare with the held-out photographs.
+
+    Returns:
+        Of each way and of the method itself the means over the photographs: the metrics over all and over the covered
+        pixels (`_covered`), the share that is covered, the number of Gaussians, and the seconds of rendering the views
+        and of making Gaussians of them; of the method, the seconds of rendering the held-out views.
+    """
+    truth = at_width(scene, width)
+    start = time.perf_counter()
+    with torch.no_grad():
+        views = render_surfaces(render, scene.cameras[list(scene.train)], width)
+    rendering_seconds = time.perf_counter() - start
+    result = {}
+    for way, choose in WAYS.items():
+        start = time.perf_counter()
+        found = fuse(views, choose(views))
+        seconds = time.perf_counter() - start
+        with TemporaryDirectory() as folder:
+            write_gaussians(found, Path(folder) / "scene.ply", scene.origin_world.tolist())
+            splats = read_splats(Path(folder) / "scene.ply")
+        result[way] = {
+            **compare_views(truth, lambda camera, splats=splats: render_splats(splats, camera, BLACK, device), True),
+            "gaussians": len(found.mean_world),
+            "rendering_seconds": rendering_seconds,
+            "making_seconds": seconds,
+        }
+    start = time.perf_counter()
+    result[METHOD] = compare_views(truth, render, False)
+    result[METHOD]["rendering_seconds"] = time.perf_counter() - start
+    return result
+
+
+def compare_views(scene: Scene, render: Render, common_light: bool) -> dict[str, float | None]:
+    """Compare the views of the held-out photographs with these; means over the photographs.
+
+    Args:
+        scene: at the width of the views.
+        render: the method.
+        common_light: its views have no gain, and get those of the photographs.
+    """
+    rows = []
+    for index in scene.test:
+        camera = scene.cameras[index]
+        with torch.no_grad():
+            view = render(camera)
+        if common_light:
+            view = replace(view, colour=(view.colour * camera.gain_of_rows()).clamp(0, 1))
+        used = scene.photographs.used(index)
+        covered = (view.opacity.cpu() >= MIN_OPACITY) & used
+        row = scores(to_8_bit(view.colour).cpu(), scene.photographs[index], {"": used, "_covered": covered})
+        rows.append({**row, "covered": float(covered.sum() / used.sum())})
+    known = {key: [row[key] for row in rows if row[key] is not None] for key in rows[0]}
+    return {key: fmean(values) if values else None for key, values in known.items()}
+
+
+def scores(image: Image8, truth: Image8, masks: Mapping[str, Bool[Tensor, "H W"]]) -> dict[str, float | None]:
+    """Measure an image over each mask, by metric and the mask's suffix; None over an empty one."""
+    maps = {"ssim": ssim_map(image, truth), "flip": flip_map(image, truth)}
+    result: dict[str, float | None] = {}
+    for suffix, mask in masks.items():
+        some = bool(mask.any())
+        result[f"psnr{suffix}"] = psnr(image, truth, mask) if some else None
+        result |= {f"{name}{suffix}": float(of[mask].mean()) if some else None for name, of in maps.items()}
+    return result
+
+
+def tables(record: Mapping[str, Any]) -> list[Table]:
+    """One table per source and width: a row per way."""
+    columns = ["points", *(name.upper() for name in METRICS), *(f"{name.upper()}, covered" for name in METRICS)]
+    columns += ["covered", "Gaussians", "views, s", "Gaussians, s"]
+    result = []
+    for name, found in record["figures"].items():
+        rows = []
+        for way, of in found["ways"].items():
+            cells = [(style, of[key + suffix]) for suffix in ("", "_covered") for key, style in METRICS.items()]
+            cells += [("{:.1%}", of["covered"]), ("{:,}", of.get("gaussians"))]
+            cells += [("{:.0f}", of["rendering_seconds"]), ("{:.0f}", of.get("making_seconds"))]
+            rows.append((way, *("-" if value is None else style.format(value) for style, value in cells)))
+        result.append(Table(name, columns, rows))
+    return result
