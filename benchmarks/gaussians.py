@@ -1,7 +1,7 @@
 """What `tidefield export` loses: Gaussians against held-out photographs, chosen in several ways, and the method itself.
 
 The files that are written are rendered with `baselines.splats`, on black, at the photographs' own gains. A pixel is
-covered where the Gaussians stop at least half of the light; what is not covered is black, so it counts among all pixels.
+covered where the Gaussians stop at least half of the light; all other pixels count as black.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ WAYS: Mapping[str, Choice] = {
 def measure_gaussians(
     sources: Sequence[Path], runs: Path, widths: Iterable[int], device: torch.device, say: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Export runs, or scenes with the trained weights, and compare with held-out photographs; what was measured is kept.
+    """Export runs, or scenes with the trained weights, and measure their Gaussians; what was measured is kept.
 
     Args:
         sources: folders of runs, or of scenes.
