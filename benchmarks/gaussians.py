@@ -78,7 +78,8 @@ def measure_gaussians(
             for width in missing:
                 say(f"{name}, {width} px")
                 found = compare_ways(scene, render, width, device)
-                record["figures"][f"{name}, {width} px"] = {"ways": found, "method": about}
+                method = {key: about.get(key) for key in ("preset", "weights", "run")}
+                record["figures"][f"{name}, {width} px"] = {"ways": found, "method": method}
                 command = "python -m benchmarks gaussians SCENE|RUN..."
                 write_json(runs / GAUSSIANS_FILE, {**record, **describe(), "command": command})
     return record

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class Export:
     """Export a run, or with --zero-shot a scene, as Gaussians (PLY), which SuperSplat and gsplat's viewer open.
 
-    Every pixel of the training photographs' views becomes a flat Gaussian; nothing is optimised. Lost are colours that
-    change with the direction (mirrors of water), what is finer than a pixel of --width, and what no photograph shows.
-    `tidefield render` shows all of it.
+    Every pixel of the training photographs' views becomes a flat Gaussian, unless other views see through it; nothing
+    is optimised. Lost are colours that change with the direction (mirrors of water), what is finer than a pixel of
+    --width, and what no photograph shows. `tidefield render` shows all of it; docs/view.md has figures.
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]
