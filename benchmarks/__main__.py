@@ -272,8 +272,8 @@ def cost(
         print(out)
         return
     model = fit_model(list(record["measured"].values()), "cuda" if gpus else "cpu")
-    asked = Survey(photographs, megapixels, cells, minutes), Machines(cores, gpus, machines)
-    print(estimate_table(model, {"the survey": asked}).markdown())
+    asked = "the survey", Survey(photographs, megapixels, cells, minutes), Machines(cores, gpus, machines)
+    print(estimate_table(model, [asked]).markdown())
 
 
 def areas(

@@ -188,6 +188,10 @@ def fit_model(measured: Sequence[dict[str, Any]], device: str) -> Model:
             f"{len(measured)} measurements of costs on {device}: expected four or more; make flights with "
             f"`python -m benchmarks flight` and name them: python -m benchmarks cost FLIGHT... --device {device}"
         )
+    return _fitted(measured, device)
+
+
+def _fitted(measured: Sequence[dict[str, Any]], device: str) -> Model:
     surveys = [_survey(of) for of in measured]
     number = measured[0]["machine"]["cores"]
     seconds, serial, memory = {}, {}, {}
@@ -217,7 +221,7 @@ def predicted_from_others(measured: Sequence[dict[str, Any]], device: str) -> di
     measured = [of for of in measured if of["device"] == device]
     found = {}
     for i, of in enumerate(measured):
-        model = fit_model([*measured[:i], *measured[i + 1 :]], device)
+        model = _fitted([*measured[:i], *measured[i + 1 :]], device)
         hours = model.estimate(_survey(of), Machines(model.cores, int(device != "cpu"))).hours
         truth = sum(stage["seconds"] for name, stage in of["stages"].items() if name != TRAIN)
         name = f"{of['photographs']:,} of {of['megapixels']:.2f} megapixels, {of['cells'] / 1e6:.1f} million cells"
@@ -225,11 +229,11 @@ def predicted_from_others(measured: Sequence[dict[str, Any]], device: str) -> di
     return found
 
 
-def estimate_table(model: Model, surveys: dict[str, tuple[Survey, Machines]]) -> Table:
+def estimate_table(model: Model, surveys: Sequence[tuple[str, Survey, Machines]]) -> Table:
     """Hours by stage, memory and disk; what is beyond the largest measurement by more than twice is marked."""
     names = ("prepare", TRAIN, MAP)
     rows = []
-    for name, (survey, machines) in surveys.items():
+    for name, survey, machines in surveys:
         found = model.estimate(survey, machines)
         grouped = {key: found.hours.get(key, 0.0) for key in (TRAIN, MAP)}
         grouped["prepare"] = sum(found.hours.values()) - sum(grouped.values())
@@ -295,14 +299,14 @@ def write_page(runs: Path, out: Path) -> None:
         for name, (a, b) in predicted_from_others(measured, "cpu").items()
     ]
     two, many = Machines(2), Machines(16)
-    surveys = {
-        "a creek": (survey_of_area(0.05, 20, 0.03, 0.05, 10), two),
-        "a flat, 1 km2": (survey_of_area(1, 20, 0.03, 0.05, 10), two),
-        "a flat, 1 km2 ": (survey_of_area(1, 20, 0.03, 0.05, 10), many),
-        "5,000 photographs of 400 px": (Survey(5000, 0.12, 1e6 / 0.15**2, 0), two),
-        "a coast, 10 km2": (survey_of_area(10, 20, 0.03, 0.05, 60), Machines(16, number=10)),
-        "a coast, 1,000 km2": (survey_of_area(1000, 20, 0.03, 0.1, 600), Machines(16, number=100)),
-    }
+    surveys = [
+        ("a creek", survey_of_area(0.05, 20, 0.03, 0.05, 10), two),
+        ("a flat, 1 km2", survey_of_area(1, 20, 0.03, 0.05, 10), two),
+        ("a flat, 1 km2", survey_of_area(1, 20, 0.03, 0.05, 10), many),
+        ("5,000 photographs of 400 px", Survey(5000, 0.12, 1e6 / 0.15**2, 0), two),
+        ("a coast, 10 km2", survey_of_area(10, 20, 0.03, 0.05, 60), Machines(16, number=10)),
+        ("a coast, 1,000 km2", survey_of_area(1000, 20, 0.03, 0.1, 600), Machines(16, number=100)),
+    ]
     machine = measured[0]["machine"]
     photographs, megapixels, cells = model.largest
     most = f"{photographs:,} photographs, {megapixels:.2f} megapixels, {cells / 1e6:.1f} million cells"
