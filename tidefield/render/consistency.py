@@ -119,10 +119,10 @@ def contradicted_shares(
         for j in others[k]:
             pixel, z = views[j].pixels(view.xyz_world)
             nearest, farthest = around[j]
-            told = (pixel >= 0) & views[j].known[pixel]
-            front = told & (z < (1 - SAME_DEPTH) * nearest[pixel])
-            against += front
-            agreeing += told & ~front & (z <= (1 + SAME_DEPTH) * farthest[pixel])
+            seen = (pixel >= 0) & views[j].known[pixel]
+            in_front = seen & (z < (1 - SAME_DEPTH) * nearest[pixel])
+            against += in_front
+            agreeing += seen & ~in_front & (z <= (1 + SAME_DEPTH) * farthest[pixel])
         result.append(against / np.maximum(against + agreeing, 1))
     return result
 
