@@ -11,6 +11,7 @@ from PIL import Image
 from rich.console import Console
 
 from tidefield import __version__
+from tidefield.data.holdout import Holdout
 from tidefield.errors import RunError
 from tidefield.evaluation import evaluate as module
 from tidefield.evaluation.evaluate import evaluate
@@ -70,6 +71,15 @@ def test_the_report_holds_every_key_that_scripts_rely_on(scene, tmp_path):
     assert report["width"] == 48
     assert report["peak_memory_bytes"] > 10_000_000
     assert report["rays_per_second"] == pytest.approx(48 * 36 / report["seconds_per_frame"])
+
+
+@pytest.mark.parametrize("prepared_without", [True, False])
+def test_the_report_says_whether_poses_know_of_the_held_out_photographs(prepared_without, scene, tmp_path):
+    scene = replace(scene, root=tmp_path)
+    if prepared_without:
+        Holdout(frozenset({"01.jpg"}), {}).write(tmp_path)
+    report = evaluate(perfect, scene, tmp_path / "out", configuration={}, console=quiet()).report
+    assert report["held_out_of_poses"] is prepared_without
 
 
 def test_a_colour_fit_undoes_an_exposure(scene, tmp_path):

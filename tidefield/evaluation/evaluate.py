@@ -21,6 +21,7 @@ from rich.table import Table
 
 from tidefield import __version__
 from tidefield.config import PROTOCOL
+from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
@@ -116,6 +117,7 @@ def evaluate(
         "version": __version__,
         "commit": commit(),
         "protocol": PROTOCOL,
+        "held_out_of_poses": (scene.root / HOLDOUT_FILE).exists(),
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
     }
