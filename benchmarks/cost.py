@@ -8,6 +8,7 @@ from its seconds and CPU seconds. Each measurement is also predicted from the ot
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +82,7 @@ def measure_costs(
 
     Args:
         flights: folders of `python -m benchmarks flight`, at least four, of different numbers and sizes of photographs.
-        work: folder for the scenes, runs and maps.
+        work: folder for the scenes, runs and maps; those of a flight that is measured are made anew.
         runs: folder of the record; what it holds is not measured again.
         device: of training and maps.
         say: reports progress.
@@ -94,7 +95,11 @@ def measure_costs(
         photographs = sorted((flight / "photographs").iterdir())
         with Image.open(photographs[0]) as first:
             megapixels = first.width * first.height / 1e6
-        scene, run, out = (work / f"{name.replace(' ', '_')}_{kind}" for kind in ("scene", TRAIN, MAP))
+        scene, run, out = folders = [work / f"{name.replace(' ', '_')}_{kind}" for kind in ("scene", TRAIN, MAP)]
+        for folder in folders:
+            if folder.exists():
+                # An interrupted measurement left it: a command that continues would be measured in part.
+                shutil.rmtree(folder)
         say(f"{name}: prepare")
         stages = run_by_stage(tidefield("prepare", flight / "photographs", scene), cores())
         say(f"{name}: train")

@@ -1,8 +1,19 @@
+from functools import partial
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
-from benchmarks.cost import Machines, Survey, fit_model, predicted_from_others, survey_of_area, write_page
+from benchmarks import cost
+from benchmarks.cost import (
+    Machines,
+    Survey,
+    fit_model,
+    measure_costs,
+    predicted_from_others,
+    survey_of_area,
+    write_page,
+)
 from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
@@ -52,6 +63,35 @@ def test_each_measurement_of_costs_is_predicted_without_itself():
     checks = predicted_from_others([odd, *(measurement(*of) for of in MEASURED[1:])], "cpu")
     truth, predicted = next(iter(checks.values()))
     assert truth > 500 > 3 * predicted
+
+
+def test_a_measurement_of_costs_that_was_interrupted_is_made_anew(tmp_path, monkeypatch):
+    photographs, work = tmp_path / "flight" / "photographs", tmp_path / "work"
+    photographs.mkdir(parents=True)
+    work.mkdir()
+    Image.new("RGB", (100, 80)).save(photographs / "0.png")
+    fails, found_there = ["train"], []
+
+    def run(command, threads):
+        step = next(word for word in ("prepare", "train", "map") if word in command)
+        out = command[command.index(step) + 2]
+        if out.exists():
+            found_there.append(out)
+        out.mkdir()
+        write_json(out / "map.json", {"cells": 10})
+        if step in fails:
+            raise RunError("killed")
+        return {"start": {"seconds": 1.0, "cpu_seconds": 2.0, "peak_bytes": 3.0}}
+
+    monkeypatch.setattr(cost, "run_by_stage", run)
+    monkeypatch.setattr(cost, "tidefield", lambda *words: words)
+    measure = partial(measure_costs, [tmp_path / "flight"], work, tmp_path, "cpu", lambda _: None)
+    with pytest.raises(RunError, match="killed"):
+        measure()
+    fails.clear()
+    record = measure()
+    assert not found_there
+    assert record["measured"]["flight cpu"]["megapixels"] == 0.008
 
 
 def test_an_area_has_the_photographs_that_its_overlaps_need():
