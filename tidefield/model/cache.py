@@ -24,9 +24,9 @@ from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
 from tidefield.parallel import in_parallel
 
-BLOCK_PX = 1024
+BLOCK_PX = 512
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
-OVERLAP_PX = 384
+OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
 BUDGET_BYTES = 1_500_000_000
 """Memory for features."""
