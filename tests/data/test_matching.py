@@ -146,6 +146,24 @@ def test_parts_of_a_large_picture_fit_together(monkeypatch: pytest.MonkeyPatch):
     assert ((parts - whole).abs() * STEP * at.cameras.focal_px[0, 0])[6:-6, 12:-12].max() < 0.3
 
 
+def test_a_large_picture_is_matched_at_half_its_size_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    camera = at.cameras[TARGET]
+    cells = 1.1 * surface_prior(camera, at.points, at.cameras)
+    sizes, match = [], Matcher._match
+
+    def noted(self: Matcher, camera: Cameras, start: Tensor, reach: float) -> Any:
+        sizes.append((camera.width, camera.height))
+        return match(self, camera, start, reach)
+
+    monkeypatch.setattr(Matcher, "_match", noted)
+    found = inverse_depth(Matcher(at, most_px=100)(camera, cells), camera)
+    assert sizes == [(64, 48)]
+    assert parallax_px(at, found)[12:-12, 16:-16].median() < 0.1
+    Matcher(at, most_px=128)(camera, cells)
+    assert sizes[1:] == [(128, 96)]
+
+
 def test_the_depth_priors_of_training_are_matched_once():
     at, calls = scene(), []
 

@@ -74,10 +74,12 @@ class Matcher:
     Args:
         scene: whose training photographs are compared, except for a camera's own.
         pyramid: of the scene, where there is one already.
+        most_px: pictures with a longer side are matched at half their size, or a quarter, ..., and the surface is
+            interpolated.
     """
 
-    def __init__(self, scene: Scene, pyramid: Pyramid | None = None) -> None:
-        self.scene, self.pyramid = scene, pyramid or Pyramid(scene)
+    def __init__(self, scene: Scene, pyramid: Pyramid | None = None, most_px: int | None = None) -> None:
+        self.scene, self.pyramid, self.most_px = scene, pyramid or Pyramid(scene), most_px
         self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self._reading = threading.Lock()
 
@@ -93,6 +95,21 @@ class Matcher:
         # Without any expected depth all of the range is searched first.
         reach = 0.0 if known.any() else float((near - far).max() / 2)
         known = known | ~known.any()
+        side = max(camera.width, camera.height)
+        octaves = max(0, math.ceil(math.log2(side / self.most_px))) if self.most_px else 0
+        found, half = (_resized(image, camera) for image in self._matched(_smaller(camera, octaves), start, reach))
+        middle, half = (_on_cells(cells, image) for image in (found, half))
+        ends = middle + half, torch.minimum(middle - half, middle)
+        result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
+        detail = found - _on_pixels(camera, torch.where(known, result[0], middle))
+        seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
+        return DepthPrior(result, torch.where(seen, detail, 0.0))
+
+    def _matched(
+        self, camera: Cameras, start: Float[Tensor, "A B"], reach: float
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+        """`_match` of a camera, part by part, from inverse depths on pixels of any size."""
+        start = _resized(start, camera)
         found, half = torch.empty_like(start), torch.empty_like(start)
 
         def match(outer: _Box, inner: _Box) -> None:
@@ -112,13 +129,7 @@ class Matcher:
             in_parallel(parts, start.device)
         else:
             parts[0]()
-        matched = torch.stack([_on_cells(cells, image) for image in (found, half)])
-        middle, half = matched
-        ends = middle + half, torch.minimum(middle - half, middle)
-        result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
-        detail = found - _on_pixels(camera, torch.where(known, result[0], middle))
-        seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
-        return DepthPrior(result, torch.where(seen, detail, 0.0))
+        return found, half
 
     def _match(
         self, camera: Cameras, start: Float[Tensor, "H W"], reach: float

@@ -50,6 +50,9 @@ FINAL_RATE = 0.02
 STEPS_EACH = 200
 """Steps in an area before the next one: each depth prior, which takes as long as a step where photographs are large, is
 then used a dozen times."""
+MATCHED_PX = 1024
+"""Longest side at which the surfaces of photographs are matched to learn from: all pixels of larger ones would take
+most of a few minutes."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
 
@@ -222,7 +225,7 @@ class SceneTrainer(Trainer):
                 self.scene.photographs.release()
             whole, targets = len(self.areas) == 1, self.areas[number]
             area = Area(self.scene, targets) if whole else select(self.scene, targets)
-            match = Matcher(area.scene) if self.network.matches_surface else None
+            match = Matcher(area.scene, most_px=MATCHED_PX) if self.network.matches_surface else None
             cameras = area.scene.cameras.to(self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match), cameras)
         return self._open
