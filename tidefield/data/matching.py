@@ -325,14 +325,29 @@ def _extent(used: Tensor) -> slice:
     return slice(int(where[0]), int(where[-1]) + 1) if len(where) else slice(0, 0)
 
 
-def _box(values: Tensor, side: int) -> Tensor:
-    """Means over windows, of a picture or of several."""
-    shape = values.shape
-    values = values.reshape(1, -1, *shape[-2:])
-    for window in ((side, 1), (1, side)):
-        padding = (window[0] // 2, window[1] // 2)
-        values = F.avg_pool2d(values, window, 1, padding, count_include_pad=False)
-    return values.reshape(shape)
+def _box(values: Float[Tensor, "*K H W"], side: int) -> Float[Tensor, "*K H W"]:
+    """Means over windows of an odd side; at the borders, of what lies within."""
+    for dim in (-2, -1):
+        counts = _window_sums(values.new_ones(values.shape[dim]), side, -1)
+        values = _window_sums(values, side, dim) / (counts[:, None] if dim == -2 else counts)
+    return values
+
+
+def _window_sums(values: Tensor, side: int, dim: int) -> Tensor:
+    """Sums over windows along a dimension, put together from sums of 1, 2, 4, ... values, each of which is a sum of two
+    of the one before: several times as fast on a CPU as `avg_pool2d`."""
+    size, half = values.shape[dim], side // 2
+    power = F.pad(values, [0, 0] * (-1 - dim) + [half, half])
+    total, start, width = torch.zeros_like(values), 0, 1
+    while True:
+        if side & width:
+            total += power.narrow(dim, start, size)
+            start += width
+        if 2 * width > side:
+            return total
+        left = power.shape[dim] - width
+        power = power.narrow(dim, 0, left) + power.narrow(dim, width, left)
+        width *= 2
 
 
 def _smoothed_up_to_edges(

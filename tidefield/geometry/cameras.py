@@ -180,8 +180,8 @@ class Cameras:
             sides.append(at[:, None] ** torch.arange(SHADING_DEGREE + 1, device=at.device))
         x, y = sides
         table = x.new_zeros(SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
-        for (of_x, of_y), row in zip(_exponents(SHADING_DEGREE), self.shading[0], strict=True):
-            table[of_y, of_x] = row
+        of_x, of_y = zip(*_exponents(SHADING_DEGREE), strict=True)
+        table[of_y, of_x] = self.shading[0]
         return self.gain[0] * torch.einsum("ha,abc,wb->hwc", y, table, x).exp()
 
     def resized(self, width: int, height: int) -> Cameras:
