@@ -202,8 +202,8 @@ SWIFT = Config(
         kind="swift",
         encoder=EncoderConfig(widths=(16, 16, 32, 64), blocks=(1, 1, 1), instance_norm=False),
         passes=(
-            PassConfig(stride=4, samples=12, feature_stride=4, feature_channels=32, hidden=32),
-            PassConfig(stride=1, samples=6, feature_stride=1, feature_channels=16, hidden=16),
+            PassConfig(stride=4, samples=8, feature_stride=4, feature_channels=32, hidden=32),
+            PassConfig(stride=1, samples=4, feature_stride=1, feature_channels=16, hidden=16),
         ),
         views=5,
         # Neither brings anything that can be measured there (docs/results.md, "What the paper's parts bring").
