@@ -244,6 +244,12 @@ def by_width(files: Sequence[Path]) -> dict[int, Results]:
     }
 
 
+PLACED_AFTERWARDS = (
+    "The scenes were made from photographs by `tidefield prepare --holdout`: their poses and points owe nothing to the "
+    "held-out photographs, either."
+)
+
+
 def _widths(sized: Mapping[int, Results]) -> list[str]:
     """Tables of quality and costs, of one width after another."""
     suffix = SHOWN_REGIONS[-1]
@@ -256,8 +262,10 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         marks = marks_of(results, learned_from())
         tables = quality_tables(results, {suffix: REGIONS[suffix]})
         costs = cost_table(results)
+        placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
         parts += [
             f"### {width} px",
+            *([PLACED_AFTERWARDS] if placed_afterwards else []),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),
             replace(costs, title=f"{width} px: {costs.title}").markdown(),

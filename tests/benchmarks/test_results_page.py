@@ -134,7 +134,10 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
     for file, (width, scene, psnr) in zip(files, kinds, strict=True):
         keep_result(file, scene, "tidefield", psnr)
         keep_result(file, scene, "sparse-depth", psnr - 1)
-        write_json(file, {"settings": {"width": width}, **(read_json(file) or {})})
+        record = {"settings": {"width": width}, **(read_json(file) or {})}
+        for result in record["results"]:
+            result["evaluation"]["held_out_of_poses"] = width == 800
+        write_json(file, record)
     table.write_page([], [], [], [*files, tmp_path / "none.json"], tmp_path, out)
     text = out.read_text()
     narrow, wide = text.index("### 400 px\n"), text.index("### 800 px\n")
@@ -144,6 +147,8 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
     assert wide < text.index("| swindale ² | **24.00** | 23.00 |")
     assert text.count("| fern ² |") == 4, "PSNR, SSIM, LPIPS and FLIP of one width"
     assert "### 800 px: Time and memory" in text
+    assert wide < text.index(table.PLACED_AFTERWARDS), "of the other scenes, all photographs were posed together"
+    assert text.count(table.PLACED_AFTERWARDS) == 1
 
 
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
