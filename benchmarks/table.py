@@ -263,8 +263,12 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         tables = quality_tables(results, {suffix: REGIONS[suffix]})
         costs = cost_table(results)
         placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
+        commits = sorted(
+            {str(one.evaluation["commit"])[:7] for one in results.by.values() if "commit" in one.evaluation}
+        )
         parts += [
             f"### {width} px",
+            *([f"Measured at commit {', '.join(commits)}."] if commits else []),
             *([PLACED_AFTERWARDS] if placed_afterwards else []),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),

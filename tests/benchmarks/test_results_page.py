@@ -136,7 +136,7 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
         keep_result(file, scene, "sparse-depth", psnr - 1)
         record = {"settings": {"width": width}, **(read_json(file) or {})}
         for result in record["results"]:
-            result["evaluation"]["held_out_of_poses"] = width == 800
+            result["evaluation"] |= {"held_out_of_poses": width == 800, "commit": f"{width}abcdef"}
         write_json(file, record)
     table.write_page([], [], [], [*files, tmp_path / "none.json"], tmp_path, out)
     text = out.read_text()
@@ -147,6 +147,7 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
     assert wide < text.index("| swindale ² | **24.00** | 23.00 |")
     assert text.count("| fern ² |") == 4, "PSNR, SSIM, LPIPS and FLIP of one width"
     assert "### 800 px: Time and memory" in text
+    assert narrow < text.index("commit 400abcd.") < wide < text.index("commit 800abcd.")
     assert wide < text.index(table.PLACED_AFTERWARDS), "of the other scenes, all photographs were posed together"
     assert text.count(table.PLACED_AFTERWARDS) == 1
 
