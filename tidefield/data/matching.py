@@ -384,6 +384,8 @@ def _smaller(camera: Cameras, octaves: int) -> Cameras:
 def _resized(image: Float[Tensor, "H W"], camera: Cameras) -> Float[Tensor, "h w"]:
     """An image of inverse depths on the pixels of a camera of another size."""
     size = camera.height, camera.width
+    if image.shape == size:
+        return image
     if image.shape[0] > size[0]:
         return F.interpolate(image[None, None], size=size, mode="area")[0, 0]
     return F.interpolate(image[None, None], size=size, mode="bilinear", align_corners=False)[0, 0]
