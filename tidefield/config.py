@@ -215,7 +215,7 @@ SWIFT = Config(
         crop_px=96,
         learning_rate=3e-3,
         unseen_weight=0.02,
-        structure_weight=1e-2,
+        structure_weight=3e-2,
         depth_weight=1e-4,
     ),
 )
