@@ -250,6 +250,21 @@ PLACED_AFTERWARDS = (
 )
 
 
+def _commits(results: Results) -> list[str]:
+    """Which commit measured what: columns of different commits are not of the same code."""
+    methods: dict[str, set[str]] = {}
+    for (_, method), one in results.by.items():
+        if "commit" in one.evaluation:
+            methods.setdefault(str(one.evaluation["commit"])[:7], set()).add(method)
+    if len(methods) < 2:
+        return [f"Measured at commit {commit}." for commit in methods]
+    return [
+        "Measured at different commits, whose code and settings differ: "
+        + "; ".join(f"{commit} ({', '.join(sorted(names))})" for commit, names in sorted(methods.items()))
+        + "."
+    ]
+
+
 def _widths(sized: Mapping[int, Results]) -> list[str]:
     """Tables of quality and costs, of one width after another."""
     suffix = SHOWN_REGIONS[-1]
@@ -263,12 +278,9 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         tables = quality_tables(results, {suffix: REGIONS[suffix]})
         costs = cost_table(results)
         placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
-        commits = sorted(
-            {str(one.evaluation["commit"])[:7] for one in results.by.values() if "commit" in one.evaluation}
-        )
         parts += [
             f"### {width} px",
-            *([f"Measured at commit {', '.join(commits)}."] if commits else []),
+            *_commits(results),
             *([PLACED_AFTERWARDS] if placed_afterwards else []),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),

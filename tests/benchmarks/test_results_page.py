@@ -152,6 +152,18 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
     assert text.count(table.PLACED_AFTERWARDS) == 1
 
 
+def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
+    file, out = tmp_path / "a.json", tmp_path / "results.md"
+    keep_result(file, "fern", "tidefield", 24.0)
+    keep_result(file, "fern", "sparse-depth", 23.0)
+    record = {"settings": {"width": 400}, **(read_json(file) or {})}
+    for result in record["results"]:
+        result["evaluation"]["commit"] = "1234567890" if result["method"] == "tidefield" else "abcdefabcd"
+    write_json(file, record)
+    table.write_page([], [], [], [file], tmp_path, out)
+    assert "code and settings differ: 1234567 (tidefield); abcdefa (sparse-depth).\n" in out.read_text()
+
+
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
     file, out = tmp_path / "comparison.json", tmp_path / "page.md"
     keep_result(file, "swindale", "tidefield", 24.0)
