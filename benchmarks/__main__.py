@@ -715,7 +715,7 @@ def table(
     print(out)
 
 
-def card(weights: Path, comparison: tuple[Path, ...] = COMPARISON) -> None:
+def card(weights: Path, comparison: tuple[Path, ...] = WIDTHS[:2]) -> None:
     """Write the card of weights, from the file itself and from stored measurements.
 
     Args:

@@ -239,6 +239,7 @@ def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkey
     assert started.weights == weights_sha256(tmp_path / "swift.safetensors")
     assert isinstance(started.config, Config)
     assert started.config.train.warm_up == 200
+    assert started.config.train.learning_rate == SMALL.train.learning_rate / 3
     assert far < 1e-4, "two steps of a two-hundred-step rise"
     same, _ = moved("same", variant="neighbours-direction")
     assert same.weights == started.weights, "other neighbours, but the same network"
