@@ -251,18 +251,24 @@ PLACED_AFTERWARDS = (
 
 
 def _commits(results: Results) -> list[str]:
-    """Which commit measured what: columns of different commits are not of the same code."""
-    methods: dict[str, set[str]] = {}
-    for (_, method), one in results.by.items():
+    """Which commit measured what: columns, or scenes of a column, of different commits are not of the same code."""
+    scenes: dict[str, dict[str, set[str]]] = {}
+    measured: dict[str, set[str]] = {}
+    for (scene, method), one in results.by.items():
         if "commit" in one.evaluation:
-            methods.setdefault(str(one.evaluation["commit"])[:7], set()).add(method)
-    if len(methods) < 2:
-        return [f"Measured at commit {commit}." for commit in methods]
-    return [
-        "Measured at different commits, whose code and settings differ: "
-        + "; ".join(f"{commit} ({', '.join(sorted(names))})" for commit, names in sorted(methods.items()))
-        + "."
-    ]
+            of_commit = scenes.setdefault(str(one.evaluation["commit"])[:7], {})
+            of_commit.setdefault(method, set()).add(scene)
+            measured.setdefault(method, set()).add(scene)
+    if len(scenes) < 2:
+        return [f"Measured at commit {commit}." for commit in scenes]
+    parts = []
+    for commit, of_commit in sorted(scenes.items()):
+        methods: dict[str, list[str]] = {}
+        for method, own in sorted(of_commit.items()):
+            of = "" if own == measured[method] else f" of {', '.join(sorted(own))}"
+            methods.setdefault(of, []).append(method)
+        parts.append(f"{commit} ({'; '.join(', '.join(names) + of for of, names in methods.items())})")
+    return [f"Measured at different commits, whose code and settings differ: {'; '.join(parts)}."]
 
 
 def _widths(sized: Mapping[int, Results]) -> list[str]:

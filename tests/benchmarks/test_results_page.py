@@ -162,6 +162,14 @@ def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
     write_json(file, record)
     table.write_page([], [], [], [file], tmp_path, out)
     assert "code and settings differ: 1234567 (tidefield); abcdefa (sparse-depth).\n" in out.read_text()
+    keep_result(file, "lego", "tidefield", 25.0)
+    record = {"settings": {"width": 400}, **(read_json(file) or {})}
+    for result in record["results"]:
+        result["evaluation"]["commit"] = "1234567890" if result["scene"] == "lego" else "abcdefabcd"
+    write_json(file, record)
+    table.write_page([], [], [], [file], tmp_path, out)
+    told = "differ: 1234567 (tidefield of lego); abcdefa (sparse-depth; tidefield of fern).\n"
+    assert told in out.read_text(), "of a column that was measured twice, the scenes"
 
 
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
