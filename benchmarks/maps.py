@@ -20,7 +20,7 @@ from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
-from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, map_frame
 from tidefield.maps.make import CLASSES, DSM, MAP_FILE, ORTHOPHOTO, SIGMA
 from tidefield.maps.surface import COARSEST, sparse_surface

@@ -13,7 +13,8 @@ from tidefield import cli
 from tidefield.change.inputs import open_pair, open_survey
 from tidefield.change.surfaces import ChangeError
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.cloud import GROUND, cloud_writer
+from tidefield.maps.classes import GROUND
+from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.grid import LOCAL_NAME, LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.make import CLOUD, DSM, FILLED, ORTHOPHOTO, SIGMA
 from tidefield.maps.rasters import NODATA, Raster, raster_writer

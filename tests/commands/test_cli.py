@@ -330,3 +330,8 @@ def test_help_does_not_import_torch() -> None:
     start = time.monotonic()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("fine\n"), time.monotonic() - start
+
+
+def test_surfaces_and_clouds_to_compare_are_read_without_torch() -> None:
+    code = "import sys, tidefield.change.inputs, tidefield.change.measure; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from tidefield.maps import contours, masks
-from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.masks import excess_green, find_water, read_water, write_classes, write_masks
 from tidefield.maps.rasters import Raster, raster_writer, read_raster

@@ -15,14 +15,12 @@ from pyproj import CRS, Transformer
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.surfaces import ChangeError, Grid
 from tidefield.files import reading_from
-from tidefield.maps.cloud import WATER
+from tidefield.maps.classes import NOISE, WATER
 
 if TYPE_CHECKING:
     from types import ModuleType
 
 _MOST_POINTS = 200_000_000
-_NOISE = (7, 18)
-"""Classes of noise (LAS 1.4)."""
 _POINTS_PER_CELL = 10.0
 """With fewer, cells without points are holes in the surface, and are missing in volumes."""
 _CHUNK = 2_000_000
@@ -80,7 +78,7 @@ def read_cloud(path: Path) -> Cloud:
             extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
             parts, sigmas = [], []
             for points in reader.chunk_iterator(_CHUNK):
-                kept = ~np.isin(np.asarray(points.classification), (*_NOISE, WATER))
+                kept = ~np.isin(np.asarray(points.classification), (*NOISE, WATER))
                 xyz = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
                 kept &= np.isfinite(xyz).all(axis=1)
                 parts.append(xyz[kept])

@@ -16,8 +16,6 @@ from tidefield.files import completed_file
 from tidefield.maps.grid import Grid
 from tidefield.maps.rasters import need
 
-GROUND, VEGETATION, WATER = 2, 3, 9
-"""Classes of the LAS specification (ASPRS, LAS 1.4 R15, table 17)."""
 SCALE = 0.001
 """Coordinates are rounded to so many units."""
 

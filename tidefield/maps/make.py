@@ -26,7 +26,8 @@ from tidefield.files import completed_file, delete_partials, read_json, write_js
 from tidefield.machine import cores
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
-from tidefield.maps.cloud import GROUND, VEGETATION, WATER, cloud_writer
+from tidefield.maps.classes import GROUND, VEGETATION, WATER
+from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.masks import Body, read_water, write_classes, write_masks

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.contours import read_reduced
 from tidefield.maps.grid import Grid
 from tidefield.maps.rasters import Raster, need, raster_writer

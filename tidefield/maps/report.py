@@ -15,7 +15,7 @@ from PIL import Image
 
 from tidefield import __version__
 from tidefield.files import write_text
-from tidefield.maps.cloud import GROUND, VEGETATION, WATER
+from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.rasters import need
 from tidefield.pages import template_environment
 
