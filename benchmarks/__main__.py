@@ -21,7 +21,8 @@ from tidefield.machine import tune_process
 MEASURED = Path("docs/measured")
 COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
-WIDTHS = tuple(MEASURED / f"{name}.json" for name in ("strict_400", "strict_400_scenes", "strict_800", "strict_1600"))
+STRICT_400 = tuple(MEASURED / f"strict_400{rest}.json" for rest in ("", "_scenes"))
+WIDTHS = (*STRICT_400, *(MEASURED / f"strict_{width}.json" for width in (800, 1600)))
 LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
 DESCRIPTION = """Measure speed, views, memory, surveys and robustness, and write the pages of results. Without a name,
 it is speed. `tidefield compare` and `tidefield ablate` measure quality.
@@ -715,7 +716,7 @@ def table(
     print(out)
 
 
-def card(weights: Path, comparison: tuple[Path, ...] = WIDTHS[:2]) -> None:
+def card(weights: Path, comparison: tuple[Path, ...] = STRICT_400) -> None:
     """Write the card of weights, from the file itself and from stored measurements.
 
     Args:

@@ -252,22 +252,26 @@ PLACED_AFTERWARDS = (
 
 def _commits(results: Results) -> list[str]:
     """Which commit measured what: columns, or scenes of a column, of different commits are not of the same code."""
-    scenes: dict[str, dict[str, set[str]]] = {}
-    measured: dict[str, set[str]] = {}
-    for (scene, method), one in results.by.items():
-        if "commit" in one.evaluation:
-            of_commit = scenes.setdefault(str(one.evaluation["commit"])[:7], {})
-            of_commit.setdefault(method, set()).add(scene)
-            measured.setdefault(method, set()).add(scene)
-    if len(scenes) < 2:
-        return [f"Measured at commit {commit}." for commit in scenes]
+    measured = sorted(
+        (str(one.evaluation["commit"])[:7], method, scene)
+        for (scene, method), one in results.by.items()
+        if "commit" in one.evaluation
+    )
+    commits = sorted({commit for commit, _, _ in measured})
+    if len(commits) < 2:
+        return [f"Measured at commit {commit}." for commit in commits]
+
+    def scenes(commit: str, method: str) -> str:
+        """Of a column that one commit did not measure alone."""
+        own = [scene for *of, scene in measured if of == [commit, method]]
+        return "" if len(own) == sum(other == method for _, other, _ in measured) else f" of {', '.join(own)}"
+
     parts = []
-    for commit, of_commit in sorted(scenes.items()):
-        methods: dict[str, list[str]] = {}
-        for method, own in sorted(of_commit.items()):
-            of = "" if own == measured[method] else f" of {', '.join(sorted(own))}"
-            methods.setdefault(of, []).append(method)
-        parts.append(f"{commit} ({'; '.join(', '.join(names) + of for of, names in methods.items())})")
+    for commit in commits:
+        columns: dict[str, list[str]] = {}
+        for method in sorted({method for of, method, _ in measured if of == commit}):
+            columns.setdefault(scenes(commit, method), []).append(method)
+        parts.append(f"{commit} ({'; '.join(', '.join(methods) + of for of, methods in columns.items())})")
     return [f"Measured at different commits, whose code and settings differ: {'; '.join(parts)}."]
 
 

@@ -154,22 +154,22 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
 
 def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
     file, out = tmp_path / "a.json", tmp_path / "results.md"
+
+    def page(new: str, value: str) -> str:
+        """The page when results whose scene or method (`new`) is this one are of another commit than the rest."""
+        record = {"settings": {"width": 400}, **(read_json(file) or {})}
+        for result in record["results"]:
+            result["evaluation"]["commit"] = "1234567890" if result[new] == value else "abcdefabcd"
+        write_json(file, record)
+        table.write_page([], [], [], [file], tmp_path, out)
+        return out.read_text()
+
     keep_result(file, "fern", "tidefield", 24.0)
     keep_result(file, "fern", "sparse-depth", 23.0)
-    record = {"settings": {"width": 400}, **(read_json(file) or {})}
-    for result in record["results"]:
-        result["evaluation"]["commit"] = "1234567890" if result["method"] == "tidefield" else "abcdefabcd"
-    write_json(file, record)
-    table.write_page([], [], [], [file], tmp_path, out)
-    assert "code and settings differ: 1234567 (tidefield); abcdefa (sparse-depth).\n" in out.read_text()
+    assert "code and settings differ: 1234567 (tidefield); abcdefa (sparse-depth).\n" in page("method", "tidefield")
     keep_result(file, "lego", "tidefield", 25.0)
-    record = {"settings": {"width": 400}, **(read_json(file) or {})}
-    for result in record["results"]:
-        result["evaluation"]["commit"] = "1234567890" if result["scene"] == "lego" else "abcdefabcd"
-    write_json(file, record)
-    table.write_page([], [], [], [file], tmp_path, out)
-    told = "differ: 1234567 (tidefield of lego); abcdefa (sparse-depth; tidefield of fern).\n"
-    assert told in out.read_text(), "of a column that was measured twice, the scenes"
+    found = "differ: 1234567 (tidefield of lego); abcdefa (sparse-depth; tidefield of fern).\n"
+    assert found in page("scene", "lego"), "the scenes, where a column is of two commits"
 
 
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
