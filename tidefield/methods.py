@@ -95,16 +95,19 @@ def configuration(name: str, preset: str = "swift", program: Path | None = None)
     return config if method.variant is None else vary(config, method.variant)
 
 
-def untrained(name: str, scene: Scene) -> Render:
-    """A baseline that needs no training."""
+def untrained(name: str, scene: Scene, sampling: Sampling = USUAL_SAMPLING) -> Render:
+    """A baseline that needs no training, with as many rays per pixel as asked for."""
     from tidefield.baselines import untrained
+    from tidefield.data.load import at_twice_the_size
+    from tidefield.model.rendering import with_rays
 
-    return {
+    make = {
         "plane-sweep": untrained.plane_sweep,
         "sparse-depth": untrained.sparse_depth,
         "sparse-depth-as-given": untrained.sparse_depth_as_given,
         "nearest": untrained.nearest,
-    }[name](scene)
+    }[name]
+    return with_rays(make(scene, at_twice_the_size(scene) if sampling.cones else None), sampling)
 
 
 def make_trainer(

@@ -20,7 +20,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras, angle_between
 from tidefield.model.rendering import Render, Rendering, fill_unseen
-from tidefield.model.views import upsample_twice
+from tidefield.model.views import pixel_means, upsample_twice
 
 VIEWS = 4
 """Photographs that `sparse_depth` blends."""
@@ -40,25 +40,32 @@ USUAL_SPREAD = 0.1
 """Of colours between photographs, per channel; stands in for what too few photographs cannot show."""
 
 
-def read_photograph(scene: Scene, index: int, uv_px: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+def read_photograph(
+    scene: Scene, index: int, uv_px: Float[Tensor, "P 2"], doubled: Scene | None = None
+) -> Float[Tensor, "P 3"]:
     """Read colours of one photograph at pixels inside its frame, at the scene's common exposure.
 
-    Interpolates as our network does (`upsample_twice`), so that what is better than these baselines is not better for
-    sharper reading.
+    Reads as our network does, means over pixels of the scene at twice the size (`pixel_means`) or else interpolated
+    ones (`upsample_twice`), so that what is better than these baselines is not better for sharper reading.
     """
     photograph = scene.photographs[index]
     # Only the part that is needed is turned into floats: memory follows the caller's chunk, not the photograph.
     low = (uv_px.amin(0) - CUBIC_REACH_PX).long().clamp(min=0)
     left, top = low.tolist()
     right, bottom = (uv_px.amax(0) + CUBIC_REACH_PX + 1).long().tolist()
-    crop = photograph[top:bottom, left:right].to(uv_px.device, uv_px.dtype).permute(2, 0, 1)[None]
-    texel = 2 * (uv_px - low) - 0.5  # twice as many texels, of which the first is centred on the first pixel
-    grid = texel / uv_px.new_tensor([crop.shape[3], crop.shape[2]]) - 1
-    colour = F.grid_sample(upsample_twice(crop), grid[None, None], padding_mode="border", align_corners=False)
+    if doubled is None:
+        crop, texels_from = photograph[top:bottom, left:right], upsample_twice
+    else:
+        crop = doubled.photographs[index][2 * top : 2 * bottom, 2 * left : 2 * right]
+        texels_from = pixel_means
+    texels = texels_from(crop.to(uv_px.device, uv_px.dtype).permute(2, 0, 1)[None])
+    texel = 2 * (uv_px - low) - 0.5  # twice as many texels as pixels, of which the first is centred on the first pixel
+    grid = 2 * texel / uv_px.new_tensor([texels.shape[3], texels.shape[2]]) - 1
+    colour = F.grid_sample(texels, grid[None, None], padding_mode="border", align_corners=False)
     return colour[0, :, 0].T / 255 / scene.cameras[index].gain_at(uv_px[None])[0].to(uv_px)
 
 
-def nearest(scene: Scene) -> Render:
+def nearest(scene: Scene, doubled: Scene | None = None) -> Render:
     """Project the nearest photograph onto the surface through the sparse points.
 
     Only photographs that see at least half as much of that surface as the best of them are candidates.
@@ -76,13 +83,13 @@ def nearest(scene: Scene) -> Render:
         best = int(distance.masked_fill(overlap < overlap.max() / 2, torch.inf).argmin())
         colour = torch.zeros_like(points_world)
         if seen[best].any():
-            colour[seen[best]] = read_photograph(scene, indices[best], uv[best, seen[best]])
+            colour[seen[best]] = read_photograph(scene, indices[best], uv[best, seen[best]], doubled)
         return _filled(camera, colour, depth, seen[best])
 
     return render
 
 
-def sparse_depth(scene: Scene) -> Render:
+def sparse_depth(scene: Scene, doubled: Scene | None = None) -> Render:
     """Blend the four photographs of the most similar directions on the surface through the sparse points.
 
     The weights are those of unstructured lumigraph rendering (Buehler et al., 2001). On plain ground with dense overlap
@@ -93,24 +100,26 @@ def sparse_depth(scene: Scene) -> Render:
         indices = scene.sources(camera)
         depth = surface_depth(camera, scene.points, scene.cameras)
         chunks = surface_points(camera, depth).split(max(1, CHUNK // len(indices)))
-        blended = torch.cat([_blend(scene, indices, camera, chunk) for chunk in chunks])
+        blended = torch.cat([_blend(scene, doubled, indices, camera, chunk) for chunk in chunks])
         return _filled(camera, blended[:, :3], depth, blended[:, 3] > 0)
 
     return render
 
 
-def sparse_depth_as_given(scene: Scene) -> Render:
+def sparse_depth_as_given(scene: Scene, doubled: Scene | None = None) -> Render:
     """Blend like `sparse_depth`, without the lens residual and the shading that are estimated when a scene is opened.
 
     It tells what these two bring, which every other method shares (docs/method.md, sections 12 and 14).
     """
     width = int(scene.cameras.size_px[:, 0].max())
     given = load_scene(scene.root, width=width, allow_missing=True, hold_out=bool(scene.test), calibrate=False)
-    render = sparse_depth(given)
+    render = sparse_depth(given, doubled)
     return lambda camera: render(replace(camera, residual=None, shading=None))
 
 
-def plane_sweep(scene: Scene, *, depths: int = DEPTHS, neighbours: int = NEIGHBOURS) -> Render:
+def plane_sweep(
+    scene: Scene, doubled: Scene | None = None, *, depths: int = DEPTHS, neighbours: int = NEIGHBOURS
+) -> Render:
     """Blend photographs at the depth at which they match best (Collins, 1996); reads no sparse points.
 
     Planes parallel to the image, evenly spaced in inverse depth between the camera's near and far; the photographs'
@@ -119,8 +128,8 @@ def plane_sweep(scene: Scene, *, depths: int = DEPTHS, neighbours: int = NEIGHBO
 
     def render(camera: Cameras) -> Rendering:
         views = nearest_photographs(scene, camera, neighbours)
-        depth = _sweep(scene, camera, views, depths)
-        colour, count, _ = _match(scene, camera, views, depth)
+        depth = _sweep(scene, doubled, camera, views, depths)
+        colour, count, _ = _match(scene, doubled, camera, views, depth)
         return _filled(camera, colour.flatten(0, 1), depth, (count > 0).flatten())
 
     return render
@@ -160,7 +169,11 @@ def _angles(camera: Cameras, sources: Cameras, points_world: Float[Tensor, "P 3"
 
 
 def _blend(
-    scene: Scene, indices: tuple[int, ...], camera: Cameras, points_world: Float[Tensor, "P 3"]
+    scene: Scene,
+    doubled: Scene | None,
+    indices: tuple[int, ...],
+    camera: Cameras,
+    points_world: Float[Tensor, "P 3"],
 ) -> Float[Tensor, "P 4"]:
     """Weighted mean colour of each surface point, and the sum of its weights: 0 where no photograph sees it."""
     sources = scene.cameras[list(indices)]
@@ -177,12 +190,12 @@ def _blend(
     for source, index in enumerate(indices):
         rank, point = torch.nonzero((which[:VIEWS] == source) & (weight > 0), as_tuple=True)
         if len(point):
-            total[point] += weight[rank, point, None] * read_photograph(scene, index, uv[source, point])
+            total[point] += weight[rank, point, None] * read_photograph(scene, index, uv[source, point], doubled)
     weight_sum = weight.sum(0)[:, None]
     return torch.cat([torch.where(weight_sum > 0, total / weight_sum, total), weight_sum], dim=-1)
 
 
-def _sweep(scene: Scene, camera: Cameras, views: list[int], depths: int) -> Float[Tensor, "H W"]:
+def _sweep(scene: Scene, doubled: Scene | None, camera: Cameras, views: list[int], depths: int) -> Float[Tensor, "H W"]:
     """The depth of least variance; the middle plane where no depth has two photographs to compare."""
     near, far = camera.near_far[0]
     shape = (camera.height, camera.width)
@@ -190,7 +203,7 @@ def _sweep(scene: Scene, camera: Cameras, views: list[int], depths: int) -> Floa
     best_cost = torch.full(shape, torch.inf, device=near.device)
     for share in torch.linspace(0, 1, depths).tolist():
         depth = 1 / ((1 - share) / near + share / far)
-        _, count, variance = _match(scene, camera, views, depth.expand(shape))
+        _, count, variance = _match(scene, doubled, camera, views, depth.expand(shape))
         cost = _windowed(variance, count >= 2)
         better = cost < best_cost
         best_cost = torch.where(better, cost, best_cost)
@@ -199,7 +212,7 @@ def _sweep(scene: Scene, camera: Cameras, views: list[int], depths: int) -> Floa
 
 
 def _match(
-    scene: Scene, camera: Cameras, views: list[int], depth: Float[Tensor, "H W"]
+    scene: Scene, doubled: Scene | None, camera: Cameras, views: list[int], depth: Float[Tensor, "H W"]
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"], Float[Tensor, "H W"]]:
     """Mean colour of the photographs that see each pixel's point, how many do, and the variance of that mean."""
     points_world = surface_points(camera, depth)
@@ -211,7 +224,7 @@ def _match(
         inside = in_frame(source, uv, z, scene.photographs.masks_of([index]))[0]
         if not inside.any():
             continue
-        colour = read_photograph(scene, index, uv[0, inside])
+        colour = read_photograph(scene, index, uv[0, inside], doubled)
         total[inside] += colour
         squares[inside] += colour.square()
         count[inside] += 1

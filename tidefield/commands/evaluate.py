@@ -64,7 +64,6 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     from tidefield.device import choose_device
     from tidefield.evaluation.evaluate import evaluate as evaluate_method
     from tidefield.evaluation.lpips import download_lpips_weights
-    from tidefield.model.rendering import with_rays
 
     if options.download_lpips:
         download_lpips_weights()
@@ -91,7 +90,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     if method is not None:
         side = sampling.rays_per_side or 1
         record = {"method": method, **({"rays_per_side": side} if side > 1 else {})}
-        render = with_rays(untrained(method, scene), sampling)
+        render = untrained(method, scene, sampling)
         return evaluate_method(render, scene, out, configuration=record, **settings)
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
     truth = scene if options.opened_width is None or options.width is None else at_width(scene, options.width)

@@ -38,10 +38,12 @@ class Area:
     Attributes:
         scene: the area's photographs and those that see its ground, all of them training photographs.
         targets: indices in `scene` of the area's own photographs.
+        doubled: the same photographs at twice the size (`load.at_twice_the_size`).
     """
 
     scene: Scene
     targets: tuple[int, ...]
+    doubled: Scene | None = None
 
 
 def cut(scene: Scene, whole: int = WHOLE, most: int = MOST, whole_bytes: float = WHOLE_BYTES) -> list[tuple[int, ...]]:
@@ -77,17 +79,28 @@ def halves(points: Float64[np.ndarray, "N D"], most: int) -> list[list[int]]:
     return parts(np.arange(len(points)))
 
 
-def select(scene: Scene, targets: Sequence[int]) -> Area:
+def select(scene: Scene, targets: Sequence[int], doubled: Scene | None = None) -> Area:
     """Select an area of a scene: some training photographs, and all others that see their ground.
 
     The ground of a photograph is looked at in 25 of its pixels, at its nearest, farthest and mean inverse depth.
+
+    Args:
+        scene: to select from.
+        targets: the photographs.
+        doubled: the scene at twice the size, if it is read.
     """
     train = torch.tensor(scene.train)
     seeing = which_see(scene.cameras[train], _ground(scene.cameras[list(targets)]))
     seeing |= torch.isin(train, torch.tensor(targets))
     kept = train[seeing].tolist()
+    of = {index: k for k, index in enumerate(kept)}
+    return Area(_part(scene, kept), tuple(of[i] for i in targets), doubled and _part(doubled, kept))
+
+
+def _part(scene: Scene, kept: list[int]) -> Scene:
+    """The scene of some photographs, all of them training photographs."""
     photographs = scene.photographs
-    part = replace(
+    return replace(
         scene,
         names=tuple(scene.names[i] for i in kept),
         cameras=scene.cameras[kept],
@@ -102,8 +115,6 @@ def select(scene: Scene, targets: Sequence[int]) -> Area:
         train=tuple(range(len(kept))),
         test=(),
     )
-    of = {index: k for k, index in enumerate(kept)}
-    return Area(part, tuple(of[i] for i in targets))
 
 
 def _ground(cameras: Cameras) -> Float[Tensor, "K 3"]:

@@ -42,6 +42,7 @@ class Batch:
         images: what to encode, in groups of one size: crops of photographs, or whole ones.
         image_corner_px: upper left corners of the images in their photographs.
         image_used: 1 for pixels of the images that are not masked; empty if the scene has no masks.
+        image_doubled: the images at twice the size; empty if they are not read.
     """
 
     targets: Int[Tensor, " T"]
@@ -57,6 +58,7 @@ class Batch:
     images: tuple[Float[Tensor, "_ 3 _ _"], ...]
     image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
     image_used: tuple[Float[Tensor, "_ 1 _ _"], ...] = ()
+    image_doubled: tuple[Float[Tensor, "_ 3 _ _"], ...] = ()
 
     def to(self, device: torch.device) -> Batch:
         def move(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
@@ -80,6 +82,7 @@ class Batch:
             images=(self.images[0][chosen],),
             image_corner_px=(self.image_corner_px[0][chosen],),
             image_used=tuple(used[chosen] for used in self.image_used),
+            image_doubled=tuple(doubled[chosen] for doubled in self.image_doubled),
         )
 
 
@@ -119,6 +122,7 @@ def draw_batch(
     views: int,
     generator: torch.Generator,
     of: Sequence[int] | None = None,
+    doubled: Scene | None = None,
 ) -> Batch:
     """Draw random tiles of random training photographs.
 
@@ -126,6 +130,7 @@ def draw_batch(
         priors: of the scene.
         views: neighbouring views at each corner of a tile; 0 encodes nothing.
         of: training photographs to draw from; all of them if not given.
+        doubled: the scene at twice the size, where crops are read from it, too.
     """
     side = config.tile_px
     train = torch.tensor(scene.train)
@@ -153,11 +158,11 @@ def draw_batch(
     columns = (torch.stack(column) for column in zip(*tiles, strict=True))
     colours, weight, detail, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
     if not views:
-        which, images, corners, used = neighbours, (), (), ()
+        which, images, corners, used, twice = neighbours, (), (), (), ()
     elif config.crop_px is None:
-        which, images, corners, used = _whole(scene, neighbours)
+        which, images, corners, used, twice = *_whole(scene, neighbours), ()
     else:
-        which, images, corners, used = _crops(scene, neighbours, middles_world, config.crop_px)
+        which, images, corners, used, twice = _crops(scene, neighbours, middles_world, config.crop_px, doubled)
     return Batch(
         targets=targets,
         corner_px=corner,
@@ -172,6 +177,7 @@ def draw_batch(
         images=images,
         image_corner_px=corners,
         image_used=used,
+        image_doubled=twice,
     )
 
 
@@ -208,8 +214,14 @@ def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> _Images:
     return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images), used
 
 
-def _crops(scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Tensor, "T 3"], side: int) -> _Images:
-    """A crop of every neighbour of each tile, around the projection of the tile's middle."""
+def _crops(
+    scene: Scene,
+    neighbours: Int[Tensor, "T N"],
+    middle_world: Float[Tensor, "T 3"],
+    side: int,
+    doubled: Scene | None,
+) -> tuple[*_Images, tuple[Tensor, ...]]:
+    """A crop of every neighbour of each tile, around the projection of the tile's middle; also at twice the size."""
     flat = neighbours.reshape(-1)
     cameras = scene.cameras[flat]
     points = middle_world.repeat_interleave(neighbours.shape[1], 0)
@@ -225,4 +237,8 @@ def _crops(scene: Scene, neighbours: Int[Tensor, "T N"], middle_world: Float[Ten
     used: tuple[Tensor, ...] = ()
     if scene.photographs.masks:
         used = (torch.stack([scene.photographs.used(i)[None, rows, columns].float() for i, rows, columns in places]),)
-    return torch.arange(len(flat)).reshape(neighbours.shape), (crops,), (corner,), used
+    twice: tuple[Tensor, ...] = ()
+    if doubled is not None:
+        larger = [(i, *(slice(2 * one.start, 2 * one.stop) for one in part)) for i, *part in places]
+        twice = (torch.stack([to_common_exposure(doubled, *place).permute(2, 0, 1) for place in larger]),)
+    return torch.arange(len(flat)).reshape(neighbours.shape), (crops,), (corner,), used, twice

@@ -326,4 +326,11 @@ def to_common_exposure(
     scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)
 ) -> Float[Tensor, "h w 3"]:
     """Read a part of a photograph in the common light: divided by gain and shading (docs/method.md, section 12)."""
-    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras[index].gain_of_rows(rows, columns))
+    return in_common_light(scene.photographs[index], scene.cameras[index], rows, columns)
+
+
+def in_common_light(
+    photograph: UInt8[Tensor, "H W 3"], camera: Cameras, rows: slice = slice(None), columns: slice = slice(None)
+) -> Float[Tensor, "h w 3"]:
+    """Bring a part of a photograph of a camera into the common light, as `to_common_exposure` does."""
+    return photograph[rows, columns].float() / (255 * camera.gain_of_rows(rows, columns))

@@ -88,6 +88,10 @@ class Photographs:
         """Return the width of a photograph's file, or of the photograph where it comes from none."""
         return self.files[index].lens.width if self.files else self.colours[index].shape[1]
 
+    def reaches(self, index: int, width: int) -> bool:
+        """Whether a photograph's file has a width, or hardly less: undistorted ones have lost a few columns."""
+        return width <= 1.02 * self.finest_width(index)
+
     def alpha(self, index: int) -> UInt8[Tensor, "H W"] | None:
         return self.alphas[index] if self.alphas else None
 

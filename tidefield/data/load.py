@@ -87,6 +87,8 @@ LAYOUTS = (
 _FEWEST = 3
 _SMALLEST_WIDTH = 16
 _WHITE = (1.0, 1.0, 1.0)
+DOUBLED_BYTES = 4e9
+"""Of photographs that are opened at twice their size: disk of the cache, and memory that is read through it."""
 
 
 def load_scene(
@@ -186,7 +188,29 @@ def at_width(scene: Scene, width: int, progress: Progress | None = None, cache: 
         width, progress, cache: see `load_scene`.
     """
     require_width(width)
-    files = [file.at_width(width) for file in scene.photographs.files]
+    return _reopened(scene, [file.at_width(width) for file in scene.photographs.files], progress, cache)
+
+
+def at_twice_the_size(scene: Scene, progress: Progress | None = None, cache: Path | None = None) -> Scene | None:
+    """Open a scene's photographs at exactly twice their size, to read means over their pixels between them.
+
+    Args:
+        scene: from `load_scene`.
+        progress, cache: see `load_scene`.
+
+    Returns:
+        None where a file has less than that, where there are no files, or where it is more than `DOUBLED_BYTES`.
+    """
+    photographs = scene.photographs
+    files = [replace(file, width=2 * file.width, height=2 * file.height) for file in photographs.files]
+    if not files or sum(file.bytes for file in files) > DOUBLED_BYTES:
+        return None
+    if not all(photographs.reaches(index, file.width) for index, file in enumerate(files)):
+        return None
+    return _reopened(scene, files, progress, cache)
+
+
+def _reopened(scene: Scene, files: list[PhotographFile], progress: Progress | None, cache: Path | None) -> Scene:
     size = torch.tensor([(file.width, file.height) for file in files])
     ratio, points = size / scene.cameras.size_px, scene.points
     if points is not None:

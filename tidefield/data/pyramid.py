@@ -49,7 +49,7 @@ class Pyramid:
         self._range = torch.stack([coarsest, finest.clamp(min=0)]).long()
         self.first, last = int(self._range[0].min()), int(self._range[1].max())
         self.cameras = concatenate([self._cameras(level) for level in range(self.first, last + 1)])
-        self._kept: OrderedDict[tuple[int, int], tuple[Tensor, Tensor | None]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, int, int], tuple[Tensor, Tensor | None]] = OrderedDict()
 
     def _cameras(self, level: int) -> Cameras:
         """The cameras of all photographs at a level, or at the nearest one that they have."""
@@ -103,12 +103,29 @@ class Pyramid:
         """Read a photograph at a level, and where it is used if it has a mask."""
         photographs = self.scene.photographs
         own, mask = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
-        if level == 0:
-            return own, mask
-        key = photograph, level
+        return (own, mask) if level == 0 else self._read(photograph, self.camera(photograph, level).size_px[0].tolist())
+
+    def read_doubled(self, photograph: int, level: int) -> UInt8[Tensor, "2H 2W 3"] | None:
+        """Read a photograph at twice the size of a level.
+
+        None where its file has less, and at levels below the scene's own size, whose pixels are finer anyway.
+        """
+        width, height = (2 * self.camera(photograph, level).size_px[0]).tolist()
+        if level < 0 or not (self.scene.photographs.files and self.scene.photographs.reaches(photograph, width)):
+            return None
+        return self._read(photograph, [width, height])[0]
+
+    def camera(self, photograph: int, level: int) -> Cameras:
+        """The camera of a photograph at a level."""
+        return self.cameras[int(self.row(torch.tensor(photograph), torch.tensor(level)))]
+
+    def _read(self, photograph: int, size_px: list[int]) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+        photographs = self.scene.photographs
+        own, mask = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
+        width, height = size_px
+        key = photograph, width, height
         if key not in self._kept:
-            width, height = self.cameras.size_px[self.row(torch.tensor(photograph), torch.tensor(level))].tolist()
-            if level < 0:
+            if width < own.shape[1]:
                 size = (width, height)
                 colours = torch.from_numpy(cv2.resize(own.numpy(), size, interpolation=cv2.INTER_AREA))
                 if mask is not None:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tidefield.data.exposure import in_common_light
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
@@ -156,15 +157,23 @@ class FeatureCache:
     def _encode(self, block: Block, slot: int) -> None:
         with self._reading:
             colours, mask = self.pyramid.read(block.photograph, block.level)
+            doubled = None
+            if self._cones and self.network.reads_doubled:
+                doubled = self.pyramid.read_doubled(block.photograph, block.level)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
         last = (_block_counts(size) - 1).clamp(min=1)
         corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
-        camera = self.pyramid.cameras[int(self.pyramid.row(torch.tensor(block.photograph), torch.tensor(block.level)))]
-        gain = camera.gain_of_rows(slice(top, bottom), slice(left, right))
-        part = colours[top:bottom, left:right].float() / (255 * gain)
+        camera = self.pyramid.camera(block.photograph, block.level)
+        part = in_common_light(colours, camera, slice(top, bottom), slice(left, right))
+        images = [part]
+        if doubled is not None:
+            camera = camera.resized(doubled.shape[1], doubled.shape[0])
+            rows, columns = slice(2 * top, 2 * bottom), slice(2 * left, 2 * right)
+            images.append(in_common_light(doubled, camera, rows, columns))
         corner_px = corner[None].to(part).to(self.device)
-        encoded = self.network.encode(part.permute(2, 0, 1)[None].to(self.device), corner_px)
+        first, *twice = (image.permute(2, 0, 1)[None].to(self.device) for image in images)
+        encoded = self.network.encode(first, corner_px, *twice)
         if self.scene.photographs.masks:
             used = torch.ones(size.flip(0).tolist(), dtype=torch.bool) if mask is None else mask
             used = used[None, None, top:bottom, left:right].to(part)

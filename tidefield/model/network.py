@@ -67,9 +67,11 @@ class Network(nn.Module, ABC):
         grids: the rays of its passes, coarse to fine.
         fills_unseen: whether renderings are continued into pixels that no neighbour sees.
         matches_surface: whether photographs are matched first, for the surface that its rays are searched around.
+        reads_doubled: whether `encode` makes use of photographs at twice the size.
     """
 
     fills_unseen = False
+    reads_doubled = False
     matches_surface = False
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -80,12 +82,18 @@ class Network(nn.Module, ABC):
         self.grids = tuple(RayGrid(one.stride, int(k < last)) for k, one in enumerate(config.passes))
 
     @abstractmethod
-    def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
+    def encode(
+        self,
+        photographs: Float[Tensor, "K 3 H W"],
+        corner_px: Float[Tensor, "K 2"] | None = None,
+        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+    ) -> Encoded:
         """Encode photographs of one size, or crops.
 
         Args:
             photographs: colours at the common exposure.
             corner_px: upper left corner of each crop in its photograph; None for whole photographs.
+            doubled: the same, read at twice the size; None where there is no more detail than in `photographs`.
         """
 
     @abstractmethod

@@ -51,7 +51,12 @@ class PaperNetwork(Network):
         self.density = nn.Linear(hidden, 1)
         self.colour = ColourBlend(hidden, config.harmonics_degree, "target colour" in config.without)
 
-    def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
+    def encode(
+        self,
+        photographs: Float[Tensor, "K 3 H W"],
+        corner_px: Float[Tensor, "K 2"] | None = None,
+        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+    ) -> Encoded:
         corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
         (features,) = self.encoder(photographs)
         stride = self.rays.feature_stride

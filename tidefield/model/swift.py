@@ -7,7 +7,7 @@ What it adds to `model.paper`:
 - A score of each sample is the logarithm of how likely the surface is there (`Pass.weights`): the prior from matched
   photographs and sparse points, the agreement of the views, and what the aggregated features say. The density is the
   hazard rate of that distribution, so more samples do not stop more light.
-- The views' colours are read by cubic interpolation from learnedly sharpened photographs, and blended by angle
+- The views' colours are means over pixels, every half pixel, of learnedly sharpened photographs, and blended by angle
   (`colour.AngularColourBlend`).
 - The ray transformer and the target colour are left out in the preset, because they bring nothing here
   (docs/results.md); variants have them.
@@ -36,7 +36,7 @@ from tidefield.model.encoder import Encoder
 from tidefield.model.network import Network, TileRendering
 from tidefield.model.ray_transformer import RayTransformer
 from tidefield.model.sampling import Intervals, Samples, Tiles, histogram, place_samples, refine, sample
-from tidefield.model.views import Encoded, Gathered, Views, maps_from_images, upsample_twice
+from tidefield.model.views import Encoded, Gathered, Views, maps_from_images, pixel_means, upsample_twice
 
 LOGIT_LIMIT = 12.0
 """Of opacities: beyond it a sample is opaque, or empty, as far as single precision can represent it."""
@@ -68,6 +68,7 @@ class SwiftNetwork(Network):
 
     fills_unseen = True
     matches_surface = True
+    reads_doubled = True
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -133,7 +134,12 @@ class SwiftNetwork(Network):
                 intervals = intervals.moved(detail)
         raise AssertionError("a network has at least one pass")
 
-    def encode(self, photographs: Float[Tensor, "K 3 H W"], corner_px: Float[Tensor, "K 2"] | None = None) -> Encoded:
+    def encode(
+        self,
+        photographs: Float[Tensor, "K 3 H W"],
+        corner_px: Float[Tensor, "K 2"] | None = None,
+        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+    ) -> Encoded:
         corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
         # As the encoder's maps are: sums of both layouts take several times as long.
         photographs = photographs.contiguous(memory_format=torch.channels_last)
@@ -143,16 +149,23 @@ class SwiftNetwork(Network):
             features = features.float() + self.descriptors[str(stride)](colours)
             channels = torch.cat([colours, features], dim=1) if stride > 1 else features
             maps[stride] = maps_from_images(channels, corner, stride)
-        photographs = upsample_twice(self._sharpened(photographs))
+        if doubled is None:
+            colours = upsample_twice(self._sharpened(photographs, 1))
+        else:
+            colours = self._sharpened(pixel_means(doubled.contiguous(memory_format=torch.channels_last)), 2)
         with_colours = frozenset(stride for stride in maps if stride > 1)
-        return Encoded(maps, maps_from_images(photographs, corner, 0.5), with_colours)
+        return Encoded(maps, maps_from_images(colours, corner, 0.5), with_colours)
 
-    def _sharpened(self, photographs: Float[Tensor, "K 3 H W"]) -> Float[Tensor, "K 3 H W"]:
-        """Sharpen against the blur of interpolation and blending: learned, starts as the identity, sums to one."""
-        padded = F.pad(photographs, (2, 2, 2, 2), mode="replicate")
+    def _sharpened(self, colours: Float[Tensor, "K 3 H W"], step: int) -> Float[Tensor, "K 3 H W"]:
+        """Sharpen against the blur of interpolation and blending: learned, starts as the identity, sums to one.
+
+        Args:
+            colours: of texels of which `step` are a pixel.
+        """
+        padded = F.pad(colours, (2 * step,) * 4, mode="replicate")
         # One convolution of all channels is faster than one of each.
-        each = torch.eye(3, device=photographs.device)[:, :, None, None]
-        return photographs + F.conv2d(padded, each * (self.sharpen - self.sharpen.mean()))
+        each = torch.eye(3, device=colours.device)[:, :, None, None]
+        return colours + F.conv2d(padded, each * (self.sharpen - self.sharpen.mean()), dilation=step)
 
 
 class Pass(nn.Module):

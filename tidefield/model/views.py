@@ -223,6 +223,14 @@ def concatenate(maps: list[FeatureMaps]) -> FeatureMaps:
     )
 
 
+def pixel_means(doubled: Float[Tensor, "K C 2H 2W"]) -> Float[Tensor, "K C 2H 2W"]:
+    """Means over the pixels of photographs that were read at twice the size, one every half pixel, as `upsample_twice`.
+
+    What a pixel would show if it lay there: nothing is interpolated, and nothing of the photograph aliases.
+    """
+    return F.avg_pool2d(F.pad(doubled, (0, 1, 0, 1), mode="replicate"), 2, stride=1)
+
+
 def upsample_twice(images: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C H W"]:
     """Images with a texel every half pixel: every second one is a pixel of the image, the others lie between.
 

@@ -22,6 +22,8 @@ from torch import nn
 from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
 from tidefield.data.areas import Area, cut, select
 from tidefield.data.depth_prior import DepthPriors
+from tidefield.data.images import Progress
+from tidefield.data.load import at_twice_the_size
 from tidefield.data.matching import Matcher
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
@@ -84,6 +86,9 @@ class Trainer(ABC):
 
     is_main_process = True
     """Whether this process writes what is learned: one of several that train together does."""
+
+    def prepare(self, progress: Progress | None = None) -> None:  # noqa: B027 - there may be nothing to read
+        """Read what steps need besides the scene; otherwise the first one does, and tells nothing of its progress."""
 
     @property
     @abstractmethod
@@ -180,6 +185,7 @@ class SceneTrainer(Trainer):
 
     network: Network
     _open: OpenArea | None
+    _doubled: Scene | None
 
     def __init__(
         self,
@@ -198,6 +204,7 @@ class SceneTrainer(Trainer):
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
         self.config, self.areas = config, areas or cut(scene)
         self._seed, self._open = seed, None
+        self._prepared, self._doubled = False, None
         self.batch_loss: nn.Module = BatchLoss(network, config.train)
 
     @property
@@ -212,7 +219,13 @@ class SceneTrainer(Trainer):
     def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
         own, views = self.open_area(), self.config.network.views
         scene, targets = own.area.scene, own.area.targets
-        return self.batch_loss(scene, own.priors, own.cameras, views, self.generator, self.precision, targets)
+        known = own.priors, own.cameras, views, self.generator, self.precision, targets, own.area.doubled
+        return self.batch_loss(scene, *known)
+
+    def prepare(self, progress: Progress | None = None) -> None:
+        if not self._prepared and self.network.reads_doubled:
+            self._doubled = at_twice_the_size(self.scene, progress)
+        self._prepared = True
 
     def open_area(self) -> OpenArea:
         """Open the area that the next step learns from; what the one before needed is given back."""
@@ -223,8 +236,11 @@ class SceneTrainer(Trainer):
             if self._open is not None:
                 self._open = None
                 self.scene.photographs.release()
+                if self._doubled is not None:
+                    self._doubled.photographs.release()
+            self.prepare()
             whole, targets = len(self.areas) == 1, self.areas[number]
-            area = Area(self.scene, targets) if whole else select(self.scene, targets)
+            area = (Area if whole else select)(self.scene, targets, self._doubled)
             match = Matcher(area.scene, most_px=MATCHED_PX) if self.network.matches_surface else None
             cameras = area.scene.cameras.to(self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match), cameras)
@@ -249,6 +265,8 @@ def train(
     def used() -> float:
         return budget.share(progress.step, progress.seconds)
 
+    with ProgressBar(console, "Reading photographs at twice the size") as bar:
+        trainer.prepare(bar)
     writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=trainer.is_main_process)
     saved = pictured = time.monotonic()
     with writer, ProgressBar(console, "Training") as bar, _stop_requests() as stopped_by:

@@ -52,6 +52,7 @@ class BatchLoss(nn.Module):
         generator: torch.Generator,
         precision: torch.dtype | None = None,
         of: Sequence[int] | None = None,
+        doubled: Scene | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """The loss of a random batch, and the mean squared error of its colours.
 
@@ -63,9 +64,10 @@ class BatchLoss(nn.Module):
             generator: of everything random.
             precision: of the encoder's convolutions; that of `choose_precision` if None.
             of: training photographs to draw from; all of them if not given.
+            doubled: the scene at twice the size, where photographs are read from it, too.
         """
         network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
-        batch = draw_batch(scene, priors, config, views, generator, of).to(device)
+        batch = draw_batch(scene, priors, config, views, generator, of, doubled).to(device)
         own = torch.stack([priors[i].cells for i in batch.targets.tolist()]).to(device)
         opaque = scene.background_rgb is None
         parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]
@@ -95,8 +97,10 @@ class BatchLoss(nn.Module):
         precision: torch.dtype | None,
     ) -> TileRendering:
         network = self.network
+        doubled = batch.image_doubled or (None,) * len(batch.images)
         with mixed_precision(priors.device, precision):
-            encoded = [network.encode(*images) for images in zip(batch.images, batch.image_corner_px, strict=True)]
+            groups = zip(batch.images, batch.image_corner_px, doubled, strict=True)
+            encoded = [network.encode(*images) for images in groups]
         if batch.image_used:
             masks = zip(encoded, batch.image_used, batch.image_corner_px, strict=True)
             encoded = [one.masked(used, corner_px) for one, used, corner_px in masks]
