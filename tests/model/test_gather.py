@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from tidefield.baselines.untrained import read_photograph
 from tidefield.model.rendering import fill_unseen
-from tidefield.model.views import concatenate, gather, maps_from_images, upsample_twice, weighted_rows
+from tidefield.model.views import concatenate, gather, maps_from_images, pixel_means, upsample_twice, weighted_rows
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -163,6 +163,29 @@ def test_doubling_keeps_the_pixels_and_is_exact_on_quadratics_between_them():
     torch.testing.assert_close(twice[0, :, ::2, ::2], picture(u, v))
     y, x = torch.meshgrid(0.5 + torch.arange(24.0).double() / 2, 0.5 + torch.arange(28.0).double() / 2, indexing="ij")
     torch.testing.assert_close(twice[0, :, 2:-4, 2:-4], picture(x, y)[:, 2:-4, 2:-4])
+
+
+def test_means_over_pixels_lie_where_interpolated_pixels_lie():
+    picture = torch.rand(1, 3, 12, 16, generator=torch.Generator().manual_seed(0))
+    means = pixel_means(picture)
+    assert means.shape == picture.shape
+    torch.testing.assert_close(means[..., ::2, ::2], F.avg_pool2d(picture, 2))
+    # Of a plane, the mean over a pixel is the value in its middle.
+    v, u = torch.meshgrid(0.25 + torch.arange(12.0) / 2, 0.25 + torch.arange(16.0) / 2, indexing="ij")
+    plane = (0.3 * u - 0.2 * v)[None, None]
+    expected = upsample_twice(F.avg_pool2d(plane, 2))
+    torch.testing.assert_close(pixel_means(plane)[..., 2:-4, 2:-4], expected[..., 2:-4, 2:-4])
+
+
+@pytest.mark.parametrize("at", [(6.0, 7.5), (0.2, 0.5), (47.9, 35.8), (17.25, 20.25)])
+def test_a_photograph_at_twice_the_size_is_read_as_the_network_reads_it(at: tuple[float, float]):
+    scene = wall.scene(wall.with_gains(wall.cameras(2)))
+    large = wall.scene(wall.with_gains(wall.cameras(2, 96, 72)))
+    found = read_photograph(scene, 1, torch.tensor([at]), large)[0]
+    means = pixel_means(large.photographs[1].permute(2, 0, 1)[None] / 255)
+    maps = maps_from_images(means, torch.zeros(1, 2), 0.5)
+    expected, _ = gather(maps, torch.tensor([[0]]), torch.tensor(at)[None, None, None])
+    torch.testing.assert_close(found, expected[0, 0, 0] / scene.cameras.gain[1])
 
 
 def test_a_doubled_picture_is_read_at_its_pixels_and_up_to_its_border():

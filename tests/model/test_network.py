@@ -229,6 +229,17 @@ def test_the_learned_sharpening_keeps_even_areas():
             torch.testing.assert_close(rows, torch.full_like(rows, level), atol=tolerance, rtol=0)
 
 
+def test_photographs_at_twice_the_size_are_sharpened_as_photographs_are():
+    own = network(SWIFT.network, stir=0.3)
+    photograph = torch.rand(1, 3, 24, 20, generator=torch.Generator().manual_seed(0))
+    doubled = photograph.repeat_interleave(2, 2).repeat_interleave(2, 3)
+    plain, twice = own.encode(photograph), own.encode(photograph, doubled=doubled)
+    pixels, means = (one.photographs.rows.reshape(48, 40, 3)[::2, ::2] for one in (plain, twice))
+    torch.testing.assert_close(means, pixels)
+    assert (pixels - photograph[0].permute(1, 2, 0)).abs().max() > 0.1
+    assert torch.equal(plain.features[1].rows, twice.features[1].rows)
+
+
 def test_the_papers_network_has_nothing_that_the_paper_does_not_have():
     ours = ("descriptors", "sharpen", "prior", "agreement", "metric", "angle")
     assert not [n for n, _ in network(SMALL_PAPER).named_parameters() if any(part in n for part in ours)]

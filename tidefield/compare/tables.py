@@ -377,7 +377,8 @@ def write_tables(
     page = [
         f"# {title}",
         "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
-        f"and {budget} of training, one after another.",
+        f"and {budget} of training, one after another. Our presets and methods without training read what lies between "
+        "pixels from files of twice the width, where there are such.",
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
         f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
         f"{machine['torch']}; {made['date']}.",

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable
+from functools import partial
 
 import cv2
 import torch
@@ -30,6 +32,8 @@ COARSEST_PX = 32
 """Least width of a level."""
 KEPT_BYTES = 800_000_000
 """Memory for decoded levels; those that were not read for the longest time go first."""
+Read = tuple[UInt8[Tensor, "_ _ 3"], Bool[Tensor, "_ _"] | None]
+"""A photograph, and where it is used if it has a mask."""
 
 
 class Pyramid:
@@ -49,7 +53,7 @@ class Pyramid:
         self._range = torch.stack([coarsest, finest.clamp(min=0)]).long()
         self.first, last = int(self._range[0].min()), int(self._range[1].max())
         self.cameras = concatenate([self._cameras(level) for level in range(self.first, last + 1)])
-        self._kept: OrderedDict[tuple[int, int, int], tuple[Tensor, Tensor | None]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, ...], Read] = OrderedDict()
 
     def _cameras(self, level: int) -> Cameras:
         """The cameras of all photographs at a level, or at the nearest one that they have."""
@@ -99,42 +103,55 @@ class Pyramid:
         finer = finer - (views.focal_px.log2().mean(1) - depth.clamp(min=1e-6).log2())
         return torch.where((depth > 0) & (own_depth > 0), finer, 0.0).reshape(photographs.shape)
 
-    def read(self, photograph: int, level: int) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+    def read(self, photograph: int, level: int) -> Read:
         """Read a photograph at a level, and where it is used if it has a mask."""
         photographs = self.scene.photographs
-        own, mask = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
-        return (own, mask) if level == 0 else self._read(photograph, self.camera(photograph, level).size_px[0].tolist())
+        own = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
+        if level == 0:
+            return own
+        size = self.camera(photograph, level).size_px[0].tolist()
+        if level < 0:
+            return self._keep(photograph, size, partial(_reduced, own, size))
+        doubled = self._doubled(photograph, level)
+        # One decoding serves both sizes.
+        return self._from_file(photograph, size) if doubled is None else _reduced(doubled, size)
 
-    def read_doubled(self, photograph: int, level: int) -> UInt8[Tensor, "2H 2W 3"] | None:
+    def read_doubled(self, photograph: int, level: int) -> UInt8[Tensor, "_ _ 3"] | None:
         """Read a photograph at twice the size of a level.
 
         None where its file has less, and at levels below the scene's own size, whose pixels are finer anyway.
         """
-        width, height = (2 * self.camera(photograph, level).size_px[0]).tolist()
-        if level < 0 or not (self.scene.photographs.files and self.scene.photographs.reaches(photograph, width)):
-            return None
-        return self._read(photograph, [width, height])[0]
+        doubled = None if level < 0 else self._doubled(photograph, level)
+        return None if doubled is None else doubled[0]
 
     def camera(self, photograph: int, level: int) -> Cameras:
         """The camera of a photograph at a level."""
         return self.cameras[int(self.row(torch.tensor(photograph), torch.tensor(level)))]
 
-    def _read(self, photograph: int, size_px: list[int]) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
-        photographs = self.scene.photographs
-        own, mask = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
-        width, height = size_px
-        key = photograph, width, height
+    def _doubled(self, photograph: int, level: int) -> Read | None:
+        photographs, size = self.scene.photographs, (2 * self.camera(photograph, level).size_px[0]).tolist()
+        enough = photographs.files and photographs.reaches(photograph, size[0])
+        return self._from_file(photograph, size) if enough else None
+
+    def _from_file(self, photograph: int, size: list[int]) -> Read:
+        return self._keep(photograph, size, partial(read_at_size, self.scene.photographs, photograph, *size))
+
+    def _keep(self, photograph: int, size: list[int], make: Callable[[], Read]) -> Read:
+        """What was made for a photograph and a size, as long as there is room for it."""
+        key = photograph, *size
         if key not in self._kept:
-            if width < own.shape[1]:
-                size = (width, height)
-                colours = torch.from_numpy(cv2.resize(own.numpy(), size, interpolation=cv2.INTER_AREA))
-                if mask is not None:
-                    grey = cv2.resize(255 * mask.byte().numpy(), size, interpolation=cv2.INTER_AREA)
-                    mask = torch.from_numpy(grey == 255)
-                self._kept[key] = colours, mask
-            else:
-                self._kept[key] = read_at_size(photographs, photograph, width, height)
+            self._kept[key] = make()
             while len(self._kept) > 1 and sum(one.nbytes for one, _ in self._kept.values()) > KEPT_BYTES:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
+
+
+def _reduced(photograph: Read, size: list[int]) -> Read:
+    """A photograph, and where it is used in full, at a smaller size."""
+    colours, mask = photograph
+    colours = torch.from_numpy(cv2.resize(colours.numpy(), size, interpolation=cv2.INTER_AREA))
+    if mask is not None:
+        grey = cv2.resize(255 * mask.byte().numpy(), size, interpolation=cv2.INTER_AREA)
+        mask = torch.from_numpy(grey == 255)
+    return colours, mask

@@ -86,7 +86,7 @@ class Network(nn.Module, ABC):
         self,
         photographs: Float[Tensor, "K 3 H W"],
         corner_px: Float[Tensor, "K 2"] | None = None,
-        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+        doubled: Float[Tensor, "K 3 2*H 2*W"] | None = None,
     ) -> Encoded:
         """Encode photographs of one size, or crops.
 

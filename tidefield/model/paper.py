@@ -55,7 +55,7 @@ class PaperNetwork(Network):
         self,
         photographs: Float[Tensor, "K 3 H W"],
         corner_px: Float[Tensor, "K 2"] | None = None,
-        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+        doubled: Float[Tensor, "K 3 2*H 2*W"] | None = None,
     ) -> Encoded:
         corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
         (features,) = self.encoder(photographs)

@@ -138,7 +138,7 @@ class SwiftNetwork(Network):
         self,
         photographs: Float[Tensor, "K 3 H W"],
         corner_px: Float[Tensor, "K 2"] | None = None,
-        doubled: Float[Tensor, "K 3 2H 2W"] | None = None,
+        doubled: Float[Tensor, "K 3 2*H 2*W"] | None = None,
     ) -> Encoded:
         corner = photographs.new_zeros(len(photographs), 2) if corner_px is None else corner_px
         # As the encoder's maps are: sums of both layouts take several times as long.

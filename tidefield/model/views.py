@@ -223,7 +223,7 @@ def concatenate(maps: list[FeatureMaps]) -> FeatureMaps:
     )
 
 
-def pixel_means(doubled: Float[Tensor, "K C 2H 2W"]) -> Float[Tensor, "K C 2H 2W"]:
+def pixel_means(doubled: Float[Tensor, "K C h w"]) -> Float[Tensor, "K C h w"]:
     """Means over the pixels of photographs that were read at twice the size, one every half pixel, as `upsample_twice`.
 
     What a pixel would show if it lay there: nothing is interpolated, and nothing of the photograph aliases.
