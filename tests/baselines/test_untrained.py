@@ -74,7 +74,7 @@ def test_the_matching_cost_is_the_squared_standard_error_of_the_mean_colour():
         picture.fill_(value)
     camera = scene.cameras[0]
     depth = torch.full((camera.height, camera.width), 4.0)
-    mean, count, variance = untrained._match(scene, camera, [0, 1, 2], depth)
+    mean, count, variance = untrained._match(scene, None, camera, [0, 1, 2], depth)
     values = torch.tensor([0.2, 0.4, 1.0])
     torch.testing.assert_close(mean, values.mean().expand_as(mean))
     assert (count == 3).all()
