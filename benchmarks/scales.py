@@ -58,6 +58,13 @@ def measure_scales(
                     of = [] if (source / "run.json").exists() else ["--zero-shot", "--opened-width", str(width)]
                     run(["evaluate", str(source), str(out), *of, "--width", str(picture), *options, "--device", device])
                     found = read_json(out / "evaluation.json")
+                trained = found["configuration"].get("trained")
+                record.setdefault("opened", {})[name] = (
+                    f"Opened at {width} px, with trained weights as they are."
+                    if trained is None
+                    else f"Trained at {found['configuration']['trained_width']} px for {trained['seconds'] / 60:.1f} "
+                    f"minutes, {trained['steps']:,} steps."
+                )
                 place[way] = {metric: found["mean"][metric] for metric in METRICS}
                 place[way] |= {"seconds": found["seconds_per_frame"], "protocol": found["protocol"]}
                 command = "python -m benchmarks scales RUN|SCENE..."
@@ -89,6 +96,6 @@ def write_page(runs: Path, out: Path) -> None:
             for width, ways in of_widths.items()
             for way, cell in ways.items()
         ]
-        parts += [f"## {name}", Table(name, columns, rows).markdown()]
+        parts += [f"## {name}", record["opened"][name], Table(name, columns, rows).markdown()]
     parts += ["## How this was measured", "\n".join(f"- {line}" for line in circumstances([("scales", record)]))]
     write_text(out, "\n\n".join(parts) + "\n")

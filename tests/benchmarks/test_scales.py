@@ -16,7 +16,10 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
         out = Path(words[2])
         out.mkdir()
         mean = dict.fromkeys(METRICS, float(len(commands)))
-        write_json(out / "evaluation.json", {"mean": mean, "seconds_per_frame": 0.5, "protocol": "strict"})
+        trained = {"trained_width": 400, "trained": {"steps": 1833, "seconds": 600.2}}
+        found = {"mean": mean, "seconds_per_frame": 0.5, "protocol": "strict"}
+        configuration = {} if "--zero-shot" in words else trained
+        write_json(out / "evaluation.json", {**found, "configuration": configuration})
 
     sources = [tmp_path / "run", tmp_path / "scene"]
     for _ in range(2):
@@ -26,5 +29,7 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
     assert commands[1][-4:] == ["--rays-per-pixel", "4", "--device", "cpu"]
     write_page(tmp_path, tmp_path / "page.md")
     lines = (tmp_path / "page.md").read_text().splitlines()
+    assert "Trained at 400 px for 10.0 minutes, 1,833 steps." in lines
+    assert "Opened at 400 px, with trained weights as they are." in lines
     assert "| 100 | points | 1.00 | 1.00 | 1.0000 | 1.0000 | 0.5 |" in lines
     assert "| | as usual | 20.00 | 20.00 | 20.0000 | 20.0000 | 0.5 |" in [line.replace("|  |", "| |") for line in lines]
