@@ -97,11 +97,11 @@ def test_an_area_has_the_same_photographs_at_twice_the_size(scene: Scene):
 
 def test_training_reads_what_it_is_prepared_with(scene: Scene):
     config = replace(SWIFT, train=replace(SWIFT.train, tile_px=8, tiles=2, crop_px=16))
-    losses, told = [], []
+    losses = []
     for prepared in (True, False):
         trainer = SceneTrainer(config, scene, 0, CPU)
         if prepared:
-            trainer.prepare(lambda *counts: told.append(counts))
+            trainer.prepare()
         opened = trainer.open_area().area
         assert opened.doubled is not None
         losses.append(trainer.loss()[1].item())

@@ -243,7 +243,7 @@ class Matcher:
             rows, columns = (_extent((view > 0).any(dim)) for dim in (1, 0))
             if rows.stop == rows.start:
                 continue
-            source = self.pyramid.cameras[int(self.pyramid.row(torch.tensor(photograph), torch.tensor(level)))]
+            source = self.pyramid.camera(photograph, level)
             image = self._image(photograph, level, source)
             looks.append(
                 _Look(

@@ -110,11 +110,13 @@ class Pyramid:
         if level == 0:
             return own
         size = self.camera(photograph, level).size_px[0].tolist()
-        if level < 0:
-            return self._keep(photograph, size, partial(_reduced, own, size))
-        doubled = self._doubled(photograph, level)
-        # One decoding serves both sizes.
-        return self._from_file(photograph, size) if doubled is None else _reduced(doubled, size)
+
+        def make() -> Read:
+            # One decoding serves this size and twice it.
+            finer = own if level < 0 else self._doubled(photograph, level)
+            return read_at_size(photographs, photograph, *size) if finer is None else _reduced(finer, size)
+
+        return self._keep(photograph, size, make)
 
     def read_doubled(self, photograph: int, level: int) -> UInt8[Tensor, "_ _ 3"] | None:
         """Read a photograph at twice the size of a level.
@@ -130,11 +132,9 @@ class Pyramid:
 
     def _doubled(self, photograph: int, level: int) -> Read | None:
         photographs, size = self.scene.photographs, (2 * self.camera(photograph, level).size_px[0]).tolist()
-        enough = photographs.files and photographs.reaches(photograph, size[0])
-        return self._from_file(photograph, size) if enough else None
-
-    def _from_file(self, photograph: int, size: list[int]) -> Read:
-        return self._keep(photograph, size, partial(read_at_size, self.scene.photographs, photograph, *size))
+        if not photographs.reaches(photograph, size[0]):
+            return None
+        return self._keep(photograph, size, partial(read_at_size, photographs, photograph, *size))
 
     def _keep(self, photograph: int, size: list[int], make: Callable[[], Read]) -> Read:
         """What was made for a photograph and a size, as long as there is room for it."""

@@ -88,7 +88,7 @@ class Trainer(ABC):
     """Whether this process writes what is learned: one of several that train together does."""
 
     def prepare(self, progress: Progress | None = None) -> None:  # noqa: B027 - there may be nothing to read
-        """Read what steps need besides the scene; otherwise the first one does, and tells nothing of its progress."""
+        """Read what steps need besides the scene; otherwise the first one does, without showing progress."""
 
     @property
     @abstractmethod
