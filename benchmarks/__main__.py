@@ -96,6 +96,8 @@ def frames(
     runs: Path,
     preset: Literal["swift", "paper"] = "swift",
     weights: Path | None = None,
+    width: int = 800,
+    height: int = 600,
     device: str = "cpu",
 ) -> None:
     """Time of zero-shot views: the first, further ones, and among many photographs (minutes).
@@ -105,6 +107,7 @@ def frames(
         runs: Store the figures in this folder's frames.json.
         preset: Which network.
         weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
+        width, height: Of the views, in pixels.
         device: auto, cpu, cuda, cuda:N or mps.
     """
     tune_process()
@@ -112,7 +115,7 @@ def frames(
     from benchmarks.table import frame_tables
     from tidefield.device import choose_device
 
-    record = measure_frames(scene, runs, preset, weights, str(choose_device(device)))
+    record = measure_frames(scene, runs, preset, weights, str(choose_device(device)), (width, height))
     for table in frame_tables(record):
         print(table.markdown(), end="\n\n")
 

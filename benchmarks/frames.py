@@ -35,7 +35,6 @@ from tidefield.render.camera_paths import make_trajectory
 from tidefield.train.checkpoint import given_or_shipped
 
 FRAMES_FILE = "frames.json"
-SIZE_PX = (800, 600)
 FURTHER = 5
 """Views after the first, of whose times the median is taken."""
 COUNTS, TURNS = (200, 2000), 7
@@ -50,6 +49,7 @@ def measure_frames(
     preset: Literal["swift", "paper"],
     given: Path | None,
     device: str,
+    size_px: tuple[int, int],
     run: Runner = run_measured,
 ) -> dict[str, Any]:
     """Measure all of it for the scene in a folder, store it as RUNS/frames.json and return it.
@@ -58,36 +58,46 @@ def measure_frames(
     """
     scene, weights = load_scene(folder), given_or_shipped(given, preset)
     name = scene.names[(scene.test or scene.train)[0]]
-    first = _first(folder, name, preset, weights, device, runs, run)
+    first = _first(folder, name, preset, weights, device, size_px, runs, run)
     where, named = torch.device(device), "" if given is None else " --weights WEIGHTS"
 
     def view_of(other: Scene) -> Render:
         return zero_shot(PRESETS[preset], weights, other, where)[0]
 
-    width, height = SIZE_PX
+    width, height = size_px
     flight = make_trajectory("cameras", scene, frames=FLIGHT_FRAMES, width=width, height=height).cameras
     middle = len(flight) // 2
     shown = flight[middle : middle + 1]
     record = {
         "preset": preset,
         "device": device,
-        "size_px": list(SIZE_PX),
+        "size_px": [width, height],
         "photographs": len(scene.names),
         "first": first,
         "further_seconds": _further(view_of(scene), flight[middle : middle + FURTHER + 1]),
         "by_photographs": _by_photographs(view_of, scene, shown),
-        "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --device {device}",
+        "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --width {width} "
+        f"--height {height} --device {device}",
         **describe(),
     }
     write_json(runs / FRAMES_FILE, record)
     return record
 
 
-def _first(folder: Path, name: str, preset: str, weights: Path, device: str, runs: Path, run: Runner) -> dict[str, Any]:
+def _first(
+    folder: Path,
+    name: str,
+    preset: str,
+    weights: Path,
+    device: str,
+    size_px: tuple[int, int],
+    runs: Path,
+    run: Runner,
+) -> dict[str, Any]:
     runs.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=runs, prefix=".frames-") as work:
         words = ["--zero-shot", "--preset", preset, "--weights", weights, "--camera", name, "--device", device]
-        size = ["--width", SIZE_PX[0], "--height", SIZE_PX[1]]
+        size = ["--width", size_px[0], "--height", size_px[1]]
         command = tidefield("render", folder, Path(work) / "frame.png", *words, *size, "--quiet")
         return asdict(run(command, {"XDG_CACHE_HOME": str(Path(work) / "cache")}))
 

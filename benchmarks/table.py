@@ -372,6 +372,7 @@ def circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]
         text = (
             f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
             f"{machine['system']}, Python {machine['python']}, torch {machine['torch']}"
+            + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
         )
         machines.setdefault(text, {})[name] = None
     versions = sorted({record["version"] for _, record in records})

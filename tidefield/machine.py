@@ -54,8 +54,15 @@ def describe() -> dict[str, Any]:
             "system": f"{platform.system()} {platform.machine()}",
             "python": platform.python_version(),
             "torch": version("torch"),
+            "gpus": _gpus(),
         },
     }
+
+
+def _gpus() -> list[str]:
+    """The CUDA devices; none where torch has not been imported, as nothing was computed on one then."""
+    torch = sys.modules.get("torch")
+    return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch else []
 
 
 def commit() -> str | None:

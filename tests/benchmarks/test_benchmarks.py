@@ -167,7 +167,6 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(frames, "PRESETS", {"swift": small})
     monkeypatch.setattr(frames, "COUNTS", (12,))
-    monkeypatch.setattr(frames, "SIZE_PX", (32, 24))
     write_weights(tmp_path / "w.safetensors", make_network(small.network), small, {})
     asked = []
 
@@ -176,7 +175,7 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
         assert not Path(environment["XDG_CACHE_HOME"]).exists(), "nothing is decoded before"
         return Usage(12.5, 1)
 
-    record = frames.measure_frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", "cpu", run)
+    record = frames.measure_frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", "cpu", (32, 24), run)
     assert record == json.loads((tmp_path / "frames.json").read_text())
     assert "--zero-shot" in asked
     assert record["first"]["seconds"] == 12.5

@@ -15,6 +15,7 @@ from tidefield.data.hull import Hull, hull_range
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import depth_through, trusted_points
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.machine import cores
 
 STRIDE = 4
 """Pixels between the cells of a prior."""

@@ -59,7 +59,9 @@ HALF_PX, SPREADS, SPREAD_PX = 1.0, 4.0, 9
 """Half of the interval that is left to search: pixels of parallax, and standard deviations of the matched depths in a
 window of this side."""
 FRAME_PX, OVERLAP_PX = 768, 96
-"""Side of the parts of a camera that are matched at once, and how far they overlap."""
+"""Side of the parts of a camera that are matched at once, and how far they overlap ..."""
+GPU_FACTOR = 4
+"""... and how many times larger the parts are on a GPU, which small ones do not keep busy."""
 MARGIN_PX = 2.0
 """Pixels at the borders of photographs that are not compared: other depths would be read outside of them."""
 SELECT_ABOVE = 256
@@ -76,10 +78,19 @@ class Matcher:
         pyramid: of the scene, where there is one already.
         most_px: pictures with a longer side are matched at half their size, or a quarter, ..., and the surface is
             interpolated.
+        device: where to compute; surfaces are returned on the CPU.
     """
 
-    def __init__(self, scene: Scene, pyramid: Pyramid | None = None, most_px: int | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        pyramid: Pyramid | None = None,
+        most_px: int | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.scene, self.pyramid, self.most_px = scene, pyramid or Pyramid(scene), most_px
+        self.device = torch.device(device)
+        self._cameras, self._sizes = scene.cameras.to(self.device), self.pyramid.cameras.to(self.device)
         self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self._reading = threading.Lock()
 
@@ -89,6 +100,7 @@ class Matcher:
 
         Rays without an expected depth keep what they have.
         """
+        camera, cells = camera.to(self.device), cells.to(self.device)
         expected, near, far = cells
         known = expected.isfinite()
         start = _on_pixels(camera, torch.where(known, expected, (near + far) / 2))
@@ -103,7 +115,7 @@ class Matcher:
         result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
         detail = found - _on_pixels(camera, torch.where(known, result[0], middle))
         seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
-        return DepthPrior(result, torch.where(seen, detail, 0.0))
+        return DepthPrior(result.cpu(), torch.where(seen, detail, 0.0).cpu())
 
     def _matched(
         self, camera: Cameras, start: Float[Tensor, "A B"], reach: float
@@ -124,7 +136,8 @@ class Matcher:
             found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
             half[y0:y1, x0:x1] = around[y0 - top : y1 - top, x0 - left : x1 - left]
 
-        parts = [partial(match, *part) for part in _parts(camera)]
+        side = FRAME_PX * (1 if start.device.type == "cpu" else GPU_FACTOR)
+        parts = [partial(match, *part) for part in _parts(camera, side)]
         if len(parts) > 1:
             in_parallel(parts, start.device)
         else:
@@ -161,15 +174,15 @@ class Matcher:
     ) -> tuple[Float[Tensor, "V H W"], Int[Tensor, " V"]]:
         """The photographs to compare, and their weights at pixels: of each pixel's `VIEWS` photographs from the most
         similar directions, as in unstructured lumigraph rendering (Buehler et al., 2001)."""
-        indices = torch.tensor(self.scene.sources(camera), dtype=torch.long)
+        indices = torch.tensor(self.scene.sources(camera.to("cpu")), dtype=torch.long)
         shape = inverse_depth.shape
-        rays = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
+        rays = camera.directions_world(pixel_grid(camera.width, camera.height, self.device)[None])[0]
         points = camera.position_world[0] + rays / inverse_depth.reshape(-1, 1)
         if len(indices) > SELECT_ABOVE:  # most photographs of a large survey see nothing of this
-            indices = indices[which_see(self.scene.cameras[indices], points)]
+            indices = indices[which_see(self._cameras[indices.to(self.device)], points).cpu()]
         if not len(indices):
             return inverse_depth.new_zeros(0, *shape), indices
-        sources = self.scene.cameras[indices]
+        sources = self._cameras[indices.to(self.device)]
         uv, z = sources.project(points)
         seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
         theirs = F.normalize(points - sources.position_world[:, None], dim=-1)
@@ -182,7 +195,7 @@ class Matcher:
         weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
         weight = weight * from_border(uv, sources.size_px[:, None], BORDER)
         used = (weight > 0).any(1)
-        return weight[used].unflatten(1, shape), indices[used]
+        return weight[used].unflatten(1, shape), indices[used.cpu()]
 
     def _level(
         self,
@@ -233,17 +246,18 @@ class Matcher:
         self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V a b"], views: Int[Tensor, " V"]
     ) -> list[_Look]:
         height, width = start.shape
-        rays = camera.directions_world(pixel_grid(width, height)[None])[0].unflatten(0, (height, width))
+        rays = camera.directions_world(pixel_grid(width, height, self.device)[None])[0].unflatten(0, (height, width))
         origin = camera.position_world[0]
         middle = origin + camera.directions_world(camera.size_px[None].to(start) / 2)[0] / start.median()
         weight = F.interpolate(weight[None], size=(height, width), mode="bilinear", align_corners=False)[0]
-        levels = self.pyramid.levels(camera, views[None], middle)[0]
+        levels = self.pyramid.levels(camera.to("cpu"), views[None], middle.cpu())[0]
         looks = []
         for view, photograph, level in zip(weight, views.tolist(), levels.tolist(), strict=True):
             rows, columns = (_extent((view > 0).any(dim)) for dim in (1, 0))
             if rows.stop == rows.start:
                 continue
-            source = self.pyramid.camera(photograph, level)
+            row = self.pyramid.row(torch.tensor(photograph), torch.tensor(level))
+            source = self._sizes[int(row)]
             image = self._image(photograph, level, source)
             looks.append(
                 _Look(
@@ -258,7 +272,7 @@ class Matcher:
         with self._reading:
             if key not in self._kept:
                 colours, _ = self.pyramid.read(photograph, level)
-                grey = (colours.float() / 255 / camera.gain_of_rows()).mean(-1)
+                grey = (colours.to(self.device).float() / 255 / camera.gain_of_rows()).mean(-1)
                 mean = _box(grey, CONTRAST_PX)
                 variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
                 self._kept[key] = ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
@@ -408,11 +422,11 @@ _Box = tuple[tuple[int, int], tuple[int, int]]
 """Upper left corner of a part of a picture, and the corner that it ends before."""
 
 
-def _parts(camera: Cameras) -> list[tuple[_Box, _Box]]:
-    """Parts of a camera's picture to match, and the part of each that is used."""
+def _parts(camera: Cameras, most_px: int) -> list[tuple[_Box, _Box]]:
+    """Parts of a camera's picture to match, of at most a side, and the part of each that is used."""
     sides = []
     for side in (camera.width, camera.height):
-        count = max(1, -(-side // FRAME_PX))
+        count = max(1, -(-side // most_px))
         edges = [round(k * side / count) for k in range(count + 1)]
         sides.append([(max(0, a - OVERLAP_PX), min(side, b + OVERLAP_PX), a, b) for a, b in pairwise(edges)])
     columns, rows = sides

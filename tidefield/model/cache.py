@@ -164,20 +164,19 @@ class FeatureCache:
         last = (_block_counts(size) - 1).clamp(min=1)
         corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
-        camera = self.pyramid.camera(block.photograph, block.level)
-        part = in_common_light(colours, camera, slice(top, bottom), slice(left, right))
+        camera = self.pyramid.camera(block.photograph, block.level).to(self.device)
+        part = in_common_light(colours.to(self.device), camera, slice(top, bottom), slice(left, right))
         images = [part]
         if doubled is not None:
             camera = camera.resized(doubled.shape[1], doubled.shape[0])
             rows, columns = slice(2 * top, 2 * bottom), slice(2 * left, 2 * right)
-            images.append(in_common_light(doubled, camera, rows, columns))
-        corner_px = corner[None].to(part).to(self.device)
-        first, *twice = (image.permute(2, 0, 1)[None].to(self.device) for image in images)
+            images.append(in_common_light(doubled.to(self.device), camera, rows, columns))
+        corner_px = corner[None].to(part)
+        first, *twice = (image.permute(2, 0, 1)[None] for image in images)
         encoded = self.network.encode(first, corner_px, *twice)
         if self.scene.photographs.masks:
             used = torch.ones(size.flip(0).tolist(), dtype=torch.bool) if mask is None else mask
-            used = used[None, None, top:bottom, left:right].to(part)
-            encoded = encoded.masked(used.to(self.device), corner_px)
+            encoded = encoded.masked(used[None, None, top:bottom, left:right].to(part), corner_px)
         for maps, found in zip(_maps(self._encoded), _maps(encoded), strict=True):
             first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(found.rows)] = found.rows.to(maps.rows.dtype)

@@ -59,7 +59,7 @@ class Renderer:
     ) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.cache = FeatureCache(network, scene, device, sampling.cones)
-        self.matcher = Matcher(scene, self.cache.pyramid) if network.matches_surface else None
+        self.matcher = Matcher(scene, self.cache.pyramid, device=device) if network.matches_surface else None
         self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)

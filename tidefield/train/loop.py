@@ -241,7 +241,9 @@ class SceneTrainer(Trainer):
             self.prepare()
             whole, targets = len(self.areas) == 1, self.areas[number]
             area = (Area if whole else select)(self.scene, targets, self._doubled)
-            match = Matcher(area.scene, most_px=MATCHED_PX) if self.network.matches_surface else None
+            match = None
+            if self.network.matches_surface:
+                match = Matcher(area.scene, most_px=MATCHED_PX, device=self.device)
             cameras = area.scene.cameras.to(self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match), cameras)
         return self._open
