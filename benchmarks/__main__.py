@@ -77,7 +77,6 @@ def speed(
 def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> Any:
     """The scene that is asked for, or the built-in one, made small."""
     from tidefield.data.load import load_scene
-    from tidefield.synthetic import make_survey, write_survey
 
     if folder is not None:
         return load_scene(folder, width=width)
@@ -85,6 +84,8 @@ def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> A
         raise RunError(
             "--width was given without --scene: the built-in scene has its size; name a scene, or leave it out"
         )
+    from tidefield.synthetic import make_survey, write_survey
+
     os.environ["XDG_CACHE_HOME"] = str(work / "cache")
     survey = make_survey("river_mouths", seed=7, views=9 if quick else 16, width=64 if quick else 256)
     write_survey(survey, work / "scene")
