@@ -44,6 +44,8 @@ from tidefield.methods import names
 SPEED_FILE = "speed.json"
 SHOWN_REGIONS = ("", "_seen_cc")
 """Of `REGIONS`, those on the page; docs/measured has all."""
+GPU_FOLDER, GPU_QUALITY, LARGE_FRAMES_FILE = "gpu", "strict_800.json", "frames_1920.json"
+"""What was measured on a GPU, beside files of speed and frames."""
 SCENES = (*TABLE_3, "caliterra", "swindale", "turin_lot", "brighton_beach", "fern", "lego")
 """In the order of the tables."""
 WITHOUT_ALPHA = Mark(
@@ -82,6 +84,25 @@ class Stored:
     parts: Mapping[str, Any] | None = None
 
 
+@dataclass(frozen=True)
+class OnGpu:
+    """What was stored of a GPU: speed, views of two sizes, and a comparison with a remark on how it was made."""
+
+    speed: Mapping[str, Any] | None
+    frames: Mapping[str, Any] | None
+    large_frames: Mapping[str, Any] | None
+    compared: Results
+    remark: str
+
+
+def read_gpu(folder: Path) -> OnGpu:
+    """Read what was measured on a GPU."""
+    quality = folder / GPU_QUALITY
+    compared = _without_empty_columns(read_figures([quality], SCENES, names()))
+    speed, frames, large = (read_json(folder / file) for file in (SPEED_FILE, FRAMES_FILE, LARGE_FRAMES_FILE))
+    return OnGpu(speed, frames, large, compared, (read_json(quality) or {}).get("remark", ""))
+
+
 def write_page(
     comparison: Sequence[Path],
     ablation: Sequence[Path],
@@ -111,14 +132,19 @@ def write_page(
             f"{places} hold no results: expected files of `tidefield compare`, `tidefield ablate` and the benchmarks; "
             "run them"
         )
-    write_text(out, page(compared, ablated, others, sized, stored))
+    write_text(out, page(compared, ablated, others, sized, stored, read_gpu(runs / GPU_FOLDER)))
 
 
 def page(
-    compared: Results, ablated: Results, others: Sequence[Results], sized: Mapping[int, Results], stored: Stored
+    compared: Results,
+    ablated: Results,
+    others: Sequence[Results],
+    sized: Mapping[int, Results],
+    stored: Stored,
+    gpu: OnGpu,
 ) -> str:
     """The whole page: results first, circumstances and commands last."""
-    records = _records(compared, ablated, others, sized, stored)
+    records = [*_records(compared, ablated, others, sized, stored), *_gpu_records(gpu)]
     marks = scene_marks(learned_from())
     lengths = [marked(table, marks) for table in length_tables(by_length(compared, others))]
     parts = [
@@ -154,6 +180,8 @@ def page(
         *_speed(stored.speed),
         "## Zero-shot views",
         *([table.markdown() for table in frame_tables(stored.frames)] if stored.frames else ["Not measured."]),
+        "## On a GPU",
+        *(_on_gpu(gpu) or ["Not measured."]),
         "## Memory of a large frame",
         _frame(stored.memory),
         "## Time and memory of each method",
@@ -299,6 +327,27 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
             replace(costs, title=f"{width} px: {costs.title}").markdown(),
         ]
     return parts if sized else []
+
+
+def _on_gpu(gpu: OnGpu) -> list[str]:
+    """Quality, speed and views on a GPU."""
+    suffix, marks = SHOWN_REGIONS[-1], marks_of(gpu.compared, learned_from())
+    quality = quality_tables(gpu.compared, {suffix: REGIONS[suffix]}) if gpu.compared.by else []
+    costs = [cost_table(gpu.compared)] if gpu.compared.by else []
+    views = [table for record in (gpu.frames, gpu.large_frames) if record for table in frame_tables(record)]
+    tables = [*(marked(table, marks) for table in quality), *costs, *views]
+    return [
+        *([gpu.remark] if gpu.remark else []),
+        *(notes(gpu.compared, marks) if quality else []),
+        *(replace(table, title=f"On a GPU: {table.title}").markdown() for table in tables),
+        *([table.markdown() for table in speed_tables(gpu.speed)] if gpu.speed else []),
+    ]
+
+
+def _gpu_records(gpu: OnGpu) -> list[tuple[str, Mapping[str, Any]]]:
+    """What has a date, a machine and a command, all under one name."""
+    steps = [one.process.get(step) for one in gpu.compared.by.values() for step in ("train", "evaluate")]
+    return [("on a GPU", record) for record in (gpu.speed, gpu.frames, gpu.large_frames, *steps) if record]
 
 
 ByLength = Mapping[str, Mapping[str, Result]]

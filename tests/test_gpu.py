@@ -16,8 +16,8 @@ from tidefield.config import SWIFT, Budget, Config, NerfConfig, Sampling
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device, choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
-from tidefield.model.rendering import Rendering
 from tidefield.model.renderer import Renderer
+from tidefield.model.rendering import Rendering
 from tidefield.model.views import weighted_rows
 from tidefield.train.loop import SceneTrainer
 
@@ -70,8 +70,7 @@ def test_reads_of_feature_maps_and_their_gradients_are_those_of_the_cpu() -> Non
 
 
 def gradients(scene: Scene, device: torch.device) -> Tensor:
-    trainer = SceneTrainer(SMALL, scene, seed=3, device=device)
-    trainer.batch_loss.config = replace(SMALL.train, tiles=8)
+    trainer = SceneTrainer(replace(SMALL, train=replace(SMALL.train, tiles=8)), scene, seed=3, device=device)
     loss, _ = trainer.loss()
     loss.backward()
     found = [p.grad for p in trainer.network.parameters() if p.grad is not None]

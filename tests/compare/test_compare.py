@@ -226,6 +226,10 @@ def test_the_limits_of_nerfacto_are_stated_where_it_ran_on_a_cpu(disk: Path, tmp
     assert "1,024 rays a batch instead of its default of 4,096" in sentence
     assert "7 to 7 steps, 0.0% to 0.0% of its default of 30,000" in sentence
     assert nerfacto_limits(read_results(out, ["flats"], ["nearest"])) == []
+    on_a_gpu = Children(load_scene(disk, width=48))
+    compare({"flats": disk}, ("nerfacto",), replace(SETTINGS, device="cuda:0"), tmp_path / "gpu", on_a_gpu, quiet)
+    (sentence,) = nerfacto_limits(read_results(tmp_path / "gpu", ["flats"], ["nerfacto"]))
+    assert sentence == "Within the budget Nerfacto made 7 to 7 steps, 0.0% to 0.0% of its default of 30,000."
 
 
 def test_the_limits_of_opensplat_are_stated(disk: Path, tmp_path: Path):

@@ -119,7 +119,8 @@ def _from_points(cells: Cameras, points: SparsePoints, cameras: Cameras) -> Floa
     else:
         from scipy.spatial import KDTree
 
-        distance, index = KDTree(uv).query(pixel_grid(width, height).double().numpy(), k=INTERVAL_POINTS)
+        pixels = pixel_grid(width, height).double().numpy()
+        distance, index = KDTree(uv).query(pixels, k=INTERVAL_POINTS, workers=cores())
         around = inverse[index]
         spread = np.percentile(inverse, 98) - np.percentile(inverse, 2)
         sparse = np.minimum(distance[:, 0] / (SPARSE_DISTANCE * width), 1.0)
