@@ -108,6 +108,16 @@ def test_the_light_of_a_picture_is_that_of_its_pixels_at_every_size():
     assert torch.equal(replace(camera, shading=None).gain_of_rows(), camera.gain[0].expand(1, 1, 3))
 
 
+def test_the_light_of_windows_is_that_of_the_pictures_there():
+    cameras = replace(survey().cameras, shading=planted(), gain=torch.rand(COUNT, 3) + 0.5)[[5, 0, 5]]
+    corners = torch.tensor([[0, 0], [30, 7], [301, 222]])
+    found = cameras.gain_of_windows(corners, 60, 40)
+    for k, (u, v) in enumerate(corners.tolist()):
+        torch.testing.assert_close(found[k], cameras[k].gain_of_rows(slice(v, v + 40), slice(u, u + 60)))
+    without = replace(cameras, shading=None)
+    assert torch.equal(without.gain_of_windows(corners, 60, 40), cameras.gain[:, None, None])
+
+
 def test_cameras_with_and_without_shading_are_joined_and_selected():
     with_light = replace(survey().cameras, shading=planted())
     both = concatenate([with_light[:3], survey().cameras[:2]])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tidefield.config import TrainConfig
 from tidefield.data.depth_prior import STRIDE, DepthPriors, Observed, unproject_to_surface
-from tidefield.data.exposure import to_common_exposure
+from tidefield.data.exposure import to_common_exposure, windows_in_common_light
 from tidefield.data.images import Masks
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
@@ -229,16 +229,21 @@ def _crops(
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
     corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())
-    places = [
-        (i, slice(v, v + height), slice(u, u + width))
-        for i, (u, v) in zip(flat.tolist(), corner.long().tolist(), strict=True)
-    ]
-    crops = torch.stack([to_common_exposure(scene, *place).permute(2, 0, 1) for place in places])
+    places = list(zip(flat.tolist(), corner.long().tolist(), strict=True))
+    crops = _windows(scene, places, (width, height))
     used: tuple[Tensor, ...] = ()
     if scene.photographs.masks:
-        used = (torch.stack([scene.photographs.used(i)[None, rows, columns].float() for i, rows, columns in places]),)
+        masks = [scene.photographs.used(i)[None, v : v + height, u : u + width] for i, (u, v) in places]
+        used = (torch.stack(masks).float(),)
     twice: tuple[Tensor, ...] = ()
     if doubled is not None:
-        larger = [(i, *(slice(2 * one.start, 2 * one.stop) for one in part)) for i, *part in places]
-        twice = (torch.stack([to_common_exposure(doubled, *place).permute(2, 0, 1) for place in larger]),)
+        twice = (_windows(doubled, [(i, [2 * u, 2 * v]) for i, (u, v) in places], (2 * width, 2 * height)),)
     return torch.arange(len(flat)).reshape(neighbours.shape), (crops,), (corner,), used, twice
+
+
+def _windows(scene: Scene, places: Sequence[tuple[int, list[int]]], size: tuple[int, int]) -> Float[Tensor, "K 3 h w"]:
+    """Windows of photographs in the common light: of each the photograph and the upper left corner, in pixels."""
+    width, height = size
+    windows = torch.stack([scene.photographs[i][v : v + height, u : u + width] for i, (u, v) in places])
+    photographs, corners = (torch.tensor(column) for column in zip(*places, strict=True))
+    return windows_in_common_light(windows, scene.cameras[photographs], corners).permute(0, 3, 1, 2)

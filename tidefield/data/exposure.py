@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
 from scipy import sparse
 from scipy.sparse.linalg import aslinearoperator, cg, spsolve
 from scipy.spatial import KDTree
@@ -334,3 +334,17 @@ def in_common_light(
 ) -> Float[Tensor, "h w 3"]:
     """Bring a part of a photograph of a camera into the common light, as `to_common_exposure` does."""
     return photograph[rows, columns].float() / (255 * camera.gain_of_rows(rows, columns))
+
+
+def windows_in_common_light(
+    windows: UInt8[Tensor, "V h w 3"], cameras: Cameras, corner_px: Int[Tensor, "V 2"]
+) -> Float[Tensor, "V h w 3"]:
+    """Bring windows of photographs, one of each camera, into the common light, all at once.
+
+    Args:
+        windows: their pixels.
+        cameras: of the photographs.
+        corner_px: the windows' upper left corners.
+    """
+    height, width = windows.shape[1:3]
+    return windows.float() / (255 * cameras.gain_of_windows(corner_px, width, height))

@@ -173,17 +173,37 @@ class Cameras:
         """Compute `gain_at` of all pixels of a part of a single camera's image, or its one gain without shading."""
         if self.shading is None:
             return self.gain[0].expand(1, 1, 3)
+        parts = ((columns, self.width), (rows, self.height))
+        u, v = (torch.arange(size, device=self.gain.device)[chosen][None] + 0.5 for chosen, size in parts)
+        return self._gain_on_grids(u, v)[0]
+
+    def gain_of_windows(self, corner_px: Int[Tensor, "V 2"], width: int, height: int) -> Float[Tensor, "V #h #w 3"]:
+        """Compute `gain_at` of all pixels of one window of each image, or their gains without shading.
+
+        Args:
+            corner_px: the windows' upper left corners.
+            width, height: of all windows.
+        """
+        if self.shading is None:
+            return self.gain[:, None, None]
+        sides = ((0, width), (1, height))
+        u, v = (corner_px[:, k, None] + torch.arange(size, device=corner_px.device) + 0.5 for k, size in sides)
+        return self._gain_on_grids(u, v)
+
+    def _gain_on_grids(self, u_px: Float[Tensor, "V w"], v_px: Float[Tensor, "V h"]) -> Float[Tensor, "V h w 3"]:
+        """`gain_at` of all pixels of a grid in each image, with shading."""
+        powers = torch.arange(SHADING_DEGREE + 1, device=u_px.device)
         sides = []
-        for axis, (chosen, size) in enumerate(((columns, self.width), (rows, self.height))):
-            pixel = torch.arange(size, device=self.gain.device)[chosen] + 0.5
-            at = ((pixel - self.principal_px[0, axis]) / self.focal_px[0, axis]).clamp(-FRAME_REACH, FRAME_REACH)
-            sides.append(at[:, None] ** torch.arange(SHADING_DEGREE + 1, device=at.device))
+        for axis, pixel in enumerate((u_px, v_px)):
+            at = (pixel - self.principal_px[:, axis, None]) / self.focal_px[:, axis, None]
+            sides.append(at.clamp(-FRAME_REACH, FRAME_REACH)[..., None] ** powers)
         x, y = sides
-        table = x.new_zeros(SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
+        table = x.new_zeros(len(self), SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
         of_x, of_y = zip(*_exponents(SHADING_DEGREE), strict=True)
-        table[of_y, of_x] = self.shading[0]
+        table[:, of_y, of_x] = self.shading
         # Two products: where opt_einsum is installed, einsum takes longer to look for an order of three than for this.
-        return self.gain[0] * torch.einsum("hbc,wb->hwc", torch.einsum("ha,abc->hbc", y, table), x).exp()
+        by_column = torch.einsum("vha,vabc->vhbc", y, table)
+        return self.gain[:, None, None] * torch.einsum("vhbc,vwb->vhwc", by_column, x).exp()
 
     def resized(self, width: int, height: int) -> Cameras:
         """Scale the images to width x height pixels."""
