@@ -1,16 +1,16 @@
 """What a survey costs in hours, memory and disk, stage by stage: a model fitted to what was measured.
 
-CPU seconds and memory of a stage are a constant and shares of the photographs, of their pixels or of the map's cells,
-none negative, by least squares on relative errors. More cores shorten what is not serial (Amdahl, "Validity of the
-single processor approach to achieving large scale computing capabilities", 1967); how much of a stage is serial follows
-from its seconds and CPU seconds. Each measurement is also predicted from the others.
+CPU seconds of a stage are a constant and shares of the photographs, of their pixels or of the map's cells, none
+negative, by least squares on relative errors; memory likewise (`_memory_terms`). More cores shorten what is not serial
+(Amdahl, "Validity of the single processor approach to achieving large scale computing capabilities", 1967); how much of
+a stage is serial follows from its seconds and CPU seconds. Each measurement is also predicted from the others.
 """
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,16 @@ from tidefield.compare.tables import Table
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_json, write_text
 from tidefield.machine import cores, describe
+from tidefield.survey.sfm.features import FeatureOptions
 
 COST_FILE = "cost.json"
 MAP = "map"
 TRAIN = "train"
 TRAINED_STEPS = 100
+FULL_MEGAPIXELS = 25
+"""Of all photographs together, from which on memory for their features is full (`model.cache.BUDGET_BYTES`)."""
+REDUCED_MEGAPIXELS = FeatureOptions().side_px ** 2 * 3 / 4 / 1e6
+"""Of photographs of 4 : 3 as `prepare` looks for features in them."""
 GROUND_SHARE = (1 - 0.8) * (1 - 0.7)
 """Of a photograph's ground that is its own, at the overlaps of 80% and 70% that surveys are flown with."""
 
@@ -81,7 +86,7 @@ def measure_costs(
     """Prepare, train for some steps and map each flight; store seconds, memory and disk in RUNS/cost.json.
 
     Args:
-        flights: folders of `python -m benchmarks flight`, at least four, of different numbers and sizes of photographs.
+        flights: folders of `python -m benchmarks flight`, at least five, of different numbers and sizes of photographs.
         work: folder for the scenes, runs and maps; those of a flight that is measured are made anew.
         runs: folder of the record; what it holds is not measured again.
         device: of training and maps.
@@ -126,9 +131,25 @@ def _size(folder: Path) -> int:
 
 
 def _terms(stage: str, survey: Survey) -> list[float]:
-    """What a stage may depend on."""
-    size = survey.cells / 1e6 if stage == MAP else survey.photographs * survey.megapixels
-    return [1.0, survey.photographs, size]
+    """What a stage may depend on.
+
+    `prepare` reads photographs whole and looks for features in reduced ones: of those there are no more in larger ones.
+    """
+    if stage == MAP:
+        return [1.0, survey.photographs, survey.cells / 1e6]
+    reduced = min(survey.megapixels, REDUCED_MEGAPIXELS)
+    return [1.0, survey.photographs, survey.photographs * survey.megapixels, survey.photographs * reduced]
+
+
+def _memory_terms(stage: str, survey: Survey, more_cores: float = 1.0) -> list[float]:
+    """What the memory of a stage may depend on.
+
+    In `prepare` each core works on a photograph of its own, and something of each photograph is kept. Training and maps
+    keep features of photographs, until their memory is full; what else they keep is that of an area or a tile.
+    """
+    if stage in (TRAIN, MAP):
+        return [1.0, survey.megapixels, min(survey.photographs * survey.megapixels, FULL_MEGAPIXELS)]
+    return [1.0, survey.megapixels * more_cores, survey.photographs]
 
 
 def _fit(rows: Sequence[Sequence[float]], values: Sequence[float]) -> np.ndarray:
@@ -145,7 +166,7 @@ class Model:
     Attributes:
         seconds: factors of `_terms` of each stage, for CPU seconds, or for seconds of what a GPU does.
         serial: share of each stage that more cores do not shorten.
-        memory: factors of `_terms` of each stage, bytes on the cores it was measured on.
+        memory: factors of `_memory_terms` of each stage, bytes.
         disk: bytes of each megapixel of photographs, and of each cell.
         cores: it was measured on.
         device: of training and maps.
@@ -165,7 +186,8 @@ class Model:
         hours, memory = {}, {}
         for stage, factors in self.seconds.items():
             terms = np.array(_terms(stage, survey))
-            memory[stage] = float(self.memory[stage] @ terms) * max(machines.cores / self.cores, 1.0)
+            more_cores = max(machines.cores / self.cores, 1.0)
+            memory[stage] = float(self.memory[stage] @ np.array(_memory_terms(stage, survey, more_cores)))
             if stage == TRAIN:
                 hours[stage] = survey.minutes / 60
                 memory[stage] = memory[stage] if survey.minutes else 0.0
@@ -185,12 +207,12 @@ def fit_model(measured: Sequence[dict[str, Any]], device: str) -> Model:
     """Fit the model to the measurements of a device.
 
     Raises:
-        RunError: there are fewer than four, as many as the terms and one.
+        RunError: there are fewer than five, as many as the terms and one.
     """
     measured = [of for of in measured if of["device"] == device]
-    if len(measured) < 4:
+    if len(measured) < 5:
         raise RunError(
-            f"{len(measured)} measurements of costs on {device}: expected four or more; make flights with "
+            f"{len(measured)} measurements of costs on {device}: expected five or more; make flights with "
             f"`python -m benchmarks flight` and name them: python -m benchmarks cost FLIGHT... --device {device}"
         )
     return _fitted(measured, device)
@@ -205,7 +227,8 @@ def _fitted(measured: Sequence[dict[str, Any]], device: str) -> Model:
         of_stage = [of["stages"].get(stage, {"seconds": 0.0, "cpu_seconds": 0.0, "peak_bytes": 0.0}) for of in measured]
         counted = "cpu_seconds" if device == "cpu" or stage != MAP else "seconds"
         seconds[stage] = _fit(rows, [of[counted] for of in of_stage])
-        memory[stage] = _fit(rows, [of["peak_bytes"] for of in of_stage])
+        kept = [_memory_terms(stage, survey) for survey in surveys]
+        memory[stage] = _fit(kept, [of["peak_bytes"] for of in of_stage])
         whole, cpu = (sum(of[key] for of in of_stage) for key in ("seconds", "cpu_seconds"))
         serial[stage] = float(np.clip((number * whole / cpu - 1) / (number - 1), 0, 1)) if cpu and number > 1 else 1.0
     pixels = sum(survey.photographs * survey.megapixels for survey in surveys)
@@ -221,16 +244,33 @@ def _survey(of: dict[str, Any]) -> Survey:
     return Survey(of["photographs"], of["megapixels"], of["cells"])
 
 
-def predicted_from_others(measured: Sequence[dict[str, Any]], device: str) -> dict[str, tuple[float, float]]:
-    """Seconds of prepare and map of each measurement but training: as measured, and by the model of all others."""
+@dataclass(frozen=True)
+class Check:
+    """A measurement of prepare and map without training, and what the model of all others says.
+
+    Attributes:
+        seconds, predicted_seconds: of all their stages.
+        memory_bytes, predicted_bytes: of the stage that needs most, training included.
+    """
+
+    seconds: float
+    predicted_seconds: float
+    memory_bytes: float
+    predicted_bytes: float
+
+
+def predicted_from_others(measured: Sequence[dict[str, Any]], device: str) -> dict[str, Check]:
+    """Each measurement, and what the model of all others says of it."""
     measured = [of for of in measured if of["device"] == device]
     found = {}
     for i, of in enumerate(measured):
         model = _fitted([*measured[:i], *measured[i + 1 :]], device)
-        hours = model.estimate(_survey(of), Machines(model.cores, int(device != "cpu"))).hours
-        truth = sum(stage["seconds"] for name, stage in of["stages"].items() if name != TRAIN)
+        estimate = model.estimate(replace(_survey(of), minutes=1.0), Machines(model.cores, int(device != "cpu")))
+        hours = sum(hours for stage, hours in estimate.hours.items() if stage != TRAIN)
+        seconds = sum(stage["seconds"] for name, stage in of["stages"].items() if name != TRAIN)
+        peak = max(stage["peak_bytes"] for stage in of["stages"].values())
         name = f"{of['photographs']:,} of {of['megapixels']:.2f} megapixels, {of['cells'] / 1e6:.1f} million cells"
-        found[name] = truth, 3600 * sum(hours.values())
+        found[name] = Check(seconds, 3600 * hours, peak, max(estimate.memory_bytes.values()))
     return found
 
 
@@ -279,8 +319,7 @@ def stage_table(model: Model) -> Table:
                 f"{stage}",
                 f"{factors[0]:.1f}",
                 f"{factors[1]:.3f}",
-                "-" if of_map else f"{factors[2]:.3f}",
-                f"{factors[2]:.1f}" if of_map else "-",
+                *(["-", "-", f"{factors[2]:.1f}"] if of_map else [f"{factors[2]:.3f}", f"{factors[3]:.3f}", "-"]),
                 f"{model.serial[stage]:.0%}",
             ]
         )
@@ -289,6 +328,7 @@ def stage_table(model: Model) -> Table:
         "CPU s",
         "each photograph, CPU s",
         "each megapixel, CPU s",
+        f"each megapixel up to {REDUCED_MEGAPIXELS:.2f} of a photograph, CPU s",
         "each million cells, CPU s",
         "serial",
     ]
@@ -299,10 +339,11 @@ def write_page(runs: Path, out: Path) -> None:
     """Write the page from what was stored."""
     measured = list((read_json(runs / COST_FILE) or {"measured": {}})["measured"].values())
     model = fit_model(measured, "cpu")
-    check = [
-        [name, f"{a:.0f}", f"{b:.0f}", f"{b / a:.2f}"]
-        for name, (a, b) in predicted_from_others(measured, "cpu").items()
-    ]
+    check = []
+    for name, of in predicted_from_others(measured, "cpu").items():
+        memory = (f"{size / 1e9:.1f}" for size in (of.memory_bytes, of.predicted_bytes))
+        ratio = of.predicted_seconds / of.seconds
+        check.append([name, f"{of.seconds:.0f}", f"{of.predicted_seconds:.0f}", f"{ratio:.2f}", *memory])
     two, many = Machines(2), Machines(16)
     surveys = [
         ("a creek", survey_of_area(0.05, 20, 0.03, 0.05, 10), two),
@@ -327,13 +368,16 @@ def write_page(runs: Path, out: Path) -> None:
         "which nothing here has shown.",
         "Areas are flown with overlaps of 80% and 70% at a ground sampling of 3 cm, and mapped at 5 cm, the 1,000 km2 "
         "at 10 cm. `prepare` and training run on one machine; only maps are shared among several. Training takes the "
-        "time it is given: 10 minutes, 1 and 10 hours for the coasts. Memory is what was measured on "
-        f"{model.cores} cores, times the ratio of cores, because each core works on a block or tile of its own. "
+        "time it is given: 10 minutes, 1 and 10 hours for the coasts. Of memory, `prepare` needs that of a photograph "
+        "for each core and something of every photograph; training and maps need that of a photograph, and keep "
+        f"features of photographs, until their memory is full ({FULL_MEGAPIXELS} megapixels in all). "
         "GPUs: " + _gpus(measured),
         "## The model",
         stage_table(model).markdown(),
         "## Each measurement, predicted from the others",
-        Table("", ["flight", "prepare and map, s", "by the model, s", "ratio"], check).markdown(),
+        Table(
+            "", ["flight", "prepare and map, s", "by the model, s", "ratio", "memory, GB", "by the model, GB"], check
+        ).markdown(),
     ]
     write_text(out, "\n\n".join(parts) + "\n")
 

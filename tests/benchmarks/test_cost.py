@@ -18,22 +18,23 @@ from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
 
-MEASURED = ((40, 0.1, 1e6), (80, 0.1, 3e6), (200, 0.1, 5e6), (40, 0.5, 9e6), (60, 0.2, 2e6))
+MEASURED = ((40, 0.1, 1e6), (80, 0.1, 3e6), (200, 0.1, 5e6), (40, 0.5, 9e6), (60, 12.0, 2e6), (100, 0.2, 2e6))
 
 
 def measurement(photographs: int, megapixels: float, cells: float) -> dict:
     """Of a machine with two cores: poses 2 s + 0.5 s each, all serial; images 3 s a megapixel, none; a map 7 s + 60 s
     a million cells, half of it serial."""
-    poses, images, mapped = 2 + 0.5 * photographs, 3 * photographs * megapixels, 7 + 60 * cells / 1e6
+    total = photographs * megapixels
+    poses, images, mapped = 2 + 0.5 * photographs, 3 * total, 7 + 60 * cells / 1e6
     return {
         "photographs": photographs, "megapixels": megapixels, "cells": cells, "device": "cpu",
         "stages": {
-            "poses": {"seconds": poses, "cpu_seconds": poses, "peak_bytes": 1e8 + 1e6 * photographs},
+            "poses": {"seconds": poses, "cpu_seconds": poses, "peak_bytes": 1e8 + 1e6 * photographs + 2e8 * megapixels},
             "images": {"seconds": images / 2, "cpu_seconds": images, "peak_bytes": 1e8},
-            "train": {"seconds": 100.0, "cpu_seconds": 200.0, "peak_bytes": 1e9},
+            "train": {"seconds": 100.0, "cpu_seconds": 200.0, "peak_bytes": 1e9 + 1e8 * min(total, 25)},
             "map": {"seconds": 0.75 * mapped, "cpu_seconds": mapped, "peak_bytes": 2e8},
         },
-        "scene_bytes": 5e5 * photographs * megapixels, "map_bytes": 40 * cells,
+        "scene_bytes": 5e5 * total, "map_bytes": 40 * cells,
         **describe(), "machine": {**describe()["machine"], "cores": 2},
     }  # fmt: skip
 
@@ -50,7 +51,10 @@ def test_the_model_of_costs_finds_what_each_stage_depends_on_and_what_more_cores
         },
         rel=1e-3,
     )
-    assert found.memory_bytes["poses"] == pytest.approx((1e8 + 1e6 * 1000) * 8, rel=1e-3)
+    assert found.memory_bytes["poses"] == pytest.approx(1e8 + 1e6 * 1000 + 2e8 * 20 * 8, rel=1e-3), (
+        "a photograph a core"
+    )
+    assert found.memory_bytes["train"] == pytest.approx(1e9 + 1e8 * 25, rel=1e-3), "full"
     assert found.disk_bytes == pytest.approx(5e5 * 1000 * 20 + 40 * 1e8, rel=1e-3)
     alone, shared = (model.estimate(Survey(1000, 20.0, 1e8), Machines(16, number=n)).hours for n in (1, 10))
     assert shared["map"] == pytest.approx(alone["map"] / 10)
@@ -61,8 +65,9 @@ def test_each_measurement_of_costs_is_predicted_without_itself():
     odd = measurement(*MEASURED[0])
     odd["stages"]["poses"] = {"seconds": 500.0, "cpu_seconds": 500.0, "peak_bytes": 1e8}
     checks = predicted_from_others([odd, *(measurement(*of) for of in MEASURED[1:])], "cpu")
-    truth, predicted = next(iter(checks.values()))
-    assert truth > 500 > 3 * predicted
+    check = next(iter(checks.values()))
+    assert check.seconds > 500 > 3 * check.predicted_seconds
+    assert (check.memory_bytes, check.predicted_bytes) == pytest.approx((1.4e9, 1.4e9), rel=1e-3)
 
 
 def test_a_measurement_of_costs_that_was_interrupted_is_made_anew(tmp_path, monkeypatch):
@@ -104,7 +109,7 @@ def test_costs_on_a_gpu_that_nobody_measured_are_refused():
 
 
 def test_the_page_of_costs_marks_what_was_not_measured(tmp_path: Path):
-    write_json(tmp_path / "cost.json", {"measured": {str(of): measurement(*of) for of in MEASURED[:4]}})
+    write_json(tmp_path / "cost.json", {"measured": {str(of): measurement(*of) for of in MEASURED[:5]}})
     write_page(tmp_path, tmp_path / "cost.md")
     text = (tmp_path / "cost.md").read_text()
     assert "| a coast, 1,000 km2 * |" in text
