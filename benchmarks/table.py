@@ -188,8 +188,8 @@ def page(
         *([cost_table(compared).markdown()] if compared.by else ["Not measured."]),
         "## How this was measured",
         "\n".join(f"- {line}" for line in circumstances(records)),
-        "`make bench ARGS=table` wrote this page from [docs/measured](measured); nothing is typed by hand. The "
-        "commands:",
+        "`make bench ARGS=table` wrote this page from [docs/measured](measured); nothing is typed by hand but the "
+        "remark on how a GPU was used. The commands:",
         "\n".join(f"    {command}" for command in dict.fromkeys(record["command"] for _, record in records)),
     ]
     return "\n\n".join(parts) + "\n"

@@ -326,20 +326,13 @@ def to_common_exposure(
     scene: Scene, index: int, rows: slice = slice(None), columns: slice = slice(None)
 ) -> Float[Tensor, "h w 3"]:
     """Read a part of a photograph in the common light: divided by gain and shading (docs/method.md, section 12)."""
-    return in_common_light(scene.photographs[index], scene.cameras[index], rows, columns)
-
-
-def in_common_light(
-    photograph: UInt8[Tensor, "H W 3"], camera: Cameras, rows: slice = slice(None), columns: slice = slice(None)
-) -> Float[Tensor, "h w 3"]:
-    """Bring a part of a photograph of a camera into the common light, as `to_common_exposure` does."""
-    return photograph[rows, columns].float() / (255 * camera.gain_of_rows(rows, columns))
+    return scene.photographs[index][rows, columns].float() / (255 * scene.cameras[index].gain_of_rows(rows, columns))
 
 
 def windows_in_common_light(
     windows: UInt8[Tensor, "V h w 3"], cameras: Cameras, corner_px: Int[Tensor, "V 2"]
 ) -> Float[Tensor, "V h w 3"]:
-    """Bring windows of photographs, one of each camera, into the common light, all at once.
+    """Bring windows of photographs, one of each camera, into the common light, as `to_common_exposure` does.
 
     Args:
         windows: their pixels.

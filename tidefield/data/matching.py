@@ -90,7 +90,7 @@ class Matcher:
     ) -> None:
         self.scene, self.pyramid, self.most_px = scene, pyramid or Pyramid(scene), most_px
         self.device = torch.device(device)
-        self._cameras, self._sizes = scene.cameras.to(self.device), self.pyramid.cameras.to(self.device)
+        self._cameras = scene.cameras.to(self.device)
         self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self._reading = threading.Lock()
 
@@ -256,8 +256,7 @@ class Matcher:
             rows, columns = (_extent((view > 0).any(dim)) for dim in (1, 0))
             if rows.stop == rows.start:
                 continue
-            row = self.pyramid.row(torch.tensor(photograph), torch.tensor(level))
-            source = self._sizes[int(row)]
+            source = self.pyramid.camera(photograph, level).to(self.device)
             image = self._image(photograph, level, source)
             looks.append(
                 _Look(

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tidefield.data.exposure import in_common_light
+from tidefield.data.exposure import windows_in_common_light
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
@@ -165,18 +165,20 @@ class FeatureCache:
         corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
         camera = self.pyramid.camera(block.photograph, block.level).to(self.device)
-        part = in_common_light(colours.to(self.device), camera, slice(top, bottom), slice(left, right))
-        images = [part]
-        if doubled is not None:
-            camera = camera.resized(doubled.shape[1], doubled.shape[0])
-            rows, columns = slice(2 * top, 2 * bottom), slice(2 * left, 2 * right)
-            images.append(in_common_light(doubled.to(self.device), camera, rows, columns))
-        corner_px = corner[None].to(part)
-        first, *twice = (image.permute(2, 0, 1)[None] for image in images)
+
+        def window(photograph: Tensor, scale: int) -> Tensor:
+            """The block as the network reads it, of the photograph at its level or at twice that size."""
+            pixels = photograph[scale * top : scale * bottom, scale * left : scale * right]
+            at = camera.resized(photograph.shape[1], photograph.shape[0])
+            colours = windows_in_common_light(pixels[None].to(self.device), at, scale * corner[None].to(self.device))
+            return colours.permute(0, 3, 1, 2)
+
+        first, twice = window(colours, 1), [] if doubled is None else [window(doubled, 2)]
+        corner_px = corner[None].to(first)
         encoded = self.network.encode(first, corner_px, *twice)
         if self.scene.photographs.masks:
             used = torch.ones(size.flip(0).tolist(), dtype=torch.bool) if mask is None else mask
-            encoded = encoded.masked(used[None, None, top:bottom, left:right].to(part), corner_px)
+            encoded = encoded.masked(used[None, None, top:bottom, left:right].to(first), corner_px)
         for maps, found in zip(_maps(self._encoded), _maps(encoded), strict=True):
             first = slot * self._texels(maps.stride)
             maps.rows[first : first + len(found.rows)] = found.rows.to(maps.rows.dtype)
