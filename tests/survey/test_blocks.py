@@ -11,6 +11,7 @@ from located_surveys import fly, photograph, quiet
 
 from tidefield.errors import RunError
 from tidefield.geometry.similarity import Similarity, refine_similarity
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images
 from tidefield.survey.sfm import blocks as module
 from tidefield.survey.sfm.blocks import DONE, Block, cut, matched_pairs, merge, reconstruct_blocks, settle
 from tidefield.survey.sfm.features import encode_name
@@ -172,6 +173,17 @@ def kill(*_: object) -> None:
     import signal
 
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_the_equations_of_thousands_of_photographs_are_factorized():
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = options.num_cameras_per_rig = 1
+    options.num_frames_per_rig, options.num_points3D = 1100, 30
+    model = pycolmap.synthesize_dataset(options)
+    config = all_images(model)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    summary = pycolmap.create_default_bundle_adjuster(adjustment_options(), config, model).solve()
+    assert summary.ceres_summary.linear_solver_type_used.name == "SPARSE_SCHUR"
 
 
 def test_models_that_share_no_photographs_stay_apart(survey, tmp_path: Path):

@@ -48,6 +48,10 @@ _GENERAL = {
 """COLMAP's models by the one that contains them."""
 _STEPS = 200
 _TOLERANCE = 1e-7
+_SOLVED_DIRECTLY = 20_000
+"""Photographs up to which the linear equations are factorized. A photograph shares points with its neighbours only, so
+the factors stay sparse. COLMAP's conjugate gradients, which it takes from 1,000 on, need many times as long for the
+bend of a long flight."""
 
 
 def adjust_to_positions(
@@ -193,6 +197,7 @@ def adjustment_options() -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = options.refine_sensor_from_rig = options.refine_focal_length = False
     options.refine_principal_point = options.refine_extra_params = True
+    options.ceres.max_num_images_direct_sparse_cpu_solver = _SOLVED_DIRECTLY
     solver = options.ceres.solver_options
     solver.max_num_iterations, solver.function_tolerance = _STEPS, _TOLERANCE
     options.ceres.solver_options = solver
