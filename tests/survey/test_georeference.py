@@ -258,3 +258,20 @@ def test_a_long_model_that_bends_is_held_by_the_positions_of_ordinary_receivers(
         off = np.array([centres[p.name] for p in flight.survey.photographs]) - flight.centres_world
         errors[many] = float(np.std(off[:, 2]))
     assert errors[10] < 0.8 * errors[10_000], errors
+
+
+def test_positions_of_ordinary_receivers_correct_the_distortion_that_bows_a_large_model(monkeypatch):
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], camera_id=1
+    )
+    flight = fly(lines=8, each=16, position_m=0.5, camera=camera)
+    bowed = pycolmap.Reconstruction(flight.model)
+    bowed.cameras[1].params = [FOCAL, WIDTH / 2, HEIGHT / 2, -0.005]
+    only_poses = {"refine_extra_params": False, "refine_principal_point": False}
+    bundle_adjustment.solve(bowed, bundle_adjustment.all_images(bowed), **only_poses)
+    monkeypatch.setattr(bundle_adjustment, "MANY", 100)
+    georeference(bowed, flight.survey, quiet)
+    centres = camera_centres(bowed)
+    off = np.array([centres[p.name] for p in flight.survey.photographs]) - flight.centres_world
+    assert np.std(off[:, 2]) < 0.2
+    assert bowed.cameras[1].params == pytest.approx([FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], abs=1e-3)

@@ -115,7 +115,8 @@ def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple
     """Adjust a large aligned model to the positions of ordinary receivers, in place.
 
     The longer a survey, the more its model bends: matches determine it ever more weakly, while the errors of positions
-    stay as they are. Lenses are kept.
+    stay as they are. The distortion is adjusted with it, because a slightly wrong one prefers a bowl, which positions
+    alone do not flatten. Focal lengths, principal points and lenses of few photographs are kept.
 
     Args:
         fit: of the model to the positions, with their observed standard deviations and gross errors.
@@ -131,7 +132,15 @@ def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple
         {fit.names[i]: fit.given_world[i] for i in good},
         {fit.names[i]: _CORRELATED * fit.sigma_m[i] for i in good},
     )
-    carry_over(_adjusted(thinned(model), priors, (), False), model)
+    light = thinned(model)
+    config = all_images(light)
+    for number, taken in _photographs_of_lenses(light).items():
+        if taken < _IMAGES_OF_A_LENS:
+            config.set_constant_cam_intrinsics(number)
+    options = adjustment_options()
+    options.refine_principal_point = False
+    _solve_with_positions(light, config, options, list(priors.values()))
+    carry_over(light, model)
     return ("The model is held by the positions of its photographs, so that it does not bend over its length.",)
 
 
@@ -226,17 +235,20 @@ def all_images(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfi
 
 def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, free: bool) -> None:
     """Convert lenses that are to be adjusted to OPENCV or OPENCV_FISHEYE; fix others, and those of few photographs."""
-    taken = Counter(model.image(number).camera_id for number in model.reg_image_ids())
-    for number, camera in model.cameras.items():
-        if not taken[number]:
-            continue
-        if not free or taken[number] < _IMAGES_OF_A_LENS:
+    for number, taken in _photographs_of_lenses(model).items():
+        camera = model.cameras[number]
+        if not free or taken < _IMAGES_OF_A_LENS:
             config.set_constant_cam_intrinsics(number)
         elif camera.model.name in _GENERAL:
             general = _GENERAL[camera.model.name]
             lens = lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
             camera.model = getattr(pycolmap.CameraModelId, general)
             camera.params = colmap_parameters(lens, general)
+
+
+def _photographs_of_lenses(model: pycolmap.Reconstruction) -> Counter[int]:
+    """Count the registered photographs of each camera that took some."""
+    return Counter(model.image(number).camera_id for number in model.reg_image_ids())
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -256,11 +268,21 @@ def _adjusted(
     copy = pycolmap.Reconstruction(model)
     config = all_images(copy)
     generalise_lenses(copy, config, free)
+    used = [prior for name, prior in priors.items() if name not in left_out]
+    _solve_with_positions(copy, config, adjustment_options(), used)
+    return copy
+
+
+def _solve_with_positions(
+    model: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    adjustment: pycolmap.BundleAdjustmentOptions,
+    priors: list[pycolmap.PosePrior],
+) -> None:
+    """Adjust a model in place to its matches and to positions."""
     options = pycolmap.PosePriorBundleAdjustmentOptions()
     options.alignment_ransac.random_seed = 0
-    used = [prior for name, prior in priors.items() if name not in left_out]
-    pycolmap.create_pose_prior_bundle_adjuster(adjustment_options(), options, config, used, copy).solve()
-    return copy
+    pycolmap.create_pose_prior_bundle_adjuster(adjustment, options, config, priors, model).solve()
 
 
 def _residual_m(
