@@ -49,6 +49,13 @@ def test_gains_and_falloff_are_found():
     np.testing.assert_allclose((found - found.min()) - (true - true.min()), 0, atol=0.03)
 
 
+def test_the_memory_of_a_photograph_is_given_back_once_it_was_looked_at(monkeypatch: pytest.MonkeyPatch):
+    released = []
+    monkeypatch.setattr(Photographs, "release", released.append)
+    estimate_correction(shaded(GAINS, FALLOFF), [0] * 12)
+    assert len(released) == 12
+
+
 def test_corrected_photographs_agree():
     scene = shaded(GAINS, FALLOFF)
     correction = estimate_correction(scene, [0] * 12)

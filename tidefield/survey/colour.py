@@ -60,11 +60,12 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
         always: apply gains even if they do not help.
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
-    seen = observe(scene.photographs, scene.points, scene.train) if scene.points is not None else None
-    if scene.points is None or seen is None or not len(seen.value):
+    photographs, points = scene.photographs, scene.points
+    seen = None if points is None else observe(photographs, points, scene.train, photographs.release)
+    if points is None or seen is None or not len(seen.value):
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
-    uv = scene.points.uv_px[torch.from_numpy(seen.row)].double()
+    uv = points.uv_px[torch.from_numpy(seen.row)].double()
     which = torch.from_numpy(seen.photograph)
     tangent = ((uv - scene.cameras.principal_px[which]) / scene.cameras.focal_px[which]).norm(dim=1).numpy()
     power = _polynomial(tangent)
