@@ -35,8 +35,8 @@ from tidefield.files import write_json
 from tidefield.machine import describe
 
 FUZZ_FILE = "fuzz.json"
-CPU_SECONDS, WAITING_SECONDS = 10.0, 120.0
-"""That a reader may compute for a file, and that it may take on a busy machine."""
+WAITING_SECONDS = 120.0
+"""That a reader may take for a file on a busy machine."""
 MOST_BYTES = 1 << 30
 """Of memory that a reader may need for a file; the files are of kilobytes."""
 _ADDRESSES = 8 << 30
@@ -167,7 +167,7 @@ class _Worker:
         kind = "time" if status.endswith("SIGPROF") or status == "it waits" else "end"
         text = self._log.read_text(errors="replace")[-20_000:]
         file = damage(reader, self.work / "seeds" / reader.seed, seed, number)
-        yield _outcome(kind, CPU_SECONDS if kind == "time" else 0.0, f"{text}\n{status}", *file)
+        yield _outcome(kind, reader.cpu_seconds if kind == "time" else 0.0, f"{text}\n{status}", *file)
 
     def _start(self) -> SpawnProcess:
         context = multiprocessing.get_context("spawn")
@@ -239,7 +239,7 @@ def _read(reader: Reader, seed: int, number: int | None, work: Path, log: Path) 
     os.truncate(log, 0)
     before = _reset_peak()
     kind, text, start = "accepted", "", time.process_time()
-    signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, reader.cpu_seconds)
     try:
         reader.read(folder)
     except TidefieldError as error:

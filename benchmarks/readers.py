@@ -26,6 +26,10 @@ _PLACE = (10.5, 53.6)
 """Longitude and latitude of the survey."""
 
 
+CPU_SECONDS = 10.0
+"""That a reader may compute for a file."""
+
+
 @dataclass(frozen=True)
 class Reader:
     """Something that reads a kind of file.
@@ -36,6 +40,7 @@ class Reader:
         files: which of them are damaged, as patterns.
         read: reads the folder; what it raises but the project's own errors is a finding.
         damage: makes other bytes of a file's.
+        cpu_seconds: that it may compute for a file; more are a finding.
     """
 
     name: str
@@ -43,6 +48,7 @@ class Reader:
     files: tuple[str, ...]
     read: Callable[[Path], object]
     damage: Mutation = mutate
+    cpu_seconds: float = CPU_SECONDS
 
 
 def _scene(folder: Path) -> None:

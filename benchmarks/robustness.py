@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fuzz import CPU_SECONDS, FUZZ_FILE, MOST_BYTES
+from benchmarks.fuzz import FUZZ_FILE, MOST_BYTES
 from benchmarks.kills import KILLS_FILE
+from benchmarks.readers import CPU_SECONDS
 from benchmarks.table import circumstances
 from tidefield.compare.tables import Table
 from tidefield.errors import RunError

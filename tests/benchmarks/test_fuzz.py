@@ -73,7 +73,7 @@ PLANTED = {function.__name__: function for function in (accept, refuse, fail, en
 
 @linux
 def test_a_finding_is_an_error_an_end_or_too_much_time_or_memory_and_does_not_end_the_campaign(tmp_path: Path):
-    readers = [Reader(name, "seed", ("file",), read) for name, read in PLANTED.items()]
+    readers = [Reader(name, "seed", ("file",), read, cpu_seconds=2.0) for name, read in PLANTED.items()]
     counts = measure_fuzz(readers, 0.006, 0, tmp_path / "kept", tmp_path, print, make_seeds)
     assert counts["accept"].accepted == counts["accept"].files > 0
     assert counts["refuse"].refused > 0
