@@ -114,6 +114,11 @@ def test_torch_is_not_imported_with_what_answers_help(name: str):
     assert not [m for m in imported_with(name) if m.split(".")[0] == "torch"]
 
 
+@pytest.mark.parametrize("name", ["features", "blocks"])
+def test_the_processes_of_prepare_do_without_torch(name: str):
+    assert not [m for m in imported_with(f"tidefield.survey.sfm.{name}") if m.split(".")[0] == "torch"]
+
+
 @pytest.mark.parametrize("command", ["render", "train"])
 def test_what_renders_and_trains_does_without_structure_from_motion(command: str):
     assert not [m for m in imported_with(f"tidefield.commands.{command}") if m.split(".")[0] == "pycolmap"]

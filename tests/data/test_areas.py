@@ -9,13 +9,14 @@ import textured_wall as wall
 import torch
 from networks import SMALL
 
-from tidefield.data.areas import PLACES, Area, _ground, cut, halves, select
+from tidefield.data.areas import PLACES, Area, _ground, cut, select
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.matching import Matcher
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import which_see
+from tidefield.geometry.halves import halves
 
 CUT = partial(cut, whole=20, most=8)
 

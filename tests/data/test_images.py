@@ -12,7 +12,8 @@ from PIL import Image
 from tidefield.data import cache as user_cache
 from tidefield.data import images
 from tidefield.data.cache import cache_folder
-from tidefield.data.images import PhotographFile, open_photographs, read_header
+from tidefield.data.images import PhotographFile, open_photographs
+from tidefield.data.pictures import read_header
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import Lens
 

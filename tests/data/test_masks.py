@@ -14,9 +14,9 @@ from scenes_on_disk import BARREL, PINHOLE, Truth, survey, write_colmap, write_t
 from tidefield.config import PAPER, SWIFT
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
-from tidefield.data.images import fill_masked
 from tidefield.data.load import load_scene
 from tidefield.data.neighbours import choose_neighbours
+from tidefield.data.pictures import fill_masked
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import SceneError

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from scenes_on_disk import BARREL, PINHOLE, survey, write_blender, write_colmap, write_llff, write_transforms
 
-from tidefield.data.images import read_header
+from tidefield.data.pictures import read_header
 from tidefield.data.ply import read_ply
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.files import inside, opened

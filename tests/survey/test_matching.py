@@ -10,7 +10,8 @@ import torch
 from located_surveys import unlocated_photograph
 from torch import Tensor
 
-from tidefield.survey.sfm.matching import (
+from tidefield.survey.sfm.matching import match
+from tidefield.survey.sfm.pairs import (
     EXHAUSTIVE,
     MAX_ANGLE_RAD,
     MAX_PAIRS,
@@ -20,7 +21,6 @@ from tidefield.survey.sfm.matching import (
     PREVIEW,
     SEQUENTIAL,
     candidate_pairs,
-    match,
     match_descriptors,
     preview_descriptors,
     select_pairs,

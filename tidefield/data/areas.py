@@ -12,14 +12,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import which_see
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.halves import halves
 
 WHOLE, WHOLE_BYTES = 400, 4e9
 """Up to this number of training photographs, whose depth priors take this memory, a scene is one area."""
@@ -64,19 +64,6 @@ def cut(scene: Scene, whole: int = WHOLE, most: int = MOST, whole_bytes: float =
     position = scene.cameras.position_world[train].double().cpu().numpy()
     most = min(most, max(FEWEST, int(whole_bytes / each)))
     return [tuple(train[i] for i in sorted(members)) for members in halves(position, most)]
-
-
-def halves(points: Float64[np.ndarray, "N D"], most: int) -> list[list[int]]:
-    """Halve a set of points across its longest side until no part has more than `most`."""
-
-    def parts(members: np.ndarray) -> list[list[int]]:
-        if len(members) <= most:
-            return [members.tolist()]
-        along = points[members, int(np.argmax(np.ptp(points[members], axis=0)))]
-        order = members[np.argsort(along, kind="stable")]
-        return [*parts(order[: len(order) // 2]), *parts(order[len(order) // 2 :])]
-
-    return parts(np.arange(len(points)))
 
 
 def select(scene: Scene, targets: Sequence[int], doubled: Scene | None = None) -> Area:

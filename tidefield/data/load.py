@@ -16,8 +16,9 @@ from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.holdout import read_holdout
 from tidefield.data.hull import visual_hull
-from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, read_header
+from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs
 from tidefield.data.near_far import estimate_near_far
+from tidefield.data.pictures import read_header
 from tidefield.data.readers.colmap import find_colmap, read_colmap
 from tidefield.data.readers.files import naming, reading
 from tidefield.data.readers.llff import SUFFIXES, read_llff

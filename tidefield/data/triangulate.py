@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from tidefield.data.cache import POINTS_SUFFIX, cache_folder, identity, key, make_room, open_folder
-from tidefield.data.images import Progress, read_mask
+from tidefield.data.images import Progress
+from tidefield.data.pictures import read_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.sift import find_features

@@ -19,8 +19,8 @@ from nerfbaselines import Dataset, Method, MethodInfo, ModelInfo, RenderOptions,
 from PIL import Image
 
 from tidefield.config import PRESETS, Budget, Range, Seed, from_json, warm_start
-from tidefield.data.images import write_mask
 from tidefield.data.load import load_scene
+from tidefield.data.pictures import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.device import choose_device
 from tidefield.errors import RunError

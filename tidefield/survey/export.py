@@ -14,7 +14,7 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
-from tidefield.data.images import decode, read_mask, write_mask
+from tidefield.data.pictures import decode, read_mask, write_mask
 from tidefield.data.readers.files import quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth

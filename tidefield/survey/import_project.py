@@ -19,8 +19,9 @@ from jaxtyping import Int64
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
 from tidefield.data.holdout import read_holdout
-from tidefield.data.images import Progress, decode, read_mask, rectify_mask, write_mask
+from tidefield.data.images import Progress
 from tidefield.data.load import own_lens, read_posed
+from tidefield.data.pictures import decode, read_mask, rectify_mask, write_mask
 from tidefield.data.readers.files import naming, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.triangulate import find_points

@@ -41,8 +41,9 @@ from tidefield.survey.sfm.mapping import (
     reconstruct,
     registered_names,
 )
-from tidefield.survey.sfm.matching import PREVIEW, candidate_pairs, match, preview_descriptors, select_pairs
+from tidefield.survey.sfm.matching import match
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
+from tidefield.survey.sfm.pairs import PREVIEW, candidate_pairs, preview_descriptors, select_pairs
 from tidefield.survey.sfm.placing import MIN_INLIERS, place
 from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey

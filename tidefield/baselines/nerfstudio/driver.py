@@ -24,7 +24,7 @@ from tidefield.baselines.export import point_colours
 from tidefield.baselines.job_file import JOB_FILE, failure, read_job
 from tidefield.baselines.nerfstudio.environment import WORKER, python
 from tidefield.config import Budget, Range, from_json
-from tidefield.data.images import write_mask
+from tidefield.data.pictures import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError

@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from tidefield.data.images import read_header
+from tidefield.data.pictures import read_header
 from tidefield.data.readers.files import (
     in_range,
     inside,

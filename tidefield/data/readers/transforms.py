@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from tidefield.data.images import read_header
+from tidefield.data.pictures import read_header
 from tidefield.data.ply import read_ply, write_ply
 from tidefield.data.readers.files import LARGEST, inside, keep_present, naming, number, parsing, read_json
 from tidefield.data.readers.posed import Observations, PosedPhotographs

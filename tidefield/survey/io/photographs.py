@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import ExifTags
 
-from tidefield.data.images import check_mask
+from tidefield.data.pictures import check_mask
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control

@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from tidefield.data.areas import halves
 from tidefield.errors import RunError, SceneError
 from tidefield.files import write_json
+from tidefield.geometry.halves import halves
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, carry_over, thinned

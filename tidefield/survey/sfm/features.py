@@ -21,7 +21,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
-from tidefield.data.images import read_mask
+from tidefield.data.pictures import read_mask
 from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
