@@ -51,7 +51,7 @@ def test_gains_and_falloff_are_found():
 
 def test_the_memory_of_a_photograph_is_given_back_once_it_was_looked_at(monkeypatch: pytest.MonkeyPatch):
     released = []
-    monkeypatch.setattr(Photographs, "release", released.append)
+    monkeypatch.setattr(Photographs, "release", lambda photographs: released.append(photographs))
     estimate_correction(shaded(GAINS, FALLOFF), [0] * 12)
     assert len(released) == 12
 
