@@ -12,7 +12,7 @@ import pytest
 from benchmarks import fuzz
 from benchmarks.fuzz import measure_fuzz
 from benchmarks.mutations import mutate
-from benchmarks.readers import READERS, Reader
+from benchmarks.readers import CPU_SECONDS, READERS, Reader
 from benchmarks.robustness import write_robustness
 from tidefield.errors import RunError, SceneError
 from tidefield.files import read_json, write_json
@@ -73,7 +73,10 @@ PLANTED = {function.__name__: function for function in (accept, refuse, fail, en
 
 @linux
 def test_a_finding_is_an_error_an_end_or_too_much_time_or_memory_and_does_not_end_the_campaign(tmp_path: Path):
-    readers = [Reader(name, "seed", ("file",), read, cpu_seconds=2.0) for name, read in PLANTED.items()]
+    readers = [
+        Reader(name, "seed", ("file",), read, cpu_seconds=1.0 if read is compute else CPU_SECONDS)
+        for name, read in PLANTED.items()
+    ]
     counts = measure_fuzz(readers, 0.006, 0, tmp_path / "kept", tmp_path, print, make_seeds)
     assert counts["accept"].accepted == counts["accept"].files > 0
     assert counts["refuse"].refused > 0
