@@ -88,11 +88,11 @@ def estimate_shading(
     weight, noise = huber_weights(seen.centred(model.value))
     none = np.array([model.cost(None, fold == k, noise) for k in range(FOLDS)])
     costs, whole = np.zeros((len(SPREADS), FOLDS)), None
+    everything = model.equations(weight)
+    without = [model.equations(weight * (fold[seen.photograph] != k)) for k in range(FOLDS)]
     for row, spread in zip(costs, SPREADS, strict=True):
-        whole = model.solve(spread, noise, weight, whole)
-        for k in range(FOLDS):
-            kept = weight * (fold[seen.photograph] != k)
-            row[k] = model.cost(model.solve(spread, noise, kept, whole), fold == k, noise)
+        whole = model.solve(spread, noise, everything, whole)
+        row[:] = [model.cost(model.solve(spread, noise, without[k], whole), fold == k, noise) for k in range(FOLDS)]
     best = int(costs.sum(1).argmin())
     helps = bool((costs[best] < (1 - LEAST_GAIN) * none).all())
     _log.debug(
@@ -103,10 +103,10 @@ def estimate_shading(
     )
     if not helps:
         return None
-    found = model.solve(SPREADS[best], noise, weight, whole)
+    found = model.solve(SPREADS[best], noise, everything, whole)
     for _ in range(ROUNDS - 1):
         weight, noise = huber_weights(seen.centred(model.value - model.design @ found, weight))
-        found = model.solve(SPREADS[best], noise, weight, found)
+        found = model.solve(SPREADS[best], noise, model.equations(weight), found)
     return model.polynomials(found)
 
 
@@ -158,35 +158,39 @@ class _Model:
             lens=lens,
         )
 
+    def equations(self, weight: Float64[np.ndarray, " O"]) -> _Equations:
+        """The normal equations of weighted observations; the points' colours are eliminated."""
+        of_point = np.bincount(self.seen.point, weight)
+        to_points = sparse.csr_array((weight, (self.seen.point, np.arange(len(weight)))))
+        sums, to_mean = to_points @ self.design, 1 / np.maximum(of_point, 1e-12)
+        back = sparse.csr_array((sparse.diags_array(to_mean) @ sums).T)
+        products = self.design.T @ (sparse.diags_array(weight) @ self.design)
+        right = self.design.T @ (weight[:, None] * self.value) - back @ (to_points @ self.value)
+        return _Equations(sparse.csr_array(products), sums, back, right)
+
     def solve(
         self,
         spread: float,
         noise: float,
-        weight: Float64[np.ndarray, " O"],
+        equations: _Equations,
         start: Float64[np.ndarray, "N 3"] | None = None,
     ) -> Float64[np.ndarray, "N 3"]:
-        """Find the most probable unknowns; the points' colours are eliminated.
+        """Find the most probable unknowns.
 
         Args:
             start: unknowns near the solution, from which the iterative solution starts.
         """
-        design, seen, own = self.design, self.seen, OWN_TERMS * len(self.lens)
-        share = weight / np.maximum(np.bincount(seen.point, weight), 1e-12)[seen.point]
-        mean = sparse.csr_array((share, (seen.point, np.arange(len(share)))))
-        diagonal = np.asarray((design.multiply(design)).T @ weight)
-        ridge = sparse.diags_array(SHARED_RIDGE * diagonal[own:] + 1e-9)
-        prior = sparse.csr_array(sparse.block_diag([self.prior * (noise / spread) ** 2, ridge]))
-
-        def remaining(values: np.ndarray) -> np.ndarray:
-            return design.T @ (weight[:, None] * (values - (mean @ values)[seen.point]))
+        own, right = OWN_TERMS * len(self.lens), equations.right
+        ridge = sparse.diags_array(SHARED_RIDGE * equations.products.diagonal()[own:] + 1e-9)
+        prior = sparse.block_diag([self.prior * (noise / spread) ** 2, ridge])
+        quadratic = sparse.csr_array(equations.products + prior)
 
         def normal(x: np.ndarray) -> np.ndarray:
             x = x.reshape(-1, 3)
-            return (remaining(design @ x) + prior @ x).ravel()
+            return (quadratic @ x - equations.back @ (equations.sums @ x)).ravel()
 
-        right = remaining(self.value)
         system = LinearOperator(shape=(right.size, right.size), matvec=normal, dtype=np.float64)  # type: ignore[call-arg]
-        inverse = sparse.diags_array(np.repeat(1 / (diagonal + prior.diagonal()), 3))
+        inverse = sparse.diags_array(np.repeat(1 / quadratic.diagonal(), 3))
         return cg(system, right.ravel(), None if start is None else start.ravel(), rtol=1e-3, M=inverse)[0].reshape(
             -1, 3
         )
@@ -212,6 +216,23 @@ class _Model:
         coefficients[:, :OWN_TERMS] = unknowns[:own].reshape(count, -1, 3)
         coefficients[:, 1:] += unknowns[own:].reshape(-1, len(self.to_monomials) - 1, 3)[self.lens]
         return torch.from_numpy(self.to_monomials @ coefficients).float()
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Normal equations of the terms, without the prior.
+
+    Attributes:
+        products: weighted sums of the products of two terms' derivatives over all observations.
+        sums: those of the derivatives over the observations of each point.
+        back: their transpose, each point's divided by its weight: `products - back @ sums` are the normal equations.
+        right: their right side, for each channel.
+    """
+
+    products: sparse.csr_array
+    sums: sparse.csr_array
+    back: sparse.csr_array
+    right: Float64[np.ndarray, "N 3"]
 
 
 def _blocks(terms: Float64[np.ndarray, "O K"], group: Int64[np.ndarray, " O"], count: int) -> sparse.csr_array:
