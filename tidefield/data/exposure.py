@@ -16,7 +16,7 @@ Alphabet: V photographs, O observations of sparse points, N pairs of photographs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -150,15 +150,14 @@ _NO_INDEX = np.zeros(0, dtype=np.int64)
 _NO_PAIRS = Pairs(_NO_INDEX, _NO_INDEX, np.zeros(0))
 
 
-def observe(
-    photographs: Photographs, points: SparsePoints, which: Sequence[int], done: Callable[[], None] = lambda: None
-) -> Seen:
+def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> Seen:
     """Measure the mean log colour of a small window around every observation in the given photographs.
+
+    The memory of each photograph is given back once it was looked at.
 
     Args:
         photographs, points: of a scene.
         which: indices of the photographs.
-        done: called after each.
     """
     camera, uv = points.camera_index.cpu().numpy(), points.uv_px.double().cpu().numpy()
     values, rows = [np.zeros((0, 3))], [_NO_INDEX]
@@ -168,7 +167,7 @@ def observe(
             value, usable = _window_means(photographs[i].cpu().numpy(), uv[row])
             values.append(np.log(value[usable]))
             rows.append(row[usable])
-            done()
+            photographs.release()
     row = np.concatenate(rows)
     point = points.point_index.cpu().numpy()[row].astype(np.int64)
     shared = np.bincount(point, minlength=1)[point] > 1

@@ -161,7 +161,7 @@ def load_scene(
     if calibrate and sparse is not None:
         cameras, sparse = calibrate_lenses(cameras, sparse, posed.lenses, train)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-    seen = None if sparse is None else observe(photographs, sparse, train, photographs.release)
+    seen = None if sparse is None else observe(photographs, sparse, train)
     exposures = read_exposures(posed.paths)
     cameras = replace(cameras, gain=estimate_gains(seen, cameras, train, exposures, posed.divided_by))
     if calibrate and seen is not None and sparse is not None:

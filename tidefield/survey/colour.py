@@ -60,8 +60,8 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
         always: apply gains even if they do not help.
     """
     count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
-    photographs, points = scene.photographs, scene.points
-    seen = None if points is None else observe(photographs, points, scene.train, photographs.release)
+    points = scene.points
+    seen = None if points is None else observe(scene.photographs, points, scene.train)
     if points is None or seen is None or not len(seen.value):
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
