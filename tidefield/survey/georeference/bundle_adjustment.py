@@ -134,9 +134,7 @@ def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple
     )
     light = thinned(model)
     config = all_images(light)
-    for number, taken in _photographs_of_lenses(light).items():
-        if taken < _IMAGES_OF_A_LENS:
-            config.set_constant_cam_intrinsics(number)
+    _fix_rare_lenses(light, config)
     options = adjustment_options()
     options.refine_principal_point = False
     _solve_with_positions(light, config, options, list(priors.values()))
@@ -235,9 +233,9 @@ def all_images(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfi
 
 def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig, free: bool) -> None:
     """Convert lenses that are to be adjusted to OPENCV or OPENCV_FISHEYE; fix others, and those of few photographs."""
-    for number, taken in _photographs_of_lenses(model).items():
+    for number in _fix_rare_lenses(model, config):
         camera = model.cameras[number]
-        if not free or taken < _IMAGES_OF_A_LENS:
+        if not free:
             config.set_constant_cam_intrinsics(number)
         elif camera.model.name in _GENERAL:
             general = _GENERAL[camera.model.name]
@@ -246,9 +244,13 @@ def generalise_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdj
             camera.params = colmap_parameters(lens, general)
 
 
-def _photographs_of_lenses(model: pycolmap.Reconstruction) -> Counter[int]:
-    """Count the registered photographs of each camera that took some."""
-    return Counter(model.image(number).camera_id for number in model.reg_image_ids())
+def _fix_rare_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdjustmentConfig) -> list[int]:
+    """Fix the lenses of few photographs; return the cameras that took more."""
+    taken = Counter(model.image(number).camera_id for number in model.reg_image_ids())
+    for number, count in taken.items():
+        if count < _IMAGES_OF_A_LENS:
+            config.set_constant_cam_intrinsics(number)
+    return [number for number, count in taken.items() if count >= _IMAGES_OF_A_LENS]
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
