@@ -78,14 +78,15 @@ def test_crops_at_twice_the_size_show_what_the_crops_show(scene: Scene):
     assert doubled is not None
     config = replace(SWIFT.train, tile_px=8, tiles=6, crop_px=16)
     batch = draw_batch(scene, DepthPriors(scene), config, 3, torch.Generator().manual_seed(0), doubled=doubled)
-    (crops,), (larger,) = batch.images, batch.image_doubled
+    crops, larger = batch.colours_of_images(0), batch.colours_at_twice_the_size(0)
+    assert larger is not None
     assert larger.shape == (*crops.shape[:2], 32, 32)
     torch.testing.assert_close(F.avg_pool2d(larger, 2), crops, atol=0.02, rtol=0)
-    neighbour, (u, v) = int(batch.neighbours[2, 1]), batch.image_corner_px[0][2 * batch.neighbours.shape[1] + 1].long()
+    neighbour, (u, v) = int(batch.neighbours[2, 1]), batch.image_corner_px[0][2 * batch.neighbours.shape[1] + 1]
     part = to_common_exposure(doubled, neighbour)[2 * v : 2 * v + 32, 2 * u : 2 * u + 32]
     torch.testing.assert_close(larger[2 * batch.neighbours.shape[1] + 1], part.permute(2, 0, 1))
     both = [part for half in batch.parts(2) for part in half.image_doubled]
-    assert torch.equal(torch.cat(both), larger)
+    assert torch.equal(torch.cat(both), batch.image_doubled[0])
 
 
 def test_an_area_has_the_same_photographs_at_twice_the_size(scene: Scene):
@@ -104,10 +105,10 @@ def test_training_reads_what_it_is_prepared_with(scene: Scene):
             trainer.prepare()
         opened = trainer.open_area().area
         assert opened.doubled is not None
-        losses.append(trainer.loss()[1].item())
+        losses.append(trainer.loss(trainer.draw())[1].item())
     without = SceneTrainer(config, replace(scene, photographs=replace(scene.photographs, files=())), 0, CPU)
     assert without.open_area().area.doubled is None
-    assert losses[0] == losses[1] != without.loss()[1].item()
+    assert losses[0] == losses[1] != without.loss(without.draw())[1].item()
 
 
 def test_a_view_comes_closer_to_the_photograph_that_was_not_used(tmp_path: Path):

@@ -27,14 +27,14 @@ def test_samples_without_jitter_are_the_quantiles_of_the_density(count: int):
 
 
 def test_many_jittered_samples_reproduce_the_density():
-    place = sample(spread(DENSITY, 4000), 6, torch.Generator().manual_seed(0))
+    place = sample(spread(DENSITY, 4000), 6, torch.rand(1, 4000, 6, generator=torch.Generator().manual_seed(0)))
     counted = torch.histc(place, len(DENSITY), 0, 1) / place.numel()
     torch.testing.assert_close(counted, DENSITY / DENSITY.sum(), atol=5e-3, rtol=0)
     assert counted[1] == 0, "a sample where there is no density"
 
 
 def test_each_sample_has_a_part_of_equal_probability_from_near_to_far():
-    place = sample(spread(DENSITY, 500), 7, torch.Generator().manual_seed(1))[0]
+    place = sample(spread(DENSITY, 500), 7, torch.rand(1, 500, 7, generator=torch.Generator().manual_seed(1)))[0]
     share = cumulative(DENSITY, place)
     assert (share >= np.arange(7) / 7 - 1e-6).all()
     assert (share <= np.arange(1, 8) / 7 + 1e-6).all()
@@ -42,10 +42,12 @@ def test_each_sample_has_a_part_of_equal_probability_from_near_to_far():
     assert ((place >= 0) & (place <= 1)).all()
 
 
-@pytest.mark.parametrize("seed", [None, 2])
-def test_the_densitys_scale_and_the_other_rays_do_not_matter(seed: int | None):
+@pytest.mark.parametrize("jittered", [False, True])
+def test_the_densitys_scale_and_the_other_rays_do_not_matter(jittered: bool):
+    jitter = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(2)) if jittered else None
+
     def drawn(density: Tensor) -> Tensor:
-        return sample(density, 5, None if seed is None else torch.Generator().manual_seed(seed))
+        return sample(density, 5, jitter)
 
     rays = torch.rand(2, 3, 8, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(drawn(rays), drawn(rays * 37.0))

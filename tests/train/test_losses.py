@@ -13,7 +13,7 @@ from tidefield.data.batches import Batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.evaluation.lpips import prepare_torchvision
 from tidefield.model.network import RayGrid, TileRendering
-from tidefield.train.losses import COARSE_WEIGHT, DEPTH_SCALE, BatchLoss, photometric, sparse_depth, structural
+from tidefield.train.losses import COARSE_WEIGHT, DEPTH_SCALE, BatchLoss, Inputs, photometric, sparse_depth, structural
 
 SIDE, TILES = 8, 2
 STRIDE = 4
@@ -41,8 +41,6 @@ def made(seed: int = 0, weight: Tensor | None = None) -> tuple[TileRendering, Ba
         neighbours=torch.zeros(TILES, 0, dtype=torch.long),
         blend_weight=torch.zeros(TILES, 0, 4),
         which=torch.zeros(TILES, 0, dtype=torch.long),
-        images=(),
-        image_corner_px=(),
     )
     rendering = TileRendering(
         colour=uniform(TILES, pixels, 3),
@@ -166,7 +164,8 @@ def test_a_scene_with_masks_is_learned_from_where_it_is_not_masked(preset: Netwo
         masks = tuple(torch.zeros(36, 48, dtype=torch.bool) for _ in range(6))
         own = replace(own, photographs=replace(own.photographs, masks=masks))
     learner = BatchLoss(network(preset), config)
-    loss, error = learner(own, DepthPriors(own), own.cameras, 3, torch.Generator().manual_seed(3))
+    random = torch.Generator().manual_seed(3)
+    loss, error = learner(Inputs.draw(learner.network, config, own, DepthPriors(own), 3, random))
     loss.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in learner.parameters())
     assert (float(error.detach()) > 0) != everything

@@ -28,6 +28,7 @@ from tidefield.synthetic import Flight
 from tidefield.train import pretrain, stream
 from tidefield.train.checkpoint import SHIPPED, read_weights, weights_sha256, write_weights
 from tidefield.train.loop import SceneTrainer
+from tidefield.train.losses import Inputs
 from tidefield.train.pretrain import Pretrainer, Validation
 from tidefield.train.stream import Drawn, Recipe, Stream, recipe
 
@@ -70,7 +71,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(stream, "POOL_SIZE", 2)
     monkeypatch.setattr(stream, "STEPS_EACH", 4)
     generator = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, SMALL) as scenes:
         names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
     assert set(names[0]) == {"7-000000", "7-000001"}
     assert set(names[1]) == {"7-000001", "7-000002"}
@@ -78,7 +79,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "cache").exists(), "the user's cache would grow without end"
     made = (tmp_path / "scenes" / "7-000002").stat().st_mtime_ns
     again = torch.Generator().manual_seed(0)
-    with Stream(tmp_path / "scenes", [], 7, CPU, SMALL) as scenes:
+    with Stream(tmp_path / "scenes", [], 7, SMALL) as scenes:
         for _ in range(8):
             scenes.draw(0, again)  # the first is made once more, ...
         assert [scenes.draw(4, again).scene.root.name for _ in range(8)] == names[1]
@@ -118,7 +119,7 @@ def test_networks_that_encode_whole_photographs_learn_from_smaller_ones(tmp_path
     asked = []
     monkeypatch.setattr(stream, "at_several_widths", lambda path, widths: asked.append(widths) or [])
     for config in (SMALL, PRESETS["paper"]):
-        with Stream(tmp_path / config.preset, [tmp_path], 1, CPU, config):
+        with Stream(tmp_path / config.preset, [tmp_path], 1, config):
             pass
     assert asked == [stream.WIDTHS, stream.WHOLE_WIDTHS]
     assert max(stream.WHOLE_WIDTHS) <= 400
@@ -131,7 +132,7 @@ def test_augmentation_is_few_points_and_photographs_and_exposures_that_are_off(t
         stream.Draw(None, 0.0, 1.0, 0.0, 0.0, (0, 1, 2), 7),
         stream.Draw(None, 0.0, 0.2, 0.5, 0.05, (2, 0, 1), 7),
     )
-    with Stream(tmp_path / "scenes", [], 1, CPU, SMALL) as scenes:
+    with Stream(tmp_path / "scenes", [], 1, SMALL) as scenes:
         whole, few = scenes._augmented(at, easy), scenes._augmented(at, hard)
         none = scenes._augmented(at, replace(easy, points_share=0.0))
     assert torch.equal(whole.cameras.principal_px, at.cameras.principal_px)
@@ -177,15 +178,15 @@ def test_a_photograph_is_told_a_wrong_attitude(tmp_path: Path) -> None:
 def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
     learner = Pretrainer(SMALL, Walls(), wall.scene(wall.cameras(4)), 0, CPU)
     seen = []
-    monkeypatch.setattr(
-        learner,
-        "batch_loss",
-        lambda scene, priors, cameras, views, generator, precision: (
-            seen.append(views) or (torch.zeros(()), torch.zeros(()))
-        ),
-    )
+    inputs = learner.draw()
+
+    def drawn(network, config, scene, priors, views, generator, cameras) -> Inputs:
+        seen.append(views)
+        return inputs
+
+    monkeypatch.setattr(Inputs, "draw", drawn)
     for _ in range(200):
-        learner.loss()
+        learner.draw()
     assert set(seen) == set(pretrain.VIEWS)
     assert seen.count(5) > seen.count(12)
 

@@ -129,10 +129,10 @@ class Nerf(nn.Module):
         """
         config, count = self.config, len(rays.near_far)
         even = torch.ones(1, count, config.coarse, device=rays.near_far.device)
-        place = sample(even, config.coarse, generator)[0]
+        place = _sample(even, config.coarse, generator)
         coarse = self._pass(self.coarse, rays, place, opaque, generator, precision)
         known = (coarse.weights.detach() + 1e-5)[None]
-        finer = torch.cat([place, sample(known, config.fine, generator)[0]], dim=-1).sort(dim=-1).values
+        finer = torch.cat([place, _sample(known, config.fine, generator)], dim=-1).sort(dim=-1).values
         return coarse, self._pass(self.fine, rays, finer, opaque, generator, precision)
 
     def _pass(
@@ -159,6 +159,13 @@ class Nerf(nn.Module):
         return Seen(composite(w, colour), (w * z).sum(-1), w.sum(-1), w)
 
 
+def _sample(pdf: Float[Tensor, "1 R B"], count: int, generator: torch.Generator | None) -> Float[Tensor, "R M"]:
+    jitter = None
+    if generator is not None:
+        jitter = torch.rand(1, pdf.shape[1], count, generator=generator).to(pdf)
+    return sample(pdf, count, jitter)[0]
+
+
 class NerfTrainer(Trainer):
     """Trains on rays through random pixels of all training photographs."""
 
@@ -177,8 +184,14 @@ class NerfTrainer(Trainer):
     def rate(self, share: float) -> float:
         return 0.1**share
 
+    def backward(self) -> Tensor:
+        self.optimizer.zero_grad()
+        loss, error = self.loss()
+        loss.backward()
+        return error
+
     def loss(self) -> tuple[Tensor, Tensor]:
-        """Squared errors of both passes (NeRF's eq. 6), and that of the fine one."""
+        """Compute the squared errors of both passes (NeRF's eq. 6), and that of the fine one."""
         scene, device = self.scene, self.device
         which, uv, truth = draw_pixels(scene, self.config.rays, self.generator)
         rays = Rays.of(self.cameras, which.to(device), uv.to(device))

@@ -83,7 +83,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
     if across.is_main_process():
         delete_partials(*(folder / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
-    with Stream(folder / "scenes", options.real, across.process_seed(seed), device, config) as stream:
+    with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
         shown = next(iter(validation.scenes.values()))
         trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:

@@ -6,15 +6,15 @@ Alphabet: T tiles of S x S pixels, R = S^2 rays, N neighbours, K crops or photog
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from tidefield.config import TrainConfig
 from tidefield.data.depth_prior import STRIDE, DepthPriors, Observed, unproject_to_surface
-from tidefield.data.exposure import to_common_exposure, windows_in_common_light
+from tidefield.data.exposure import windows_in_common_light
 from tidefield.data.images import Masks
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
@@ -39,7 +39,8 @@ class Batch:
         neighbours: photographs serving as the tiles' neighbouring views.
         blend_weight: of each neighbour at the tile's four corners.
         which: for each neighbour, the image of `images` to read.
-        images: what to encode, in groups of one size: crops of photographs, or whole ones.
+        images: pixels to encode, in groups of one size: crops of photographs, or whole ones.
+        image_cameras: of the photographs that the images are from.
         image_corner_px: upper left corners of the images in their photographs.
         image_used: 1 for pixels of the images that are not masked; empty if the scene has no masks.
         image_doubled: the images at twice the size; empty if they are not read.
@@ -55,16 +56,23 @@ class Batch:
     neighbours: Int[Tensor, "T N"]
     blend_weight: Float[Tensor, "T N 4"]
     which: Int[Tensor, "T N"]
-    images: tuple[Float[Tensor, "_ 3 _ _"], ...]
-    image_corner_px: tuple[Float[Tensor, "_ 2"], ...]
+    images: tuple[UInt8[Tensor, "_ _ _ 3"], ...] = ()
+    image_cameras: tuple[Cameras, ...] = ()
+    image_corner_px: tuple[Int[Tensor, "_ 2"], ...] = ()
     image_used: tuple[Float[Tensor, "_ 1 _ _"], ...] = ()
-    image_doubled: tuple[Float[Tensor, "_ 3 _ _"], ...] = ()
+    image_doubled: tuple[UInt8[Tensor, "_ _ _ 3"], ...] = ()
 
-    def to(self, device: torch.device) -> Batch:
-        def move(value: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
-            return tuple(v.to(device) for v in value) if isinstance(value, tuple) else value.to(device)
+    def colours_of_images(self, group: int) -> Float[Tensor, "_ 3 _ _"]:
+        """Return the colours of a group of images."""
+        return _in_common_light(self.images[group], self.image_cameras[group], self.image_corner_px[group])
 
-        return Batch(**{f.name: move(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+    def colours_at_twice_the_size(self, group: int) -> Float[Tensor, "_ 3 _ _"] | None:
+        """Return the colours of a group of images at twice the size; None if they are not read."""
+        if not self.image_doubled:
+            return None
+        cameras = self.image_cameras[group]
+        doubled = cameras.resized_each(2 * cameras.size_px)
+        return _in_common_light(self.image_doubled[group], doubled, 2 * self.image_corner_px[group])
 
     def parts(self, count: int) -> list[Batch]:
         """Split into at most `count` batches of some of the tiles each; into one where tiles share images."""
@@ -80,6 +88,7 @@ class Batch:
         return Batch(
             **own | {"which": torch.arange(len(chosen), device=chosen.device).reshape(own["which"].shape)},
             images=(self.images[0][chosen],),
+            image_cameras=(self.image_cameras[0][chosen],),
             image_corner_px=(self.image_corner_px[0][chosen],),
             image_used=tuple(used[chosen] for used in self.image_used),
             image_doubled=tuple(doubled[chosen] for doubled in self.image_doubled),
@@ -91,14 +100,20 @@ def tile_doubly_seen(
     prior: Float[Tensor, "3 h w"],
     corner_px: Float[Tensor, "2"],
     side_px: int,
-    others: Cameras,
+    cameras: Cameras,
+    others: Bool[Tensor, " V"],
     masks: Masks = (),
 ) -> Bool[Tensor, " R"]:
-    """Decide which pixels of a tile show surface that at least two other cameras see, at the prior's resolution."""
+    """Decide which pixels of a tile show surface that at least two other cameras see, at the prior's resolution.
+
+    Args:
+        cameras, others: some cameras, and which of them are other ones.
+        masks: of the cameras.
+    """
     cells = max(1, side_px // STRIDE)
     middles = corner_px + pixel_grid(cells, cells) * (side_px / cells)
-    uv, z = others.project(unproject_to_surface(camera, prior, middles))
-    seen = (in_frame(others, uv, z, masks).sum(0) >= 2).reshape(cells, cells)
+    uv, z = cameras.project(unproject_to_surface(camera, prior, middles))
+    seen = (in_frame(cameras, uv, z, masks)[others].sum(0) >= 2).reshape(cells, cells)
     cell = torch.arange(side_px) * cells // side_px
     return seen[cell][:, cell].reshape(-1)
 
@@ -140,97 +155,84 @@ def draw_batch(
     targets = drawn_from[picks].repeat_interleave(per_photograph)
     free = (scene.cameras.size_px[targets] - side + 1).clamp(min=1)
     corner = (torch.rand(len(targets), 2, generator=generator) * free).floor()
-    tiles = []
+    cameras, masks, tiles = scene.cameras[train], scene.photographs.masks_of(scene.train), []
     for target, at in zip(targets.tolist(), corner, strict=True):
         camera, prior = scene.cameras[target], priors[target].cells
         middle_world = unproject_to_surface(camera, prior, at[None] + side / 2)[0]
         found = choose_neighbours(camera, prior, at, (1, 1), side, scene, views, config.neighbours)
-        colours, inside = _tile(scene, target, at.long(), side)
+        pixels, inside = _tile(scene, target, at.long(), side)
         weight = torch.ones(side * side)
         if config.unseen_weight != 1:
-            others = train[train != target]
-            masks = scene.photographs.masks_of(others.tolist())
-            seen = tile_doubly_seen(camera, prior, at, side, scene.cameras[others], masks)
+            seen = tile_doubly_seen(camera, prior, at, side, cameras, train != target, masks)
             weight[~seen] = config.unseen_weight
         depth = _sparse_depth(priors.observed(target), at, side)
         detail = priors[target].detail_of_tiles(at[None], side)[0]
-        tiles.append((colours, weight * inside, detail, *depth, found.index[0], found.blend_weight[0], middle_world))
+        tiles.append((pixels, weight * inside, detail, *depth, found.index[0], found.blend_weight[0], middle_world))
     columns = (torch.stack(column) for column in zip(*tiles, strict=True))
-    colours, weight, detail, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
-    if not views:
-        which, images, corners, used, twice = neighbours, (), (), (), ()
-    elif config.crop_px is None:
-        which, images, corners, used, twice = *_whole(scene, neighbours), ()
-    else:
-        which, images, corners, used, twice = _crops(scene, neighbours, middles_world, config.crop_px, doubled)
-    return Batch(
+    pixels, weight, detail, inverse_depth, depth_weight, neighbours, blend_weight, middles_world = columns
+    batch = Batch(
         targets=targets,
         corner_px=corner,
-        colours=colours,
+        colours=windows_in_common_light(pixels, scene.cameras[targets], corner.long()).flatten(1, 2),
         weight=weight,
         detail=detail,
         inverse_depth=inverse_depth,
         depth_weight=depth_weight,
         neighbours=neighbours,
         blend_weight=blend_weight,
-        which=which,
-        images=images,
-        image_corner_px=corners,
-        image_used=used,
-        image_doubled=twice,
+        which=neighbours,
     )
+    if not views:
+        return batch
+    if config.crop_px is None:
+        return _with_whole_photographs(batch, scene)
+    return _with_crops(batch, scene, middles_world, config.crop_px, doubled)
 
 
 def _tile(
     scene: Scene, index: int, corner: Int[Tensor, "2"], side: int
-) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, " R"]]:
-    """Colours of a tile's pixels, and which of them lie in the photograph and are not masked."""
+) -> tuple[UInt8[Tensor, "S S 3"], Bool[Tensor, " R"]]:
+    """A tile's pixels, and which of them lie in the photograph and are not masked."""
     u, v = corner.tolist()
-    pixels = to_common_exposure(scene, index, slice(v, v + side), slice(u, u + side))
-    height, width = pixels.shape[:2]
-    colours, inside = torch.zeros(side, side, 3), torch.zeros(side, side, dtype=torch.bool)
-    colours[:height, :width], inside[:height, :width] = pixels, True
+    part = scene.photographs[index][v : v + side, u : u + side]
+    height, width = part.shape[:2]
+    pixels, inside = part.new_zeros(side, side, 3), torch.zeros(side, side, dtype=torch.bool)
+    pixels[:height, :width], inside[:height, :width] = part, True
     if scene.photographs.masks:
         inside[:height, :width] = scene.photographs.used(index)[v : v + side, u : u + side]
-    return colours.reshape(-1, 3), inside.reshape(-1)
+    return pixels, inside.reshape(-1)
 
 
-_Images = tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]
-"""`which`, `images`, `image_corner_px` and `image_used` of a batch."""
-
-
-def _whole(scene: Scene, neighbours: Int[Tensor, "T N"]) -> _Images:
-    """Every neighbour once, whole, in groups of one size."""
-    photographs, which = neighbours.unique(return_inverse=True)
+def _with_whole_photographs(batch: Batch, scene: Scene) -> Batch:
+    """The batch with every neighbour once, whole, in groups of one size."""
+    photographs, which = batch.neighbours.unique(return_inverse=True)
     sizes, group = scene.cameras.size_px[photographs].unique(dim=0, return_inverse=True)
     order = group.argsort(stable=True)
     groups = [photographs[group == g].tolist() for g in range(len(sizes))]
-    images = tuple(torch.stack([to_common_exposure(scene, i).permute(2, 0, 1) for i in mine]) for mine in groups)
-    used = tuple(
-        torch.stack([scene.photographs.used(i)[None].float() for i in mine])
-        for mine in groups
-        if scene.photographs.masks
+    masked = groups if scene.photographs.masks else []
+    return replace(
+        batch,
+        which=order.argsort()[which],
+        images=tuple(torch.stack([scene.photographs[i] for i in mine]) for mine in groups),
+        image_cameras=tuple(scene.cameras[torch.tensor(mine)] for mine in groups),
+        image_corner_px=tuple(torch.zeros(len(mine), 2, dtype=torch.long) for mine in groups),
+        image_used=tuple(torch.stack([scene.photographs.used(i)[None].float() for i in mine]) for mine in masked),
     )
-    return order.argsort()[which], images, tuple(torch.zeros(len(i), 2) for i in images), used
 
 
-def _crops(
-    scene: Scene,
-    neighbours: Int[Tensor, "T N"],
-    middle_world: Float[Tensor, "T 3"],
-    side: int,
-    doubled: Scene | None,
-) -> tuple[*_Images, tuple[Tensor, ...]]:
-    """A crop of every neighbour of each tile, around the projection of the tile's middle; also at twice the size."""
-    flat = neighbours.reshape(-1)
+def _with_crops(
+    batch: Batch, scene: Scene, middle_world: Float[Tensor, "T 3"], side: int, doubled: Scene | None
+) -> Batch:
+    """The batch with a crop of every neighbour of each tile, around the projection of the tile's middle; also at twice
+    the size."""
+    flat = batch.neighbours.reshape(-1)
     cameras = scene.cameras[flat]
-    points = middle_world.repeat_interleave(neighbours.shape[1], 0)
+    points = middle_world.repeat_interleave(batch.neighbours.shape[1], 0)
     uv = cameras.project(points[:, None])[0][:, 0]
     width, height = (min(side, int(x)) for x in scene.cameras.size_px.amin(0))
     extent = torch.tensor([width, height])
-    corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float())
-    places = list(zip(flat.tolist(), corner.long().tolist(), strict=True))
-    crops = _windows(scene, places, (width, height))
+    corner = torch.minimum((uv - extent / 2).round().clamp(min=0), (cameras.size_px - extent).float()).long()
+    places = list(zip(flat.tolist(), corner.tolist(), strict=True))
     used: tuple[Tensor, ...] = ()
     if scene.photographs.masks:
         masks = [scene.photographs.used(i)[None, v : v + height, u : u + width] for i, (u, v) in places]
@@ -238,12 +240,24 @@ def _crops(
     twice: tuple[Tensor, ...] = ()
     if doubled is not None:
         twice = (_windows(doubled, [(i, [2 * u, 2 * v]) for i, (u, v) in places], (2 * width, 2 * height)),)
-    return torch.arange(len(flat)).reshape(neighbours.shape), (crops,), (corner,), used, twice
+    return replace(
+        batch,
+        which=torch.arange(len(flat)).reshape(batch.neighbours.shape),
+        images=(_windows(scene, places, (width, height)),),
+        image_cameras=(cameras,),
+        image_corner_px=(corner,),
+        image_used=used,
+        image_doubled=twice,
+    )
 
 
-def _windows(scene: Scene, places: Sequence[tuple[int, list[int]]], size: tuple[int, int]) -> Float[Tensor, "K 3 h w"]:
-    """Windows of photographs in the common light: of each the photograph and the upper left corner, in pixels."""
+def _windows(scene: Scene, places: Sequence[tuple[int, list[int]]], size: tuple[int, int]) -> UInt8[Tensor, "K h w 3"]:
+    """Windows of photographs: of each the photograph and the upper left corner, in pixels."""
     width, height = size
-    windows = torch.stack([scene.photographs[i][v : v + height, u : u + width] for i, (u, v) in places])
-    photographs, corners = (torch.tensor(column) for column in zip(*places, strict=True))
-    return windows_in_common_light(windows, scene.cameras[photographs], corners).permute(0, 3, 1, 2)
+    return torch.stack([scene.photographs[i][v : v + height, u : u + width] for i, (u, v) in places])
+
+
+def _in_common_light(
+    pixels: UInt8[Tensor, "K h w 3"], cameras: Cameras, corner_px: Int[Tensor, "K 2"]
+) -> Float[Tensor, "K 3 h w"]:
+    return windows_in_common_light(pixels, cameras, corner_px).permute(0, 3, 1, 2)

@@ -62,9 +62,11 @@ class DepthPrior:
         """Return the detail of the pixels of tiles, row by row; 0 outside of the image."""
         if self.detail is None:
             return self.cells.new_zeros(len(corner_px), side_px**2)
-        padded = F.pad(self.detail, (0, side_px, 0, side_px))
-        tiles = [padded[v : v + side_px, u : u + side_px] for u, v in corner_px.long().tolist()]
-        return torch.stack(tiles).flatten(1)
+        tiles = self.detail.new_zeros(len(corner_px), side_px, side_px)
+        for tile, (u, v) in zip(tiles, corner_px.long().tolist(), strict=True):
+            part = self.detail[v : v + side_px, u : u + side_px]
+            tile[: part.shape[0], : part.shape[1]] = part
+        return tiles.flatten(1)
 
 
 def surface_prior(

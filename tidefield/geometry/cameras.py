@@ -143,12 +143,16 @@ class Cameras:
             return uv_px
         focal = self.focal_px[:, None]
         xy = (uv_px - self.principal_px[:, None]) / focal
-        return torch.addcmul(uv_px, self._residual_at(xy, self.residual), focal)
+        return torch.addcmul(uv_px, self._residual_at(xy, self._rows_of_residual()), focal)
+
+    def _rows_of_residual(self) -> tuple[Tensor, ...]:
+        assert self.residual is not None, "there is no residual"
+        return self.residual[:, None].unbind(2)
 
     @staticmethod
-    def _residual_at(xy: Float[Tensor, "V P 2"], residual: Float[Tensor, "V 6 2"]) -> Float[Tensor, "V P 2"]:
+    def _residual_at(xy: Float[Tensor, "V P 2"], rows: tuple[Tensor, ...]) -> Float[Tensor, "V P 2"]:
         x, y = xy.clamp(-FRAME_REACH, FRAME_REACH).split(1, -1)
-        one, of_x, of_y, of_xx, of_xy, of_yy = (row[:, None] for row in residual.unbind(1))
+        one, of_x, of_y, of_xx, of_xy, of_yy = rows
         along_x = torch.addcmul(torch.addcmul(of_x, x, of_xx), y, of_xy)
         return torch.addcmul(torch.addcmul(one, x, along_x), y, torch.addcmul(of_y, y, of_yy))
 
@@ -156,8 +160,9 @@ class Cameras:
         """Compute ray directions through pixels, scaled to a z-depth of 1."""
         shown = xy = (uv_px - self.principal_px[:, None]) / self.focal_px[:, None]
         if self.residual is not None:
+            rows = self._rows_of_residual()
             for _ in range(_INVERSE_STEPS):
-                xy = shown - self._residual_at(xy, self.residual)
+                xy = shown - self._residual_at(xy, rows)
         xyz = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return xyz @ self.T_world_camera[:, :, :3].transpose(1, 2)
 
@@ -198,9 +203,10 @@ class Cameras:
             at = (pixel - self.principal_px[:, axis, None]) / self.focal_px[:, axis, None]
             sides.append(at.clamp(-FRAME_REACH, FRAME_REACH)[..., None] ** powers)
         x, y = sides
+        assert self.shading is not None, "there is no shading"
         table = x.new_zeros(len(self), SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
-        of_x, of_y = zip(*_exponents(SHADING_DEGREE), strict=True)
-        table[:, of_y, of_x] = self.shading
+        for coefficient, (of_x, of_y) in zip(self.shading.unbind(1), _exponents(SHADING_DEGREE), strict=True):
+            table[:, of_y, of_x] = coefficient
         # Two products: where opt_einsum is installed, einsum takes longer to look for an order of three than for this.
         by_column = torch.einsum("vha,vabc->vhbc", y, table)
         return self.gain[:, None, None] * torch.einsum("vhbc,vwb->vhwc", by_column, x).exp()

@@ -104,7 +104,7 @@ class Network(nn.Module, ABC):
         start: Intervals,
         opaque: bool,
         detail: Float[Tensor, "T R"] | None = None,
-        generator: torch.Generator | None = None,
+        jitter: tuple[Float[Tensor, "T _ _"], ...] = (),
     ) -> TileRendering:
         """Render tiles.
 
@@ -114,12 +114,18 @@ class Network(nn.Module, ABC):
             start: intervals of the first pass's rays (`start_intervals`).
             opaque: light that passes all samples is stopped by the last; False lets it through to the background.
             detail: what the expected inverse depth of each pixel has beyond that of the first pass's rays.
-            generator: jitters samples, for training.
+            jitter: of the samples of every pass, for training (`draw_jitter`); they lie evenly without.
         """
 
     def start_intervals(self, tiles: Tiles, priors: Float[Tensor, "_ 3 h w"]) -> Intervals:
         """Intervals of the first pass's rays from the depth priors of the tiles' cameras, or the one of all tiles."""
         return intervals_from_prior(priors, tiles.rays_px(*self.grids[0]))
+
+    def draw_jitter(self, tiles: int, tile_px: int, generator: torch.Generator) -> tuple[Float[Tensor, "T _ _"], ...]:
+        """Draw where the samples of every pass lie in their parts of the rays (`sampling.sample`)."""
+        rays = ((tile_px // grid.stride + 2 * grid.margin) ** 2 for grid in self.grids)
+        of_passes = zip(rays, self.config.passes, strict=True)
+        return tuple(torch.rand(tiles, count, one.samples, generator=generator) for count, one in of_passes)
 
     def values_per_tile(self, tile_px: int, views: int) -> int:
         """Most numbers that a pass gathers for a tile: what bounds the memory of rendering."""

@@ -70,13 +70,14 @@ class PaperNetwork(Network):
         start: Intervals,
         opaque: bool,
         detail: Float[Tensor, "T R"] | None = None,
-        generator: torch.Generator | None = None,
+        jitter: tuple[Float[Tensor, "T _ _"], ...] = (),
     ) -> TileRendering:
         uv = tiles.rays_px(self.rays.stride)
         if detail is not None:
             start = start.moved(detail)
         even = torch.ones_like(start.inv_near)[..., None]
-        samples = place_samples(tiles.cameras, uv, start, sample(even, self.rays.samples, generator))
+        s = sample(even, self.rays.samples, jitter[0] if jitter else None)
+        samples = place_samples(tiles.cameras, uv, start, s)
         in_tile = (uv - tiles.corner_px[:, None]) / tiles.side_px
         scale = tiles.pixels_per_unit(samples.inverse_depth)
         gathered = views.read(self.rays.feature_stride, samples.points_world, samples.directions, in_tile, scale)

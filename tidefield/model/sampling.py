@@ -114,19 +114,17 @@ def place_samples(
     return Samples(s, inverse_depth, points, unit, ends.diff(dim=-1).clamp(min=0))
 
 
-def sample(pdf: Float[Tensor, "T R B"], count: int, generator: torch.Generator | None) -> Float[Tensor, "T R M"]:
+def sample(pdf: Float[Tensor, "T R B"], count: int, jitter: Float[Tensor, "T R M"] | None) -> Float[Tensor, "T R M"]:
     """Normalised distances of `count` samples per ray, one in each of as many parts of equal probability.
 
     Args:
         pdf: not negative and not normalised, over B equal bins from near to far; one bin is the uniform density.
-        generator: jitters the samples within their parts, for training; None puts them in the middle.
+        jitter: where in its part each sample lies, 0 to 1, for training; None puts them in the middle.
     """
     tiles, rays, bins = pdf.shape
     device = pdf.device
-    if generator is None:
+    if jitter is None:
         jitter = torch.full((1, 1, count), 0.5, device=device)
-    else:
-        jitter = torch.rand(tiles, rays, count, generator=generator).to(device)
     quantile = ((torch.arange(count, device=device) + jitter) / count).expand(tiles, rays, count).contiguous()
     if bins == 1:
         return quantile

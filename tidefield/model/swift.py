@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import cast
 
 import torch
@@ -92,13 +93,14 @@ class SwiftNetwork(Network):
         start: Intervals,
         opaque: bool,
         detail: Float[Tensor, "T R"] | None = None,
-        generator: torch.Generator | None = None,
+        jitter: tuple[Float[Tensor, "T _ _"], ...] = (),
     ) -> TileRendering:
         intervals, pdf = start, torch.ones_like(start.inv_near)[..., None]
         inverse_depths, coarse_colours = [], []
         for k, one in enumerate(self.config.passes):
             uv = tiles.rays_px(*self.grids[k])
-            samples = place_samples(tiles.cameras, uv, intervals, sample(pdf, one.samples, generator))
+            s = sample(pdf, one.samples, jitter[k] if jitter else None)
+            samples = place_samples(tiles.cameras, uv, intervals, s)
             in_tile = ((uv - tiles.corner_px[:, None]) / tiles.side_px).clamp(0, 1)
             last = one is self.config.passes[-1]
             gathered = views.read(
@@ -315,7 +317,9 @@ def surface_logits(score: Float[Tensor, "*R M"], empty: Float[Tensor, ""] | None
         score: of each sample, finite.
         empty: as for `surface_shares`; lies behind the last sample.
     """
-    later = _with_empty(score, empty)[..., 1:].flip(-1).logcumsumexp(-1).flip(-1)
+    # Sample by sample: a few of them for many rays take less time than `logcumsumexp` does.
+    scores = _with_empty(score, empty).unbind(-1)
+    later = torch.stack(list(accumulate(scores[:0:-1], torch.logaddexp))[::-1], dim=-1)
     # The last sample of an opaque ray stops all light whatever its logit.
     return (score - (F.pad(later, (0, 1)) if empty is None else later)).clamp(-LOGIT_LIMIT, LOGIT_LIMIT)
 

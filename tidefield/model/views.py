@@ -97,9 +97,11 @@ class Views:
     blend_weight: Float[Tensor, "T N 4"]
     encoded: Encoded
 
-    def __getitem__(self, tiles: Int[Tensor, " t"]) -> Views:
-        rows = torch.arange(self.which.numel(), device=self.which.device).reshape(self.which.shape)[tiles].reshape(-1)
-        return Views(self.cameras[rows], self.which[tiles], self.blend_weight[tiles], self.encoded)
+    def __getitem__(self, tiles: slice) -> Views:
+        count = self.which.shape[1]
+        first, last, _ = tiles.indices(len(self.which))
+        cameras = self.cameras[slice(first * count, last * count)]
+        return Views(cameras, self.which[tiles], self.blend_weight[tiles], self.encoded)
 
     def read(
         self,
@@ -205,14 +207,23 @@ def maps_from_images(
     return FeatureMaps(
         rows=images.permute(0, 2, 3, 1).reshape(-1, channels),
         first=torch.arange(count, device=device) * (height * width),
-        size=torch.tensor([width, height], device=device).expand(count, 2),
+        size=_sizes(count, width, height, device),
         origin_px=corner_px + 0.5,
         stride=stride,
     )
 
 
+def _sizes(count: int, width: int, height: int, device: torch.device) -> Int[Tensor, "K 2"]:
+    """Filled in on the device: a copy from the processor cannot be recorded (`train.recording`)."""
+    size = torch.full((count, 2), height, device=device)
+    size[:, 0] = width
+    return size
+
+
 def concatenate(maps: list[FeatureMaps]) -> FeatureMaps:
     """Join maps of several sizes into one set."""
+    if len(maps) == 1:
+        return maps[0]
     offsets = torch.tensor([0, *(len(m.rows) for m in maps[:-1])], device=maps[0].rows.device).cumsum(0)
     return FeatureMaps(
         rows=torch.cat([m.rows for m in maps]),

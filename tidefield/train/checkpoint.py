@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -118,14 +119,14 @@ def save_checkpoint(
     folder: Path,
     network: nn.Module,
     optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
+    random_state: UInt8[Tensor, " B"],
     progress: TrainingProgress,
 ) -> None:
-    """Replace the run's checkpoint."""
+    """Replace the run's checkpoint; `random_state` is that of the generator of the batches to come."""
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    tensors["generator"] = generator.get_state()
+    tensors["generator"] = random_state
     header = {"run": _run_id(folder), **asdict(progress), "version": __version__}
     _write_tensors(folder / CHECKPOINT_FILE, tensors, header)
 

@@ -34,6 +34,7 @@ from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
 from tidefield.processes import STOPPING, handled
 from tidefield.progress import ProgressBar
+from tidefield.recording import Recorder, moved
 from tidefield.train.checkpoint import (
     CHECKPOINT_FILE,
     TrainingProgress,
@@ -41,7 +42,7 @@ from tidefield.train.checkpoint import (
     read_weights,
     save_checkpoint,
 )
-from tidefield.train.losses import BatchLoss
+from tidefield.train.losses import BatchLoss, Inputs
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +81,9 @@ class Trainer(ABC):
     ) -> None:
         self.network, self.learning_rate, self.scene, self.device = network, learning_rate, scene, device
         self.generator = torch.Generator().manual_seed(seed)
-        self.optimizer = torch.optim.Adam(network.parameters(), **adam)
+        # Fused: a GPU takes all parameters at once.
+        fused = True if device.type == "cuda" else None
+        self.optimizer = torch.optim.Adam(network.parameters(), fused=fused, **adam)
         self.progress = TrainingProgress()
         self.cameras = scene.cameras.to(device)
 
@@ -100,8 +103,16 @@ class Trainer(ABC):
         """Learning rate as a share of its peak when this share of the budget is used."""
 
     @abstractmethod
-    def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw a batch; returns its loss, and the mean squared error of its colours."""
+    def backward(self) -> torch.Tensor:
+        """Set the gradients of the next batch's loss; returns the mean squared error of its colours."""
+
+    def draw_ahead(self) -> None:  # noqa: B027 - a batch may be drawn when it is needed
+        """Draw the batch of the next step, while a GPU is at work on this one."""
+
+    @property
+    def random_state(self) -> torch.Tensor:
+        """State of the generator before the batch of the next step was drawn."""
+        return self.generator.get_state()
 
     @abstractmethod
     def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
@@ -137,7 +148,7 @@ class Trainer(ABC):
         self.progress = load_training(folder, self.network, self.optimizer, self.generator)
 
     def save(self, folder: Path) -> None:
-        save_checkpoint(folder, self.network, self.optimizer, self.generator, self.progress)
+        save_checkpoint(folder, self.network, self.optimizer, self.random_state, self.progress)
 
     def step(self, budget: Budget) -> float:
         """One step of gradient descent; returns the mean squared error of its colours."""
@@ -145,13 +156,12 @@ class Trainer(ABC):
         rate = self.rate(budget.share(self.progress.step, self.progress.seconds))
         for group in self.optimizer.param_groups:
             group["lr"] = rate * self.learning_rate
-        loss, error = self.loss()
-        self.optimizer.zero_grad()
-        loss.backward()
+        error = self.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
-        value = error.item()
         self.progress.step += 1
+        self.draw_ahead()
+        value = error.item()
         self.progress.seconds += time.perf_counter() - start
         self.progress.losses = [*self.progress.losses[-99:], value]
         return value
@@ -165,13 +175,11 @@ class OpenArea:
         number: among the scene's areas.
         area: its part of the scene.
         priors: depth priors of the part.
-        cameras: of the part, on the network's device.
     """
 
     number: int
     area: Area
     priors: DepthPriors
-    cameras: Cameras
 
 
 class SceneTrainer(Trainer):
@@ -186,6 +194,8 @@ class SceneTrainer(Trainer):
     network: Network
     _open: OpenArea | None
     _doubled: Scene | None
+    _ahead: tuple[torch.Tensor, Inputs] | None
+    """The state of the generator before a batch was drawn, and the batch."""
 
     def __init__(
         self,
@@ -204,8 +214,12 @@ class SceneTrainer(Trainer):
         super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
         self.config, self.areas = config, areas or cut(scene)
         self._seed, self._open = seed, None
-        self._prepared, self._doubled = False, None
+        self._prepared, self._doubled, self._ahead = False, None, None
         self.batch_loss: nn.Module = BatchLoss(network, config.train)
+        self._recorder: Recorder[Inputs, tuple[torch.Tensor, tuple[torch.Tensor | None, ...]]] | None = None
+        # Whole photographs are encoded once for all tiles that read them: their number changes.
+        if device.type == "cuda" and config.train.crop_px is not None:
+            self._recorder = Recorder(self._gradients, device)
 
     @property
     def rays_per_step(self) -> int:
@@ -216,11 +230,42 @@ class SceneTrainer(Trainer):
         warm = min(1.0, (self.progress.step + 1) / self.config.train.warm_up)
         return warm * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
 
-    def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def draw(self) -> Inputs:
+        """Draw the next batch, on the CPU."""
         own, views = self.open_area(), self.config.network.views
-        scene, targets = own.area.scene, own.area.targets
-        known = own.priors, own.cameras, views, self.generator, self.precision, targets, own.area.doubled
-        return self.batch_loss(scene, *known)
+        part = own.area
+        drawn_from = part.scene, own.priors, views, self.generator, part.targets, part.doubled
+        return Inputs.draw(self.network, self.config.train, *drawn_from)
+
+    def loss(self, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the loss of a batch on the network's device, and the mean squared error of its colours."""
+        return self.batch_loss(inputs, self.precision)
+
+    def backward(self) -> torch.Tensor:
+        inputs = self.draw() if self._ahead is None else self._ahead[1]
+        self._ahead = None
+        if self._recorder is None:
+            error, gradients = self._gradients(moved(inputs, self.device))
+        else:
+            error, gradients = self._recorder(inputs, inputs.opaque)
+        for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+            parameter.grad = gradient
+        return error
+
+    def _gradients(self, inputs: Inputs) -> tuple[torch.Tensor, tuple[torch.Tensor | None, ...]]:
+        """Compute the error of a batch's colours, and the gradients of its loss."""
+        self.optimizer.zero_grad()
+        loss, error = self.loss(inputs)
+        loss.backward()
+        return error.detach(), tuple(parameter.grad for parameter in self.network.parameters())
+
+    def draw_ahead(self) -> None:
+        state = self.generator.get_state()
+        self._ahead = state, self.draw()
+
+    @property
+    def random_state(self) -> torch.Tensor:
+        return super().random_state if self._ahead is None else self._ahead[0]
 
     def prepare(self, progress: Progress | None = None) -> None:
         if not self._prepared and self.network.reads_doubled:
@@ -244,8 +289,7 @@ class SceneTrainer(Trainer):
             match = None
             if self.network.matches_surface:
                 match = Matcher(area.scene, most_px=MATCHED_PX, device=self.device)
-            cameras = area.scene.cameras.to(self.device)
-            self._open = OpenArea(number, area, DepthPriors(area.scene, match=match), cameras)
+            self._open = OpenArea(number, area, DepthPriors(area.scene, match=match))
         return self._open
 
     def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:

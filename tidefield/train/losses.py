@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -19,9 +21,10 @@ from tidefield.device import mixed_precision
 from tidefield.evaluation.metrics import similarity
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network, RayGrid, TileRendering
-from tidefield.model.sampling import Tiles
+from tidefield.model.sampling import Intervals, Tiles
 from tidefield.model.views import Encoded, Views
 from tidefield.parallel import differentiable_parts
+from tidefield.recording import map_tensors
 
 COARSE_WEIGHT = 0.5
 """Of the coarse passes' own colours, without which nothing would teach them where the surface is."""
@@ -29,8 +32,79 @@ DEPTH_SCALE = 0.01
 """Share of its depth by which a surface may miss a sparse point before the penalty grows no faster (Huber)."""
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What the loss of a batch is computed from.
+
+    Attributes:
+        batch: the tiles, and what to encode.
+        cameras: of the tiles.
+        neighbours: of the tiles' neighbours, tile by tile.
+        start: intervals of the first pass's rays.
+        jitter: of the samples of every pass.
+        opaque: whether the last sample of a ray stops all light.
+    """
+
+    batch: Batch
+    cameras: Cameras
+    neighbours: Cameras
+    start: Intervals
+    jitter: tuple[Float[Tensor, "T _ _"], ...]
+    opaque: bool
+
+    @staticmethod
+    def draw(
+        network: Network,
+        config: TrainConfig,
+        scene: Scene,
+        priors: DepthPriors,
+        views: int,
+        generator: torch.Generator,
+        of: Sequence[int] | None = None,
+        doubled: Scene | None = None,
+        cameras: Cameras | None = None,
+    ) -> Inputs:
+        """Draw a random batch.
+
+        Args:
+            network: that learns from it.
+            config: of the training.
+            scene: whose training photographs are drawn from.
+            priors: of its cameras.
+            views: neighbours of each tile.
+            generator: of everything random.
+            of: training photographs to draw from; all of them if not given.
+            doubled: the scene at twice the size, where photographs are read from it, too.
+            cameras: to render with; the scene's own if not given.
+        """
+        batch = draw_batch(scene, priors, config, views, generator, of, doubled)
+        cameras = scene.cameras if cameras is None else cameras
+        own = cameras[batch.targets]
+        cells = torch.stack([priors[i].cells for i in batch.targets.tolist()])
+        return Inputs(
+            batch=batch,
+            cameras=own,
+            neighbours=cameras[batch.neighbours.reshape(-1)],
+            start=network.start_intervals(Tiles(own, batch.corner_px, config.tile_px), cells),
+            jitter=network.draw_jitter(len(batch.targets), config.tile_px, generator),
+            opaque=scene.background_rgb is None,
+        )
+
+    def parts(self, count: int) -> list[Inputs]:
+        """Split into at most `count` parts of some of the tiles each; into one where tiles share images."""
+        views, first, parts = self.batch.which.shape[1], 0, []
+        for batch in self.batch.parts(count):
+            last = first + len(batch.targets)
+            tiles = slice(first, last)
+            start, jitter = map_tensors((self.start, self.jitter), itemgetter(tiles))
+            neighbours = self.neighbours[slice(first * views, last * views)]
+            parts.append(Inputs(batch, self.cameras[tiles], neighbours, start, jitter, self.opaque))
+            first = last
+        return parts
+
+
 class BatchLoss(nn.Module):
-    """The loss of a batch: drawn, rendered and compared.
+    """The loss of a batch: rendered and compared.
 
     A module, so that DistributedDataParallel can average what several processes learn.
 
@@ -44,40 +118,23 @@ class BatchLoss(nn.Module):
         self.network, self.config = network, config
 
     def forward(
-        self,
-        scene: Scene,
-        priors: DepthPriors,
-        cameras: Cameras,
-        views: int,
-        generator: torch.Generator,
-        precision: torch.dtype | None = None,
-        of: Sequence[int] | None = None,
-        doubled: Scene | None = None,
+        self, inputs: Inputs, precision: torch.dtype | None = None
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """The loss of a random batch, and the mean squared error of its colours.
+        """Compute the loss of a batch, and the mean squared error of its colours.
+
+        On a GPU nothing waits for it, and no value decides what is computed: the operations can be recorded.
 
         Args:
-            scene: whose training photographs are drawn from.
-            priors: of its cameras.
-            cameras: the scene's, on the network's device.
-            views: neighbours of each tile.
-            generator: of everything random.
+            inputs: on the network's device.
             precision: of the encoder's convolutions; that of `choose_precision` if None.
-            of: training photographs to draw from; all of them if not given.
-            doubled: the scene at twice the size, where photographs are read from it, too.
         """
-        network, config, device, side = self.network, self.config, cameras.gain.device, self.config.tile_px
-        batch = draw_batch(scene, priors, config, views, generator, of, doubled).to(device)
-        own = torch.stack([priors[i].cells for i in batch.targets.tolist()]).to(device)
-        opaque = scene.background_rgb is None
-        parts = batch.parts(torch.get_num_threads()) if device.type == "cpu" else [batch]
+        network, config, batch = self.network, self.config, inputs.batch
+        device, side = batch.colours.device, config.tile_px
+        parts = inputs.parts(torch.get_num_threads()) if device.type == "cpu" else [inputs]
         if len(parts) == 1:
-            rendering = self._render(batch, cameras, own, opaque, generator, precision)
+            rendering = self._render(inputs, precision)
         else:
-            tasks = [
-                partial(self._render_tensors, part, cameras, prior, opaque, _derived(generator), precision)
-                for part, prior in zip(parts, own.split([len(part.targets) for part in parts]), strict=True)
-            ]
+            tasks = [partial(self._render_tensors, part, precision) for part in parts]
             trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
             rendering = TileRendering.from_tensors(differentiable_parts(tasks, trained, device))
         loss, error = photometric(rendering, batch, network.grids, side)
@@ -87,35 +144,21 @@ class BatchLoss(nn.Module):
             loss = loss + config.depth_weight * sparse_depth(rendering, batch, network.grids, side)
         return loss, error
 
-    def _render(
-        self,
-        batch: Batch,
-        cameras: Cameras,
-        priors: Float[Tensor, "T 3 h w"],
-        opaque: bool,
-        generator: torch.Generator,
-        precision: torch.dtype | None,
-    ) -> TileRendering:
-        network = self.network
-        doubled = batch.image_doubled or (None,) * len(batch.images)
-        with mixed_precision(priors.device, precision):
-            groups = zip(batch.images, batch.image_corner_px, doubled, strict=True)
-            encoded = [network.encode(*images) for images in groups]
+    def _render(self, inputs: Inputs, precision: torch.dtype | None) -> TileRendering:
+        network, batch = self.network, inputs.batch
+        groups = range(len(batch.images))
+        images = [(batch.colours_of_images(k), batch.colours_at_twice_the_size(k)) for k in groups]
+        corners = [corner.float() for corner in batch.image_corner_px]
+        with mixed_precision(batch.colours.device, precision):
+            encoded = [network.encode(one, at, twice) for (one, twice), at in zip(images, corners, strict=True)]
         if batch.image_used:
-            masks = zip(encoded, batch.image_used, batch.image_corner_px, strict=True)
-            encoded = [one.masked(used, corner_px) for one, used, corner_px in masks]
-        neighbours = cameras[batch.neighbours.reshape(-1)]
-        views = Views(neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
-        tiles = Tiles(cameras[batch.targets], batch.corner_px, self.config.tile_px)
-        return network(tiles, views, network.start_intervals(tiles, priors), opaque, batch.detail, generator)
+            encoded = [one.masked(*used) for one, *used in zip(encoded, batch.image_used, corners, strict=True)]
+        views = Views(inputs.neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
+        tiles = Tiles(inputs.cameras, batch.corner_px, self.config.tile_px)
+        return network(tiles, views, inputs.start, inputs.opaque, batch.detail, inputs.jitter)
 
     def _render_tensors(self, *arguments: Any) -> tuple[Tensor, ...]:
         return self._render(*arguments).tensors()
-
-
-def _derived(generator: torch.Generator) -> torch.Generator:
-    """A new generator, seeded by this one, for a thread of its own."""
-    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))
 
 
 def photometric(
@@ -155,10 +198,10 @@ def sparse_depth(rendering: TileRendering, batch: Batch, grids: tuple[RayGrid, .
     loss = weight.new_zeros(())
     for grid, inverse_depth in zip(grids, rendering.inverse_depths, strict=True):
         total = F.avg_pool2d(share, grid.stride)[:, 0]
-        known = total > 0
-        mean = (F.avg_pool2d(weighted, grid.stride)[:, 0] / total.clamp(min=1e-12))[known]
-        miss = (_without_margin(inverse_depth, grid, side_px)[known] / mean - 1) / DEPTH_SCALE
-        penalty = F.huber_loss(miss, torch.zeros_like(miss), reduction="none") * total[known]
+        mean = F.avg_pool2d(weighted, grid.stride)[:, 0] / total.clamp(min=1e-12)
+        found = _without_margin(inverse_depth, grid, side_px)
+        miss = (found / torch.where(total > 0, mean, found.detach()) - 1) / DEPTH_SCALE
+        penalty = F.huber_loss(miss, torch.zeros_like(miss), reduction="none") * total
         loss = loss + penalty.sum() / total.sum().clamp(min=1e-12)
     return loss / len(rendering.inverse_depths)
 

@@ -25,6 +25,7 @@ from tidefield.files import read_json, write_text
 from tidefield.model.renderer import Renderer
 from tidefield.synthetic import CATEGORIES, Flight
 from tidefield.train.loop import SceneTrainer, Trainer
+from tidefield.train.losses import Inputs
 from tidefield.train.stream import Recipe, Stream, make
 
 VIEWS = {4: 0.2, 5: 0.35, 6: 0.2, 8: 0.15, 10: 0.06, 12: 0.04}
@@ -102,16 +103,21 @@ class Pretrainer(SceneTrainer):
         if is_distributed():
             # What acts between views only (eq. 6) has no gradient where a single view sees.
             self.batch_loss = DistributedDataParallel(self.batch_loss, find_unused_parameters=True)
+            self._recorder = None  # what processes send one another is not recorded
 
     @property
     def rays_per_step(self) -> int:
         return world_size() * super().rays_per_step
 
-    def loss(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def draw(self) -> Inputs:
         drawn = self.stream.draw(self.progress.step, self.generator)
         shares = torch.tensor(list(VIEWS.values()))
         views = list(VIEWS)[int(torch.multinomial(shares, 1, generator=self.generator))]
-        loss, error = self.batch_loss(drawn.scene, drawn.priors, drawn.cameras, views, self.generator, self.precision)
+        given = drawn.scene, drawn.priors, views, self.generator
+        return Inputs.draw(self.network, self.config.train, *given, cameras=drawn.cameras)
+
+    def loss(self, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
+        loss, error = super().loss(inputs)
         # All scenes count alike: the gradient is that of decibels. Otherwise the least predictable scenes (trees,
         # brighton_beach) would have a hundred times the weight of bare mud, and nothing would be learned from it.
         return loss / (error.detach() + LEAST_ERROR), error

@@ -100,7 +100,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A scene with its depth priors, and its cameras on the network's device."""
+    """A scene with its depth priors, and the cameras that the network is given."""
 
     scene: Scene
     priors: DepthPriors
@@ -191,12 +191,11 @@ class Stream:
         folder: for the procedural scenes in the pool.
         real: folders of real scenes; only their training photographs are learned from.
         seed: of the procedural scenes.
-        device: of the network.
         config: of the network that learns.
     """
 
-    def __init__(self, folder: Path, real: Sequence[Path], seed: int, device: torch.device, config: Config) -> None:
-        self.folder, self.seed, self.device = folder, seed, device
+    def __init__(self, folder: Path, real: Sequence[Path], seed: int, config: Config) -> None:
+        self.folder, self.seed = folder, seed
         widths = WHOLE_WIDTHS if config.train.crop_px is None else WIDTHS
         self.real = [scene for path in real for scene in at_several_widths(path, widths)]
         self.matches_surface = network_class(config.network).matches_surface
@@ -272,4 +271,4 @@ class Stream:
             )
         augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
         match = Matcher(augmented) if self.matches_surface else None
-        return Drawn(augmented, DepthPriors(augmented, scene.points, match), cameras.to(self.device))
+        return Drawn(augmented, DepthPriors(augmented, scene.points, match), cameras)
