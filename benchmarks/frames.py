@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +31,7 @@ from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.machine import describe
 from tidefield.methods import zero_shot
+from tidefield.model.renderer import in_turn
 from tidefield.model.rendering import Render
 from tidefield.render.camera_paths import make_trajectory
 from tidefield.train.checkpoint import given_or_shipped
@@ -103,8 +105,8 @@ def _first(
 
 
 def _further(view: Render, cameras: Cameras) -> float:
-    view(cameras[0])
-    return statistics.median(_seconds(view, cameras[k]) for k in range(1, len(cameras)))
+    ends = [time.perf_counter() for _ in in_turn(view, cameras)]
+    return statistics.median(end - start for start, end in pairwise(ends))
 
 
 def _by_photographs(view_of: Callable[[Scene], Render], scene: Scene, camera: Cameras) -> dict[str, float]:

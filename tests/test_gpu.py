@@ -16,7 +16,7 @@ from tidefield.config import SWIFT, Budget, Config, NerfConfig, Sampling
 from tidefield.data.scene import Scene
 from tidefield.device import choose_device, choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
-from tidefield.model.renderer import Renderer
+from tidefield.model.renderer import Renderer, in_turn
 from tidefield.model.rendering import Rendering
 from tidefield.model.views import weighted_rows
 from tidefield.train.loop import SceneTrainer
@@ -53,6 +53,16 @@ def test_views_are_those_of_the_cpu(scene: Scene, name: str, side: int) -> None:
     torch.testing.assert_close(ours.depth, theirs.depth, rtol=0.01, atol=0)
 
 
+def test_views_in_turn_are_recorded_and_the_same(scene: Scene) -> None:
+    own = network(SWIFT.network, stir=0.02).to(GPU).eval()
+    flight = scene.cameras[[3, 2, 3, 3, 4]]
+    every = list(in_turn(Renderer(own, scene, SWIFT, GPU), flight))
+    for k, view in enumerate(every):
+        alone = Renderer(own, scene, SWIFT, GPU)(flight[k])
+        torch.testing.assert_close(view.colour, alone.colour, rtol=0, atol=1e-4)
+        torch.testing.assert_close(view.depth, alone.depth, rtol=1e-4, atol=0)
+
+
 def test_reads_of_feature_maps_and_their_gradients_are_those_of_the_cpu() -> None:
     generator = torch.Generator().manual_seed(0)
     rows = torch.randn(50, 8, generator=generator)
@@ -71,8 +81,7 @@ def test_reads_of_feature_maps_and_their_gradients_are_those_of_the_cpu() -> Non
 
 def gradients(scene: Scene, device: torch.device) -> Tensor:
     trainer = SceneTrainer(replace(SMALL, train=replace(SMALL.train, tiles=8)), scene, seed=3, device=device)
-    loss, _ = trainer.loss()
-    loss.backward()
+    trainer.backward()
     found = [p.grad for p in trainer.network.parameters() if p.grad is not None]
     return torch.cat([gradient.reshape(-1).cpu() for gradient in found])
 

@@ -8,13 +8,13 @@ import torch
 from networks import CPU, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
 from torch import Tensor, nn
 
-from tidefield.config import PAPER, SWIFT, Config
+from tidefield.config import PAPER, SWIFT, Config, Sampling
 from tidefield.data.neighbours import Neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
 from tidefield.model.cache import FeatureCache
 from tidefield.model.network import Network, TileRendering
-from tidefield.model.renderer import Renderer
+from tidefield.model.renderer import Renderer, in_turn
 from tidefield.model.sampling import Intervals, Tiles, place_samples
 
 PASSES = {"swift": "passes", "paper": "aggregate"}
@@ -34,7 +34,7 @@ def finite_forward_and_backward(own: Network, result: TileRendering) -> set[str]
 def test_every_kind_of_network_is_finite_forward_and_backward(name: str, opaque: bool):
     own = network(NETWORKS[name], stir=0.02)
     tiles, views, start = looking(own, scene())
-    result = own(tiles, views, start, opaque, generator=torch.Generator().manual_seed(0))
+    result = own(tiles, views, start, opaque, jitter=own.draw_jitter(2, 16, torch.Generator().manual_seed(0)))
     assert result.colour.shape == (2, 256, 3)
     assert result.depth.shape == result.opacity.shape == (2, 256)
     assert len(result.inverse_depths) == len(result.coarse_colours) + 1 == len(own.grids)
@@ -171,14 +171,27 @@ def test_tiles_do_not_show(name: str):
     torch.testing.assert_close(torch.cat([upper, lower]), whole, atol=1e-4, rtol=0)
 
 
-def test_without_a_generator_rendering_repeats_and_with_one_it_varies_with_the_seed():
+def test_without_jitter_rendering_repeats_and_with_it_it_varies_with_the_seed():
     own = network(SWIFT.network).eval()
     given = looking(own, scene())
     with torch.inference_mode():
         first, again = own(*given, True), own(*given, True)
-        one, other = (own(*given, True, generator=torch.Generator().manual_seed(s)) for s in (1, 2))
+        seeds = (torch.Generator().manual_seed(s) for s in (1, 2))
+        one, other = (own(*given, True, jitter=own.draw_jitter(2, 16, seed)) for seed in seeds)
     assert torch.equal(first.colour, again.colour)
     assert not torch.equal(one.colour, other.colour)
+
+
+@pytest.mark.parametrize("side", [1, 2])
+def test_views_in_turn_are_those_of_each_camera(side: int):
+    at = scene()
+    own = Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU, Sampling(rays_per_side=side))
+    flight = at.cameras[[TARGET, 0, 3]]
+    for render in (own, lambda camera: own(camera)):
+        for k, view in enumerate(in_turn(render, flight)):
+            alone = own(flight[k])
+            assert torch.equal(view.colour, alone.colour)
+            assert torch.equal(view.depth, alone.depth)
 
 
 def test_rays_go_through_the_centres_of_a_tiles_squares():

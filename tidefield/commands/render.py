@@ -94,12 +94,13 @@ def render(options: Render, console: Console) -> None:
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = trajectory.cameras
+        from tidefield.model.renderer import in_turn
         from tidefield.render.video import write_video
 
         with ExitStack() as stack:
             bar = stack.enter_context(ProgressBar(console, "Rendering"))
             if options.cluster is None:
-                frames = (view(cameras[k]) for k in range(len(cameras)))
+                frames = in_turn(view, cameras)
             else:
                 ray = stack.enter_context(connected(options.cluster))
                 frames = _frames_of_cluster(ray, options, cameras, _key(scene, record))

@@ -24,6 +24,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
 from tidefield.parallel import in_parallel
+from tidefield.recording import moved
 
 BLOCK_PX = 512
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
@@ -123,9 +124,9 @@ class FeatureCache:
             if key in self._slots:
                 self._slots.move_to_end(key)
         self._encode_all([key for key in distinct if key not in self._slots])
-        which = torch.tensor([self._slots[key] for key in keys], device=self.device).reshape(photographs.shape)
-        blend_weight = neighbours.blend_weight.to(self.device)
-        return Views(self._cameras[rows.to(self.device)], which, blend_weight, self._encoded)
+        which = torch.tensor([self._slots[key] for key in keys]).reshape(photographs.shape)
+        which, rows, blend_weight = moved((which, rows, neighbours.blend_weight), self.device)
+        return Views(self._cameras[rows], which, blend_weight, self._encoded)
 
     def _blocks_of(
         self,

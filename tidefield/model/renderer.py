@@ -6,10 +6,13 @@ for it (`Network.fills_unseen`) the colours around are continued into it, unless
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tidefield.config import USUAL_SAMPLING, Config, Sampling
@@ -22,20 +25,40 @@ from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.cache import CacheFull, FeatureCache
 from tidefield.model.network import Network
-from tidefield.model.rendering import Rendering, fill_unseen, render_with_rays
-from tidefield.model.sampling import Tiles
-from tidefield.model.views import Views
+from tidefield.model.rendering import Render, Rendering, fill_unseen, render_with_rays
+from tidefield.model.sampling import Intervals, Tiles
+from tidefield.model.views import Encoded, Views
 from tidefield.parallel import in_parallel
+from tidefield.recording import Recorder, moved
 
 TILE_PX = 32
 VALUES_AT_ONCE = 1_250_000
 """Numbers gathered at once by a pass on one core: few enough for its cache ..."""
-GPU_FACTOR = 64
+GPU_FACTOR = 32
 """... and so many times more keep a GPU busy."""
 BEHIND_PHOTOGRAPHS, BEHIND_STEP = 32, 16
 """Photographs, and pixels between their pixels, whose mean colour lies behind pixels that let light through."""
 BLOCK_TILES = 16
 """Tiles along the sides of the blocks that a view is rendered in, so that successive tiles share photographs."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some tiles of a view, with all that their network reads but the maps.
+
+    Attributes:
+        tiles: to render.
+        cameras, which, blend_weight: of `Views`.
+        start: intervals of the first pass's rays.
+        detail: of the depth prior, at each pixel.
+    """
+
+    tiles: Tiles
+    cameras: Cameras
+    which: Int[Tensor, "T N"]
+    blend_weight: Float[Tensor, "T N 4"]
+    start: Intervals
+    detail: Float[Tensor, "T R"]
 
 
 class Renderer:
@@ -63,13 +86,15 @@ class Renderer:
         self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
-        self.tiles_at_once = max(1, limit // gathered)
+        # A power of two divides blocks into few kinds of pieces, which a GPU records one by one.
+        self.tiles_at_once = 1 << max(0, (limit // gathered).bit_length() - 1)
         # Of tiles larger than that, one on each core would take too much memory: all cores share one.
         self.tiles_in_parallel = gathered <= limit
         self.fills_unseen = network.fills_unseen and scene.background_rgb is None
         few = scene.train[:: -(-len(scene.train) // BEHIND_PHOTOGRAPHS)]
         lines = slice(None, None, BEHIND_STEP)
         self.mean_colours = {i: to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few}
+        self._recorded: tuple[Encoded, Recorder[_Piece, Tensor]] | None = None
 
     def __call__(self, camera: Cameras, prior: Float[Tensor, "3 h w"] | None = None) -> Rendering:
         """Render the view of one camera, at its own gain, from its sources (`Scene.sources`).
@@ -79,13 +104,48 @@ class Renderer:
             prior: where its rays are sampled, on cells of its pixels (`depth_prior.surface_prior`); that of the scene's
                 points if not given.
         """
-        side = self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
+        side = self._rays_per_side(camera)
         if prior is not None and side > 1:
             prior = prior.repeat_interleave(side, 1).repeat_interleave(side, 2)
         return render_with_rays(partial(self._render, cells=prior), camera, side)
 
+    def in_turn(self, cameras: Cameras) -> Iterator[Rendering]:
+        """Render the views of cameras, one after the other.
+
+        While a GPU renders a view, the processor looks for the surface of the next one among the sparse points.
+        """
+        with ThreadPoolExecutor(1) as pool:
+            next_one = pool.submit(self._points_surface, cameras[0])
+            for k in range(len(cameras)):
+                surface = next_one.result()
+                if k + 1 < len(cameras):
+                    next_one = pool.submit(self._points_surface, cameras[k + 1])
+                side = self._rays_per_side(cameras[k])
+                yield render_with_rays(partial(self._render, surface=surface), cameras[k], side)
+
+    def _rays_per_side(self, camera: Cameras) -> int:
+        return self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
+
+    def _points_surface(self, camera: Cameras) -> Float[Tensor, "3 h w"]:
+        """The surface of a camera, of all its rays, before photographs are matched."""
+        side, scene = self._rays_per_side(camera), self.scene
+        camera = camera.resized(side * camera.width, side * camera.height)
+        return surface_prior(camera, scene.points, scene.cameras, scene.hull)
+
     @torch.inference_mode()
-    def _render(self, camera: Cameras, cells: Float[Tensor, "3 h w"] | None = None) -> Rendering:
+    def _render(
+        self,
+        camera: Cameras,
+        cells: Float[Tensor, "3 h w"] | None = None,
+        surface: Float[Tensor, "3 h w"] | None = None,
+    ) -> Rendering:
+        """Render a view with a ray in each pixel.
+
+        Args:
+            camera: of the view.
+            cells: where its rays are sampled; found if not given.
+            surface: `_points_surface`, if it is known already.
+        """
         scene = self.scene
         sources = scene.sources(camera)
         if not sources:
@@ -94,13 +154,15 @@ class Renderer:
                 "view from; add photographs"
             )
         if cells is None:
-            prior = DepthPrior(surface_prior(camera, scene.points, scene.cameras, scene.hull))
+            if surface is None:
+                surface = surface_prior(camera, scene.points, scene.cameras, scene.hull)
+            prior = DepthPrior(surface)
             if self.matcher is not None:
                 prior = self.matcher(camera, prior.cells)
         else:
             prior = DepthPrior(cells)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
-        picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6)
+        picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6, device=self.device)
         for top in range(0, rows, BLOCK_TILES):
             for left in range(0, columns, BLOCK_TILES):
                 size = (min(BLOCK_TILES, columns - left), min(BLOCK_TILES, rows - top))
@@ -111,13 +173,13 @@ class Renderer:
         colour, opacity, depth, visibility = picture[: camera.height, : camera.width].split([3, 1, 1, 1], dim=-1)
         white = scene.background_rgb
         mean_colour = torch.stack([colour for i, colour in self.mean_colours.items() if i in sources]).mean(0)
-        gain = camera.gain_of_rows()
-        behind = mean_colour * gain if white is None else torch.tensor(white)
+        gain = camera.to(self.device).gain_of_rows()
+        behind = mean_colour.to(gain) * gain if white is None else gain.new_tensor(white)
         colour = colour * gain + (1 - opacity) * behind
         if self.fills_unseen:
             colour = fill_unseen(colour, visibility[..., 0] > 0.5)
-        colour = colour.clamp(0, 1)
-        return Rendering(colour=colour, depth=depth[..., 0].clone(), opacity=opacity[..., 0].clamp(0, 1))
+        depth = depth[..., 0].clone()
+        return Rendering(*(x.cpu() for x in (colour.clamp(0, 1), depth, opacity[..., 0].clamp(0, 1))))
 
     def _block(
         self, camera: Cameras, prior: DepthPrior, corner: tuple[int, int], size: tuple[int, int]
@@ -151,17 +213,33 @@ class Renderer:
             return torch.cat([self._tiles(camera, prior, corners[s], neighbours[s], middle_world[s]) for s in halves])
         pieces = [
             partial(self._piece, camera, prior, corners[part], views[part])
-            for part in torch.arange(len(corners)).split(self.tiles_at_once)
+            for part in (slice(k, k + self.tiles_at_once) for k in range(0, len(corners), self.tiles_at_once))
         ]
         return torch.cat(in_parallel(pieces, self.device) if self.tiles_in_parallel else [piece() for piece in pieces])
 
     def _piece(
         self, camera: Cameras, prior: DepthPrior, corners: Float[Tensor, "T 2"], views: Views
     ) -> Float[Tensor, "T R 6"]:
-        index = torch.zeros(len(corners), dtype=torch.long)
-        tiles = Tiles(camera[index].to(self.device), corners.to(self.device), TILE_PX)
-        start = self.network.start_intervals(tiles, prior.cells[None].to(self.device))
-        detail = prior.detail_of_tiles(corners, TILE_PX).to(self.device)
-        found = self.network(tiles, views, start, self.scene.background_rgb is None, detail)
+        tiles = Tiles(camera[torch.zeros(len(corners), dtype=torch.long)], corners, TILE_PX)
+        start = self.network.start_intervals(tiles, prior.cells[None])
+        detail = prior.detail_of_tiles(corners, TILE_PX)
+        piece = _Piece(tiles, views.cameras, views.which, views.blend_weight, start, detail)
+        if self.device.type != "cuda":
+            return self._compute(views.encoded, moved(piece, self.device))
+        if self._recorded is None or self._recorded[0] is not views.encoded:
+            recorder = Recorder(partial(self._compute, views.encoded), self.device, after=1)
+            self._recorded = views.encoded, recorder
+        return self._recorded[1](piece).clone()
+
+    def _compute(self, encoded: Encoded, piece: _Piece) -> Float[Tensor, "T R 6"]:
+        views = Views(piece.cameras, piece.which, piece.blend_weight, encoded)
+        found = self.network(piece.tiles, views, piece.start, self.scene.background_rgb is None, piece.detail)
         single = torch.stack([found.opacity, found.depth, found.visibility], dim=-1)
-        return torch.cat([found.colour, single], dim=-1).cpu()
+        return torch.cat([found.colour, single], dim=-1)
+
+
+def in_turn(render: Render, cameras: Cameras) -> Iterator[Rendering]:
+    """Render the views of cameras one after the other, by any method."""
+    if isinstance(render, Renderer):
+        return render.in_turn(cameras)
+    return (render(cameras[k]) for k in range(len(cameras)))
