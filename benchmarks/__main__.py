@@ -561,6 +561,34 @@ def map_memory(
     )
 
 
+def cluster(
+    scene: tyro.conf.Positional[Path],
+    work: tyro.conf.Positional[Path],
+    runs: Path = MEASURED,
+    metres: float = 1000.0,
+    cell: float = 0.2,
+    kills: int = 10,
+    seed: int = 0,
+) -> None:
+    """A map on a cluster of this machine: speed of one and two workers, and what killed workers cost (an hour).
+
+    Args:
+        scene: A survey that is larger than the square.
+        work: Folder for the maps; those that the record has are not made again.
+        runs: Store the figures in this folder's cluster.json.
+        metres: Side of the square in the survey's middle that is mapped.
+        cell: Side of a cell, metres.
+        kills: How often a worker is killed.
+        seed: Of the moments.
+    """
+    from benchmarks.cluster import measure_cluster, tables
+
+    record = measure_cluster(scene, work, runs, metres, cell, kills, seed, partial(print, flush=True))
+    for table in tables(record):
+        print(table.markdown(), end="\n\n")
+    print(f"{record['files']} files are the same in all maps")
+
+
 def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Write the page on damaged files and killed commands from stored counts.
 
@@ -737,7 +765,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    mapped = (maps, map_control, map_views, map_memory)
+    mapped = (maps, map_control, map_views, map_memory, cluster)
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
     surveyed = (surveys, flight, large, cost, areas)

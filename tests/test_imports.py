@@ -28,7 +28,10 @@ RANK = {
     "commands": 8,
     "cli": 9,
 }
-FOR_ALL = {"cluster", "config", "machine", "device", "errors", "files", "progress", "parallel", "processes", "pages"}
+FOR_ALL = {
+    *("cluster", "config", "machine", "device", "errors", "files", "progress", "parallel", "recording"),
+    *("processes", "pages"),
+}
 """These import nothing of ours but each other."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -1,4 +1,4 @@
-"""`tidefield cache`: show or empty the cache of decoded photographs and triangulated points."""
+"""`tidefield cache`: show or empty the cache of decoded photographs and of what is estimated from them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cache:
-    """Show the cache of decoded photographs and triangulated points, or empty it.
+    """Show the cache of decoded photographs and of what is estimated from them, or empty it.
 
-    A scene that is opened for the first time at a width is decoded into one file of the cache. When a new file does not
-    fit, those that were not used for the longest time are deleted. The environment variable TIDEFIELD_CACHE_GB sets the
-    limit (20 gigabytes if not given), XDG_CACHE_HOME the folder that the cache is in.
+    A scene that is opened for the first time at a width is decoded into one file of the cache; its points, exposures
+    and lenses, as estimated, are kept in others. When a new file does not fit, those that were not used for the longest
+    time are deleted. The environment variable TIDEFIELD_CACHE_GB sets the limit (20 gigabytes if not given),
+    XDG_CACHE_HOME the folder that the cache is in.
     """
 
     clear: bool = False

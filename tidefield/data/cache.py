@@ -1,8 +1,10 @@
-"""The user's cache of decoded photographs and triangulated points: its folder, its size, and what is deleted from it.
+"""The user's cache of decoded photographs and of what is estimated from them: its folder, its size, and what is deleted
+from it.
 
-Each file of it holds the photographs of one scene at one width (`data.images`) or its points (`data.triangulate`), is
-named by a hash of everything that its content depends on, and is touched when it is used. Before another is written,
-the files that were not used for the longest time are deleted until it fits.
+Each file of it holds the photographs of one scene at one width (`data.images`), its points (`data.triangulate`), or its
+cameras and points as estimated when it is opened (`data.load`), is named by a hash of everything that its content
+depends on, and is touched when it is used. Before another is written, the files that were not used for the longest time
+are deleted until it fits.
 """
 
 from __future__ import annotations
@@ -10,22 +12,32 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import os
 import stat
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from zipfile import BadZipFile
 
+import numpy as np
 from platformdirs import user_cache_path
 
-from tidefield.errors import SceneError
+from tidefield.errors import RunError, SceneError
+from tidefield.files import completed_file
 
-SUFFIX, POINTS_SUFFIX = ".photographs", ".points"
+Arrays = dict[str, np.ndarray]
+
+SUFFIX, POINTS_SUFFIX, ESTIMATES_SUFFIX = ".photographs", ".points", ".estimates"
 LIMIT_VARIABLE, USUAL_LIMIT_GB = "TIDEFIELD_CACHE_GB", 20.0
 _DAYS_KEPT_UNUSED = 60
 _WRITERS_HOUR_SECONDS = 3600
 """A file that is being written grows all the time; one that did not for so long is of a program that was killed."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,53 @@ def key(parts: object) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
+def array_hash(array: np.ndarray) -> str:
+    """Identify an array, for `key`."""
+    whole = np.ascontiguousarray(array)
+    return hashlib.sha256(f"{whole.dtype} {whole.shape}".encode() + whole.tobytes()).hexdigest()
+
+
+@cache
+def code_hash() -> str:
+    """Identify the code that reads scenes, for `key`: what another version of it estimated is not used."""
+    package = Path(__file__).parents[1]
+    files = sorted(path for name in ("data", "geometry") for path in (package / name).rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def kept_arrays(name: str, folder: Path | None, make: Callable[[], Arrays]) -> Arrays:
+    """Read arrays from a file of the cache, or make them and keep them there for the next time.
+
+    Args:
+        name: of the file: a `key` and one of the suffixes.
+        folder: the cache's; None where there is none.
+        make: makes the arrays.
+    """
+    store = None
+    try:
+        if folder is not None:
+            open_folder(folder)
+            store = folder / name
+    except OSError as error:  # `open_photographs` tells of it
+        _log.debug("the cache folder %s cannot be used (%s)", folder, error.strerror)
+    if store is not None and store.is_file():
+        # A damaged file is made anew.
+        with suppress(ValueError, KeyError, EOFError, BadZipFile):
+            with store.open("rb") as file, np.load(file, allow_pickle=False) as stored_arrays:
+                arrays = dict(stored_arrays)
+            os.utime(store)
+            return arrays
+    arrays = make()
+    if store is not None:
+        try:
+            make_room(store.parent, sum(array.nbytes for array in arrays.values()))
+            with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+        except (OSError, RunError) as error:
+            _log.warning("what was estimated from photographs cannot be kept for the next time: %s", error)
+    return arrays
+
+
 def limit_bytes() -> float:
     """The size that the cache may have, which $TIDEFIELD_CACHE_GB sets in gigabytes.
 
@@ -102,7 +161,7 @@ def limit_bytes() -> float:
 def stored(folder: Path) -> list[Stored]:
     """List the files of the cache, least recently used first."""
     found = []
-    for path in (path for suffix in (SUFFIX, POINTS_SUFFIX) for path in folder.glob(f"*{suffix}")):
+    for path in (path for suffix in (SUFFIX, POINTS_SUFFIX, ESTIMATES_SUFFIX) for path in folder.glob(f"*{suffix}")):
         with suppress(FileNotFoundError):  # another program has deleted it
             status = path.stat()
             found.append(Stored(path, status.st_size, status.st_mtime))

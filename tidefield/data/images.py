@@ -155,7 +155,7 @@ def open_photographs(
             "set XDG_CACHE_HOME to a writable folder"
         )
         return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files, background_rgb)
-    store = folder / f"{_key(files, background_rgb)}{SUFFIX}"
+    store = folder / f"{photographs_key(files, background_rgb)}{SUFFIX}"
     expected = sum(file.bytes for file in files)
     try:
         open_folder(store.parent)
@@ -188,7 +188,8 @@ def open_photographs(
     return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files, background_rgb)
 
 
-def _key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
+def photographs_key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:
+    """Identify decoded photographs by their files and how they are read, for `cache.key`."""
     parts = []
     for file in files:
         path, *version = identity(file.path)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from tidefield.data.cache import ESTIMATES_SUFFIX, Arrays, array_hash, cache_folder, code_hash, kept_arrays, key
 from tidefield.data.calibrate import calibrate_lenses
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.holdout import read_holdout
 from tidefield.data.hull import visual_hull
-from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs
+from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, photographs_key
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.pictures import read_header
 from tidefield.data.readers.colmap import find_colmap, read_colmap
@@ -136,11 +138,57 @@ def load_scene(
     origin = posed.T_world_camera[:, :, 3].mean(axis=0)
     T_world_camera = posed.T_world_camera.copy()
     T_world_camera[:, :, 3] -= origin
+    pinholes = tuple(_pinhole(file) for file in files)
+    background = posed.background_rgb or _WHITE
+    photographs = open_photographs(files, background, progress, cache)
+    estimate = partial(_estimate, posed, T_world_camera, origin, pinholes, photographs, train, calibrate)
+    points = [] if posed.points is None else [getattr(posed.points, field.name) for field in fields(posed.points)]
+    read = [T_world_camera, posed.near_far, posed.divided_by, *points]
+    hashes = [None if array is None else array_hash(array) for array in read]
+    lenses = [asdict(lens) for lens in posed.lenses]
+    depends_on = [code_hash(), photographs_key(files, background), lenses, hashes, train, calibrate]
+    arrays = kept_arrays(f"{key(depends_on)}{ESTIMATES_SUFFIX}", cache or cache_folder(), lambda: _arrays(*estimate()))
+    cameras, sparse = _from_arrays(arrays)
+    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
+    return Scene(
+        root=root,
+        names=posed.names,
+        cameras=cameras,
+        photographs=photographs,
+        points=sparse,
+        train=train,
+        test=test,
+        origin_world=torch.from_numpy(origin),
+        background_rgb=posed.background_rgb or (_WHITE if transparent else None),
+        hull=visual_hull(cameras, photographs, train) if transparent else None,
+    )
+
+
+def _estimate(
+    posed: PosedPhotographs,
+    T_world_camera: Float64[np.ndarray, "V 3 4"],
+    origin: Float64[np.ndarray, "3"],
+    pinholes: tuple[Lens, ...],
+    photographs: Photographs,
+    train: tuple[int, ...],
+    calibrate: bool,
+) -> tuple[Cameras, SparsePoints | None]:
+    """Estimate what a scene needs beyond what its files state, from its training photographs.
+
+    Args:
+        posed: as read.
+        T_world_camera, origin: its poses around their mean position, and that.
+        pinholes: the cameras of its photographs.
+        photographs: at their size.
+        train: indices of the training photographs.
+        calibrate: see `load_scene`.
+
+    Returns:
+        The cameras with near and far, gains, shading and what is left of the lens, and the points that are left.
+    """
     points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
     if points is not None and len(points.uv_px):
         points = triangulate_again(points, T_world_camera, posed.lenses, train)
-    pinholes = tuple(_pinhole(file) for file in files)
-    photographs = open_photographs(files, posed.background_rgb or _WHITE, progress, cache)
     sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
     if sparse is not None and photographs.masks:
         sparse = _of_used_pixels(sparse, photographs)
@@ -160,25 +208,33 @@ def load_scene(
     )
     if calibrate and sparse is not None:
         cameras, sparse = calibrate_lenses(cameras, sparse, posed.lenses, train)
-    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     seen = None if sparse is None else observe(photographs, sparse, train)
     exposures = read_exposures(posed.paths)
     cameras = replace(cameras, gain=estimate_gains(seen, cameras, train, exposures, posed.divided_by))
     if calibrate and seen is not None and sparse is not None:
         shading = estimate_shading(seen, cameras, sparse, posed.lenses, train, exposures)
         cameras = replace(cameras, shading=shading)
-    return Scene(
-        root=root,
-        names=posed.names,
-        cameras=cameras,
-        photographs=photographs,
-        points=sparse,
-        train=train,
-        test=test,
-        origin_world=torch.from_numpy(origin),
-        background_rgb=posed.background_rgb or (_WHITE if transparent else None),
-        hull=visual_hull(cameras, photographs, train) if transparent else None,
-    )
+    return cameras, sparse
+
+
+def _arrays(cameras: Cameras, points: SparsePoints | None) -> Arrays:
+    """What was estimated, as arrays for the cache; `_from_arrays` is the inverse."""
+    named = {"cameras": cameras} | ({} if points is None else {"points": points})
+    return {
+        f"{name}.{field.name}": value.numpy()
+        for name, own in named.items()
+        for field in fields(own)
+        if isinstance(value := getattr(own, field.name), Tensor)
+    }
+
+
+def _from_arrays(arrays: Arrays) -> tuple[Cameras, SparsePoints | None]:
+    parts: dict[str, dict[str, Tensor]] = {"cameras": {}, "points": {}}
+    for name, array in arrays.items():
+        part, _, field = name.partition(".")
+        parts[part][field] = torch.from_numpy(array)
+    cameras = Cameras(**parts["cameras"])  # type: ignore[arg-type]
+    return cameras, SparsePoints(**parts["points"]) if parts["points"] else None
 
 
 def at_width(scene: Scene, width: int, progress: Progress | None = None, cache: Path | None = None) -> Scene:

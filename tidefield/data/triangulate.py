@@ -7,28 +7,24 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from tidefield.data.cache import POINTS_SUFFIX, cache_folder, identity, key, make_room, open_folder
+from tidefield.data.cache import POINTS_SUFFIX, Arrays, cache_folder, identity, kept_arrays, key
 from tidefield.data.images import Progress
 from tidefield.data.pictures import read_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.sift import find_features
-from tidefield.errors import RunError
-from tidefield.files import completed_file
 from tidefield.geometry.cameras import project_with_slopes
 from tidefield.geometry.lenses import LensModel
 from tidefield.machine import cores
@@ -235,10 +231,16 @@ def find_points(
         root: of the scene, for messages.
         cache: a folder; the user's if not given.
     """
-    store = _store(posed, used, cache or cache_folder())
-    if store and store.is_file():
-        with suppress(ValueError, KeyError, EOFError, BadZipFile):  # damaged: they are found again
-            return _read(store)
+
+    def found() -> Arrays:
+        points = _found(posed, used, root, progress)
+        return {} if points is None else {field.name: getattr(points, field.name) for field in fields(points)}
+
+    arrays = kept_arrays(f"{_key(posed, used)}{POINTS_SUFFIX}", cache or cache_folder(), found)
+    return Observations(**arrays) if arrays else None
+
+
+def _found(posed: PosedPhotographs, used: Sequence[int], root: Path, progress: Progress | None) -> Observations | None:
     _log.info("%s has no sparse points: triangulating them from its photographs and poses", root)
     points = triangulate(posed, used, progress)
     if points is None:
@@ -252,20 +254,7 @@ def find_points(
     else:
         count, seen = len(points.xyz_world), len(points.uv_px)
         _log.info("%s: found %s points, each seen by %.1f photographs", root, f"{count:,}", seen / count)
-    if store:
-        _keep(points, store)
     return points
-
-
-def _store(posed: PosedPhotographs, used: Sequence[int], folder: Path | None) -> Path | None:
-    """Where points are kept; None without a folder that can be used, which `open_photographs` tells of."""
-    try:
-        if folder is not None:
-            open_folder(folder)
-            return folder / f"{_key(posed, used)}{POINTS_SUFFIX}"
-    except OSError as error:
-        _log.debug("the cache folder %s cannot be used (%s)", folder, error.strerror)
-    return None
 
 
 def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
@@ -273,24 +262,6 @@ def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
     files = [identity(path) for path in (*posed.paths, *posed.masks) if path is not None]
     lenses = [asdict(lens) for lens in posed.lenses]
     return key([_VERSION, files, lenses, posed.T_world_camera.tolist(), list(used)])
-
-
-def _read(store: Path) -> Observations | None:
-    with store.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-        points = Observations(**{name: arrays[name] for name in arrays.files}) if arrays.files else None
-    os.utime(store)
-    return points
-
-
-def _keep(points: Observations | None, store: Path) -> None:
-    """Write points, or that there are none, unless the cache cannot be used: then they are found again next time."""
-    arrays = {} if points is None else {field.name: getattr(points, field.name) for field in fields(points)}
-    try:
-        make_room(store.parent, sum(array.nbytes for array in arrays.values()))
-        with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
-            np.savez(file, **arrays)
-    except (OSError, RunError) as error:
-        _log.warning("the points cannot be kept for the next time: %s", error)
 
 
 def triangulate_again(
