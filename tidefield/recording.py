@@ -84,7 +84,9 @@ class Recorder(Generic[T, R]):
 
 
 def moved(inputs: T, device: torch.device) -> T:
-    """Return inputs on a device, without waiting for what it is at work on."""
+    """Return inputs from the processor on a device, without waiting for what it is at work on."""
+    if device.type == "cpu":
+        return inputs
     return map_tensors(inputs, lambda tensor: tensor.to(device, non_blocking=tensor.device.type == "cpu"))
 
 

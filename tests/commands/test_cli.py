@@ -196,14 +196,14 @@ def test_the_cache_of_photographs_is_shown_and_emptied(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     call("cache")
     assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 0 files, 0 MB of at most 20,000 MB\n"
-    for width in (32, 48):  # of files of 64, which are also read at 64
+    for width in (32, 48):  # of files of 64, which are also read at 64; what is estimated at each width is kept, too
         call("evaluate", scene, tmp_path / str(width), "--method", "nearest", "--width", width, "-q")
     (tmp_path / "tidefield" / "thesis.tex").touch()
     monkeypatch.setenv("TIDEFIELD_CACHE_GB", "0.5")
     call("cache")
-    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 3 files, 0 MB of at most 500 MB\n"
+    assert capsys.readouterr().out == f"{tmp_path / 'tidefield'}: 5 files, 0 MB of at most 500 MB\n"
     call("cache", "--clear")
-    assert capsys.readouterr().out.startswith("deleted: 3 files, 0 MB\n")
+    assert capsys.readouterr().out.startswith("deleted: 5 files, 0 MB\n")
     assert [path.name for path in (tmp_path / "tidefield").iterdir()] == ["thesis.tex"]
 
 

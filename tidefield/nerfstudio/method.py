@@ -35,6 +35,7 @@ from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, to_8_bit
 from tidefield.nerfstudio.data import PHOTOGRAPH, SceneOutputs, SceneParserConfig, pinholes, to_nerfstudio
+from tidefield.recording import moved
 from tidefield.render.camera_paths import free_camera
 from tidefield.train.checkpoint import given_or_shipped
 from tidefield.train.loop import ADAM, SceneTrainer
@@ -167,7 +168,7 @@ class TidefieldModel(Model):
         if not self.training:
             return self.get_outputs_for_camera(ray_bundle)
         self._render = None
-        loss, error = self.trainer.loss()
+        loss, error = self.trainer.loss(moved(self.trainer.draw(), self.trainer.device))
         return {"loss": loss, "error": error.detach()}
 
     @torch.no_grad()
