@@ -59,7 +59,7 @@ def connected(address: str) -> Iterator[Any]:
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise RunError(
             f"no Ray cluster answers at {address} ({error}): expected `auto` or an address such as 10.0.0.1:6379; "
-            "start one with `ray start --head`"
+            "start one with `ray start --head`, and set RAY_AUTH_MODE=token if it has a token"
         ) from error
     try:
         if in_main and before is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +18,8 @@ from tidefield.errors import RunError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tidefield.maps.make import Job, TileMaker
+    from tidefield.cluster import Share
+    from tidefield.maps.make import Job
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Map:
 
 def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
-    from tidefield.cluster import absolute, connected, done_on_cluster, share_of
+    from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
     from tidefield.maps.make import delete_tiles, make_map
     from tidefield.maps.rasters import need
@@ -84,7 +85,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             ray = stack.enter_context(connected(options.cluster))
             opened = partial(_tile_maker, absolute(options), job.key)
             share = share_of(ray, options.device, "core")
-            elsewhere = partial(done_on_cluster, ray, job.key, opened, share=share)
+            elsewhere = partial(_in_blocks, ray, job, opened, share)
         result = make_map(
             job, options.out, options.overwrite, about, lambda name: ProgressBar(console, name), elsewhere
         )
@@ -98,6 +99,15 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         found = result["check_points"]
         console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit)}", soft_wrap=True)
     return result
+
+
+def _in_blocks(ray: Any, job: Job, opened: Callable[..., Any], share: Share, numbers: list[int]) -> Iterator[int]:
+    """Make tiles on a cluster, some neighbours in a task; yields their numbers."""
+    from tidefield.cluster import done_on_cluster
+
+    workers = max(1, int(sum(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])))
+    for block in done_on_cluster(ray, job.key, opened, job.blocks(numbers, workers), share):
+        yield from block
 
 
 @contextmanager
@@ -133,7 +143,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]
 
 
 @contextmanager
-def _tile_maker(options: Map, key: str) -> Iterator[TileMaker]:
+def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], None]]:
     """Open a map in a worker of a cluster."""
     import torch
 
@@ -144,7 +154,7 @@ def _tile_maker(options: Map, key: str) -> Iterator[TileMaker]:
     torch.set_num_threads(1)  # a task has one core
     with _open(options, make_console(quiet=True)) as (job, _):
         require_same(options.source, key, job.key)
-        yield TileMaker(job, options.out)
+        yield TileMaker(job, options.out).block
 
 
 def _describe(found: dict[str, Any], unit: str) -> str:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -100,6 +101,20 @@ class Job:
         side = -(-(self.tile_side + 2 * MARGIN) // 32) * 32 - 2 * MARGIN
         return self.grid.tiles(side, MARGIN)
 
+    def blocks(self, numbers: Sequence[int], workers: int) -> list[tuple[int, ...]]:
+        """Group tiles, by their numbers, into square blocks, some for each worker.
+
+        Neighbouring tiles show the same photographs, which every worker encodes for itself.
+        """
+        side = min(LARGEST_BLOCK, max(1, math.isqrt(len(numbers) // (BLOCKS_EACH * workers))))
+        tiles, found = self.tiles(), dict[tuple[int, int], list[int]]()
+        for number in numbers:
+            tile = tiles[number]
+            step = side * (tile.side - 2 * tile.margin)
+            place = (tile.row + tile.margin) // step, (tile.column + tile.margin) // step
+            found.setdefault(place, []).append(number)
+        return [tuple(block) for block in found.values()]
+
     @property
     def key(self) -> str:
         """Identifies everything that the tiles depend on."""
@@ -109,6 +124,8 @@ class Job:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
+BLOCKS_EACH, LARGEST_BLOCK = 4, 8
+"""Blocks of tiles for each worker, so that none waits long for the last, and the most tiles along the side of one."""
 Elsewhere = Callable[[list[int]], Iterator[int]]
 """Makes tiles, given by their numbers among `Job.tiles`, by other processes; yields the number of each that is done."""
 
@@ -148,6 +165,12 @@ class TileMaker:
         """Make one tile, by its number, on one core."""
         tile = self._tiles[number]
         self._write(tile, self._match(tile))
+
+    def block(self, numbers: Sequence[int]) -> None:
+        """Make tiles one by one; those that a worker has made before it died are there."""
+        for number in numbers:
+            if not _file(self._folder, self._tiles[number]).exists():
+                self(number)
 
     def several(self, numbers: list[int]) -> Iterator[int]:
         """Make tiles, as many at a time as there are cores; yields their numbers."""
