@@ -104,10 +104,11 @@ class Renderer:
             prior: where its rays are sampled, on cells of its pixels (`depth_prior.surface_prior`); that of the scene's
                 points if not given.
         """
+        if prior is None:
+            return self._view(camera, self._points_surface(camera))
         side = self._rays_per_side(camera)
-        if prior is not None and side > 1:
-            prior = prior.repeat_interleave(side, 1).repeat_interleave(side, 2)
-        return render_with_rays(partial(self._render, cells=prior), camera, side)
+        cells = prior.repeat_interleave(side, 1).repeat_interleave(side, 2)
+        return render_with_rays(partial(self._render, cells=cells, match=False), camera, side)
 
     def in_turn(self, cameras: Cameras) -> Iterator[Rendering]:
         """Render the views of cameras, one after the other.
@@ -120,8 +121,11 @@ class Renderer:
                 surface = next_one.result()
                 if k + 1 < len(cameras):
                     next_one = pool.submit(self._points_surface, cameras[k + 1])
-                side = self._rays_per_side(cameras[k])
-                yield render_with_rays(partial(self._render, surface=surface), cameras[k], side)
+                yield self._view(cameras[k], surface)
+
+    def _view(self, camera: Cameras, surface: Float[Tensor, "3 h w"]) -> Rendering:
+        """Render the view of a camera, around the surface that photographs show near `_points_surface`."""
+        return render_with_rays(partial(self._render, cells=surface, match=True), camera, self._rays_per_side(camera))
 
     def _rays_per_side(self, camera: Cameras) -> int:
         return self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
@@ -133,18 +137,13 @@ class Renderer:
         return surface_prior(camera, scene.points, scene.cameras, scene.hull)
 
     @torch.inference_mode()
-    def _render(
-        self,
-        camera: Cameras,
-        cells: Float[Tensor, "3 h w"] | None = None,
-        surface: Float[Tensor, "3 h w"] | None = None,
-    ) -> Rendering:
+    def _render(self, camera: Cameras, cells: Float[Tensor, "3 h w"], match: bool) -> Rendering:
         """Render a view with a ray in each pixel.
 
         Args:
             camera: of the view.
-            cells: where its rays are sampled; found if not given.
-            surface: `_points_surface`, if it is known already.
+            cells: where its rays are sampled.
+            match: match photographs first, where the network asks for it, starting from the cells.
         """
         scene = self.scene
         sources = scene.sources(camera)
@@ -153,14 +152,7 @@ class Renderer:
                 f"{scene.root} has no training photograph besides the camera's own: expected another to render its "
                 "view from; add photographs"
             )
-        if cells is None:
-            if surface is None:
-                surface = surface_prior(camera, scene.points, scene.cameras, scene.hull)
-            prior = DepthPrior(surface)
-            if self.matcher is not None:
-                prior = self.matcher(camera, prior.cells)
-        else:
-            prior = DepthPrior(cells)
+        prior = self.matcher(camera, cells) if match and self.matcher is not None else DepthPrior(cells)
         columns, rows = (-(-x // TILE_PX) for x in (camera.width, camera.height))
         picture = torch.empty(rows * TILE_PX, columns * TILE_PX, 6, device=self.device)
         for top in range(0, rows, BLOCK_TILES):
