@@ -62,6 +62,8 @@ def measure_cluster(
         RunError: the survey is too small, a command failed, or a map differs from another one.
     """
     square, tiles = _square(scene_folder, work, metres, cell)
+    if kills > max(0, tiles - 3):
+        raise RunError(f"--kills {kills} was asked for, of {tiles} tiles: expected at most {max(0, tiles - 3)}")
     options = [scene_folder, "--zero-shot", "--device", "cpu", "--gsd", cell, "--area", square, "--quiet"]
     record: dict[str, Any] = read_json(runs / CLUSTER_FILE) or {}
     made: dict[str, Any] = record.get("maps", {})
@@ -141,7 +143,7 @@ def _rendered_by_workers(camera: Cameras) -> Rendering:
 
 def _moments(tiles: int, count: int, random_: random.Random) -> list[int]:
     """Numbers of finished tiles after which a worker is killed."""
-    return sorted(random_.sample(range(1, max(2, tiles - 2)), count))
+    return sorted(random_.sample(range(1, tiles - 2), count))
 
 
 @contextmanager

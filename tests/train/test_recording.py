@@ -66,7 +66,7 @@ def test_what_a_loss_computes_can_be_recorded(tmp_path: Path, monkeypatch: pytes
 
 
 def test_values_that_decide_are_found() -> None:
-    with OnOneDevice(), pytest.raises((AssertionError, RuntimeError, NotImplementedError)):
+    with OnOneDevice(), pytest.raises(RuntimeError, match="meta"):
         torch.ones(3, device="meta").max().item()
     with OnOneDevice(), pytest.raises(AssertionError, match="on the cpu"):
         torch.ones(3).to("meta")

@@ -175,7 +175,7 @@ class NerfTrainer(Trainer):
             network = Nerf(config)
         network.cover(scene.cameras[list(scene.train)])
         super().__init__(network.to(device), config.learning_rate, scene, seed, device, {})
-        self.config, self.nerf = config, network
+        self.config, self.nerf, self.cameras = config, network, scene.cameras.to(device)
 
     @property
     def rays_per_step(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -141,13 +140,16 @@ def load_scene(
     pinholes = tuple(_pinhole(file) for file in files)
     background = posed.background_rgb or _WHITE
     photographs = open_photographs(files, background, progress, cache)
-    estimate = partial(_estimate, posed, T_world_camera, origin, pinholes, photographs, train, calibrate)
     points = [] if posed.points is None else [getattr(posed.points, field.name) for field in fields(posed.points)]
     read = [T_world_camera, posed.near_far, posed.divided_by, *points]
     hashes = [None if array is None else array_hash(array) for array in read]
     lenses = [asdict(lens) for lens in posed.lenses]
     depends_on = [code_hash(), photographs_key(files, background), lenses, hashes, train, calibrate]
-    arrays = kept_arrays(f"{key(depends_on)}{ESTIMATES_SUFFIX}", cache or cache_folder(), lambda: _arrays(*estimate()))
+
+    def estimated() -> Arrays:
+        return _arrays(*_estimate(posed, T_world_camera, origin, pinholes, photographs, train, calibrate))
+
+    arrays = kept_arrays(f"{key(depends_on)}{ESTIMATES_SUFFIX}", cache or cache_folder(), estimated)
     cameras, sparse = _from_arrays(arrays)
     transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
     return Scene(

@@ -205,6 +205,7 @@ class Cameras:
         x, y = sides
         assert self.shading is not None, "there is no shading"
         table = x.new_zeros(len(self), SHADING_DEGREE + 1, SHADING_DEGREE + 1, 3)
+        # One by one: an index of several is a tensor of the processor's, which cannot be recorded (`recording`).
         for coefficient, (of_x, of_y) in zip(self.shading.unbind(1), _exponents(SHADING_DEGREE), strict=True):
             table[:, of_y, of_x] = coefficient
         # Two products: where opt_einsum is installed, einsum takes longer to look for an order of three than for this.

@@ -214,7 +214,7 @@ def maps_from_images(
 
 
 def _sizes(count: int, width: int, height: int, device: torch.device) -> Int[Tensor, "K 2"]:
-    """Filled in on the device: a copy from the processor cannot be recorded (`train.recording`)."""
+    """Filled in on the device: a copy from the processor cannot be recorded (`recording`)."""
     size = torch.full((count, 2), height, device=device)
     size[:, 0] = width
     return size

@@ -85,7 +85,6 @@ class Trainer(ABC):
         fused = True if device.type == "cuda" else None
         self.optimizer = torch.optim.Adam(network.parameters(), fused=fused, **adam)
         self.progress = TrainingProgress()
-        self.cameras = scene.cameras.to(device)
 
     is_main_process = True
     """Whether this process writes what is learned: one of several that train together does."""
