@@ -90,3 +90,34 @@ def test_nohup_keeps_its_meaning():
     code = "import signal, os; from tidefield import cli; cli._run = lambda _: os.kill(os.getpid(), signal.SIGHUP)"
     ignore = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); {code}; cli.main()"
     assert subprocess.run([sys.executable, "-c", ignore], cwd=ROOT, check=False).returncode == 0
+
+
+INTERRUPTED = """
+import multiprocessing.util as util, signal
+from tidefield.processes import Ended, ended_by_signals, worker_processes
+
+spawn = util.spawnv_passfds
+
+def spawn_and_interrupt(*given):
+    number = spawn(*given)
+    if "spawn_main" in str(given):
+        signal.raise_signal(signal.SIGTERM)
+    return number
+
+if __name__ == "__main__":
+    util.spawnv_passfds = spawn_and_interrupt
+    try:
+        with ended_by_signals(), worker_processes(2) as pool:
+            print("worked", pool.submit(int).result())
+    except Ended:
+        print("ended")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are spawned otherwise")
+def test_a_signal_waits_until_the_workers_have_been_started(tmp_path: Path):
+    program = tmp_path / "program.py"
+    program.write_text(INTERRUPTED)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr, done.returncode) == ("ended\n", "", 0)

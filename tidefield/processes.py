@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -58,6 +58,18 @@ def ended_by_signals() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def delayed_signals() -> Iterator[None]:
+    """Handle signals that would end the command when the block has ended; for the main thread, in others nothing."""
+    arrived: list[int] = []
+    with ExitStack() as stack:
+        if threading.current_thread() is threading.main_thread():
+            stack.enter_context(handled(lambda number, frame: arrived.append(number), signal.SIGINT, *STOPPING))
+        yield
+    for number in arrived:
+        signal.raise_signal(number)
+
+
 def restore_sigterm() -> None:
     """Put back the handler that the import of pycolmap replaced by one that prints its stack."""
     if threading.current_thread() is threading.main_thread():
@@ -97,6 +109,10 @@ def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterato
     """
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), start_worker, initializers)
     try:
+        # The first task starts all processes. One whose start is interrupted waits in vain for what it is to run, and
+        # is not among the children yet.
+        with delayed_signals():
+            pool.submit(int)
         yield pool
     except BaseException:
         for process in multiprocessing.active_children():
