@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from tidefield.data.load import load_scene
-from tidefield.maps.grid import Grid, map_frame
+from tidefield.geometry.cameras import Cameras
+from tidefield.maps import surface
+from tidefield.maps.grid import Grid, Tile, map_frame
 from tidefield.maps.stereo import Rectified, choose_pairs, fill_from_nearest, stereo_heights
-from tidefield.maps.surface import COARSEST, GreyPhotographs, choose_views, sparse_surface
+from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
 
 pytest.importorskip("rasterio")
@@ -73,6 +77,28 @@ def test_heights_are_those_of_the_flat(scene):
     assert not choose_pairs(
         choice.views[:2], np.ones((2, 4), bool), np.zeros((2, 4)), choice.views[0].position[2] - 1e-3
     )
+
+
+def test_cells_are_projected_into_the_photographs_above_them_only(scene, monkeypatch: pytest.MonkeyPatch):
+    loaded, _ = scene
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    start = sparse_surface(loaded, grid.coarser(COARSEST))
+    before = choose_views(tile, loaded, start)
+    pose = loaded.cameras.T_world_camera.clone()
+    away = before.indices[::2]
+    pose[away, 0, 3] += 1000.0
+    moved = replace(loaded, cameras=replace(loaded.cameras, T_world_camera=pose))
+    projected = []
+
+    class Counted(View):
+        def __init__(self, camera: Cameras, tile: Tile) -> None:
+            projected.append(camera)
+            super().__init__(camera, tile)
+
+    monkeypatch.setattr(surface, "View", Counted)
+    assert choose_views(tile, moved, start).indices == before.indices[1::2]
+    assert len(projected) == len(loaded.names) - len(away)
 
 
 def test_holes_have_the_nearest_height():

@@ -214,7 +214,7 @@ def ground_sampling_distance(scene: Scene) -> float:
         )
     points = scene.points.xyz_world[:: max(1, len(scene.points.xyz_world) // 4000)]
     each = []
-    for index in range(len(scene.names)):
+    for index in range(0, len(scene.names), max(1, len(scene.names) // 500)):
         camera = scene.cameras[index]
         uv, z = camera.project(points)
         inside = (z[0] > 0) & (uv[0] > 0).all(-1) & (uv[0] < camera.size_px[0]).all(-1)
@@ -296,10 +296,11 @@ def _seen_bounds(frame: MapFrame, scene: Scene) -> tuple[float, float, float, fl
     ground = torch.from_numpy(frame.to_scene(places)).float()
     count = np.zeros(len(places), int)
     for index in range(len(scene.names)):
+        near = np.flatnonzero(np.hypot(*(places[:, :2] - position[index, :2]).T) <= reach)
         camera = scene.cameras[index]
-        uv, z = camera.project(ground)
-        inside = ((z[0] > 0) & (uv[0] > 0).all(-1) & (uv[0] < camera.size_px[0]).all(-1)).numpy()
-        count += inside & (np.linalg.norm(places[:, :2] - position[index, :2], axis=1) <= reach)
+        uv, z = camera.project(ground[near])
+        inside = (z[0] > 0) & (uv[0] > 0).all(-1) & (uv[0] < camera.size_px[0]).all(-1)
+        count[near[inside.numpy()]] += 1
     seen = places[count >= 2, :2]
     if len(seen):
         low, high = np.minimum(low, seen.min(0)), np.maximum(high, seen.max(0))

@@ -20,12 +20,13 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 from scipy.spatial import KDTree
 
 from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER
@@ -185,6 +186,20 @@ def _agree(xyz: Float[np.ndarray, "N 3"], neighbours: int = 16, spreads: float =
     return np.abs(xyz[:, 2] - median) <= spreads * np.maximum(spread, np.median(spread))
 
 
+def positions_from(tile: Tile, cameras: Cameras) -> Float64[np.ndarray, "V 3"]:
+    """East, north (horizontal units) and height above `Grid.height` of cameras, from the middle of a tile."""
+    affine = tile.affine()
+    away = cameras.T_world_camera[:, :, 3].double().numpy() - affine[:, 3]
+    return away @ np.linalg.inv(affine[:, :3]).T
+
+
+def _above(position: np.ndarray, east: np.ndarray, north: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, "*shape"]:
+    """Whether a camera stands within `STEEPEST_DEG` from the vertical above cells; the shapes broadcast."""
+    above = position[2] - height
+    across = (position[0] - east) ** 2 + (position[1] - north) ** 2
+    return (above > 0) & (across <= (math.tan(math.radians(STEEPEST_DEG)) * above) ** 2)
+
+
 class View:
     """One photograph's projection of a tile's cells.
 
@@ -194,10 +209,7 @@ class View:
     """
 
     def __init__(self, camera: Cameras, tile: Tile) -> None:
-        matrix = camera.projection[0].double().numpy()
         affine = tile.affine()
-        self.matrix = matrix[:, :3] @ affine
-        self.matrix[:, 3] += matrix[:, 3]
         # Exact positions in double precision: single precision would cost a hundredth of a pixel.
         pose = camera.T_world_camera[0].double().numpy()
         rotation = pose[:, :3].T
@@ -208,12 +220,14 @@ class View:
         self.matrix = (k @ rotation @ there).astype(np.float64)
         self.size = camera.width, camera.height
         self.camera = camera
-        uv = torch.tensor([[[*(self.matrix[:2, 3] / self.matrix[2, 3])]]]).float()
-        self.gain = float(camera.gain_at(uv).mean())
-        """Of the photograph where it shows the middle of the tile."""
-        inverse = np.linalg.inv(affine[:, :3])
-        self.position = inverse @ (pose[:, 3] - affine[:, 3])
+        self.position = positions_from(tile, camera)[0]
         """East, north and height above `Grid.height` of the photograph, from the middle of the tile."""
+
+    @cached_property
+    def gain(self) -> float:
+        """Of the photograph where it shows the middle of the tile."""
+        uv = torch.tensor([[[*(self.matrix[:2, 3] / self.matrix[2, 3])]]]).float()
+        return float(self.camera.gain_at(uv).mean())
 
     def base(self, east: np.ndarray, north: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Homogeneous pixels (3 x H x W) of cells at heights above `Grid.height`."""
@@ -245,9 +259,7 @@ class View:
         width, tall = self.size
         b = BORDER_PX
         inside = (z > 0) & (u > b) & (v > b) & (u < width - b) & (v < tall - b)
-        above = self.position[2] - height
-        across = (self.position[0] - east) ** 2 + (self.position[1] - north) ** 2
-        return inside & (above > 0) & (across <= (math.tan(math.radians(STEEPEST_DEG)) * above) ** 2)
+        return inside & _above(self.position, east, north, height)
 
     def rank(self, u: np.ndarray, v: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """How well cells are seen, as a network's neighbours of a view straight down are ranked (`data.neighbours`)."""
@@ -285,7 +297,9 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
     east, north = np.meshgrid(along * tile.grid.cell, -along * tile.grid.cell)
     height = start.on(tile, 0)[np.ix_(at, at)] - np.float32(tile.grid.height)
     views, indices, seen, direction = [], [], [], []
-    for index in range(len(scene.names)):
+    # Projecting the cells into each of thousands of photographs would take most of a tile's time.
+    near = _above(positions_from(tile, scene.cameras).T[..., None, None], east, north, height).any((1, 2))
+    for index in np.flatnonzero(near).tolist():
         view = View(scene.cameras[index], tile)
         u, v, z = view.pixels(east, north, height)
         sees = view.sees(u, v, z, height, east, north)
