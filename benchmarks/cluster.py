@@ -37,8 +37,8 @@ from tidefield.processes import end_with_parent
 CLUSTER_FILE = "cluster.json"
 HOST, PORT = "127.0.0.1", 6399
 START_SECONDS, PAUSE_SECONDS = 60.0, 0.1
-WORKER = b"ray::_work"
-"""Begins the command line of a process that works on a tile."""
+WORKER = b"ray::_each"
+"""Begins the command line of a process that works on tiles."""
 COMPARED = (".tif", ".laz", ".geojson")
 """Suffixes of a map's files that hold no dates."""
 

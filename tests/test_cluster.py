@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from tidefield.cluster import Share, connected, on_cluster, share_of
+from tidefield.cluster import Share, connected, each_on_cluster, on_cluster, share_of
 from tidefield.commands.common import ZeroShot, open_zero_shot
 from tidefield.commands.render import Render, _frames_of_cluster, _key
 from tidefield.compare.run import Settings, scene_runner
@@ -131,6 +131,54 @@ def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path
     assert len(killed) == 3
     attempts = sum(len(path.read_text().split()) for path in tmp_path.glob("attempts *"))
     assert attempts == 10 + 3
+
+
+def test_an_item_of_a_group_comes_when_it_is_done(address, tmp_path: Path):
+    @contextmanager
+    def prepare():
+        def work(group):
+            for item in group:
+                while item and not (tmp_path / f"got {item - 1}").exists():
+                    time.sleep(0.05)
+                yield item
+
+        yield work
+
+    found = []
+    for item in each_on_cluster(ray, "groups", prepare, [(0, 1), (2, 3)]):
+        (tmp_path / f"got {item}").touch()
+        found.append(item)
+    assert found == [0, 1, 2, 3]
+
+
+def test_a_killed_worker_s_group_goes_on_where_it_was(address, tmp_path: Path):
+    @contextmanager
+    def prepare():
+        def work(group):
+            for item in group:
+                made = tmp_path / str(item)
+                if item % 2 and not made.exists():
+                    made.touch()
+                    os.kill(os.getpid(), signal.SIGKILL)
+                yield item
+
+        yield work
+
+    assert sorted(each_on_cluster(ray, "killed groups", prepare, [(0, 1, 2), (3, 4), (5,)])) == list(range(6))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "3", "5"]
+
+
+def test_an_error_within_a_group_is_raised_as_it_is(address):
+    @contextmanager
+    def prepare():
+        def work(group):
+            yield group[0]
+            raise RunError(f"{group[1]} is wrong: expected another; choose one")
+
+        yield work
+
+    with pytest.raises(RunError, match="7 is wrong"):
+        list(each_on_cluster(ray, "wrong groups", prepare, [(6, 7)]))
 
 
 def tidefield(folder: Path, *words: object) -> None:

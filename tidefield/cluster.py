@@ -6,6 +6,7 @@ loads a network), and works on as many items as it gets.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -13,12 +14,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, no_type_check
 
 from tidefield.errors import RunError
 from tidefield.machine import cores
 
+log = logging.getLogger(__name__)
+
 Item = TypeVar("Item")
+Group = TypeVar("Group")
 Options = TypeVar("Options")
 Work = Callable[[Any], Any]
 RETRIES = 20
@@ -47,15 +51,19 @@ def connected(address: str) -> Iterator[Any]:
             "--cluster needs Ray, which is not installed: expected the extra; pip install 'tidefield[cluster]'"
         ) from error
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's default from its next version on
+    # Where a cluster was found is none of a user's business, and --quiet leaves out warnings, too.
+    level = max(logging.WARNING, log.getEffectiveLevel())
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     try:
         try:
-            ray.init(address=address, log_to_driver=False)
+            ray.init(address=address, log_to_driver=False, logging_level=level)
         except ConnectionError:
             if address != "auto":
                 raise
-            ray.init(address="local", num_cpus=cores(), include_dashboard=False, log_to_driver=False)
+            ray.init(
+                address="local", num_cpus=cores(), include_dashboard=False, log_to_driver=False, logging_level=level
+            )
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise RunError(
             f"no Ray cluster answers at {address} ({error}): expected `auto` or an address such as 10.0.0.1:6379; "
@@ -115,16 +123,49 @@ def on_cluster(
     while waiting:
         done = next(iter(waiting)) if in_order else ray.wait(list(waiting), num_returns=1)[0][0]
         item = waiting.pop(done)
+        yield item, _made(ray, done, item)
+
+
+def each_on_cluster(
+    ray: Any,
+    key: str,
+    prepare: Callable[[], AbstractContextManager[Callable[[Any], Iterator[Any]]]],
+    groups: Sequence[Group],
+    share: Share = Share(),
+) -> Iterator[Any]:
+    """Work on groups of items as tasks of a cluster; yields what is made of each item when it is done.
+
+    Args:
+        ray, key, share: as of `on_cluster`.
+        prepare: opens a function that works on a group and yields what it makes of each item. It is called again, and
+            has to yield the same again, for the group of a worker that dies.
+
+    Raises:
+        RunError: as of `on_cluster`.
+    """
+    task = ray.remote(num_cpus=share.cores, num_gpus=share.gpus, max_retries=RETRIES, num_returns="streaming")(_each)
+    shared = ray.put(prepare)
+    waiting = {task.remote(key, shared, group): group for group in groups}
+    while waiting:
+        made = ray.wait(list(waiting), num_returns=1)[0][0]
         try:
-            made = ray.get(done)
-        except ray.exceptions.RayTaskError as error:
-            raise error.cause from error
-        except ray.exceptions.RayError as error:
-            raise RunError(
-                f"workers of the cluster died {RETRIES + 1} times with {item} ({type(error).__name__}): expected them "
-                "to go on, with memory enough for it; repeat the command, which continues from there"
-            ) from error
-        yield item, made
+            one = next(made)
+        except StopIteration:
+            del waiting[made]
+        else:
+            yield _made(ray, one, waiting[made])
+
+
+def _made(ray: Any, reference: Any, item: object) -> Any:
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    except ray.exceptions.RayError as error:
+        raise RunError(
+            f"workers of the cluster died {RETRIES + 1} times with {item} ({type(error).__name__}): expected them "
+            "to go on, with memory enough for it; repeat the command, which continues from there"
+        ) from error
 
 
 def done_on_cluster(
@@ -150,6 +191,11 @@ def _work(key: str, prepare: Callable[[], AbstractContextManager[Work]], item: A
         _OPEN.close()
         _READY[key] = _OPEN.enter_context(prepare())
     return _READY[key](item)
+
+
+@no_type_check  # Ray wants a generator function, and not what checks one in the tests
+def _each(key: str, prepare: Callable[[], AbstractContextManager[Work]], group: Any) -> Iterator[Any]:
+    yield from _work(key, prepare, group)
 
 
 def require_same(source: Path, key: str, own_key: str) -> None:

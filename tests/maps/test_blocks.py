@@ -45,5 +45,5 @@ def test_a_worker_makes_what_another_has_not_finished(tmp_path, monkeypatch: pyt
         def __init__(self) -> None:
             self.__dict__.update(vars(maker))
 
-    Maker().block([0, 1, 2])
+    assert list(Maker().block([0, 1, 2])) == [0, 1, 2]
     assert made == [0, 2]

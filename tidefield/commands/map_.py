@@ -103,11 +103,10 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
 
 def _in_blocks(ray: Any, job: Job, opened: Callable[..., Any], share: Share, numbers: list[int]) -> Iterator[int]:
     """Make tiles on a cluster, some neighbours in a task; yields their numbers."""
-    from tidefield.cluster import done_on_cluster
+    from tidefield.cluster import each_on_cluster
 
     workers = max(1, int(sum(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])))
-    for block in done_on_cluster(ray, job.key, opened, job.blocks(numbers, workers), share):
-        yield from block
+    yield from each_on_cluster(ray, job.key, opened, job.blocks(numbers, workers), share)
 
 
 @contextmanager
@@ -143,7 +142,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]
 
 
 @contextmanager
-def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], None]]:
+def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], Iterator[int]]]:
     """Open a map in a worker of a cluster."""
     import torch
 

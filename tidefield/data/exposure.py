@@ -84,25 +84,6 @@ def estimate_gains(
     return torch.as_tensor(np.exp(gains - gains[learned].mean(0)), dtype=torch.float32)
 
 
-def disagreement(
-    photographs: Photographs, points: SparsePoints, which: Sequence[int], gains: Float[Tensor, "V 3"]
-) -> tuple[float, float]:
-    """Measure how much photographs differ in the colour of the points they share, after division by their gains.
-
-    Returns:
-        Root-mean-square of the log residuals (0.05 is 5% of a pixel's value), and 1.4826 times the median of their
-        magnitudes, which outliers such as moving water do not move. NaN where no two photographs share a point.
-    """
-    seen = observe(photographs, points, which)
-    if not len(seen.value):
-        return float("nan"), float("nan")
-    residual = seen.centred(seen.value - np.log(gains.double().cpu().numpy())[seen.photograph])
-    # A mean of n values follows them: without this factor a point seen twice would look twice as consistent.
-    sharing = np.bincount(seen.point)[seen.point]
-    residual *= np.sqrt(sharing / (sharing - 1))[:, None]
-    return float(np.sqrt((residual**2).mean())), float(1.4826 * np.median(np.abs(residual)))
-
-
 @dataclass(frozen=True)
 class Seen:
     """O usable observations of points that at least two photographs share.

@@ -166,11 +166,12 @@ class TileMaker:
         tile = self._tiles[number]
         self._write(tile, self._match(tile))
 
-    def block(self, numbers: Sequence[int]) -> None:
-        """Make tiles one by one; those that a worker has made before it died are there."""
+    def block(self, numbers: Sequence[int]) -> Iterator[int]:
+        """Make tiles one by one; yields their numbers. Those that a worker has made before it died are there."""
         for number in numbers:
             if not _file(self._folder, self._tiles[number]).exists():
                 self(number)
+            yield number
 
     def several(self, numbers: list[int]) -> Iterator[int]:
         """Make tiles, as many at a time as there are cores; yields their numbers."""
