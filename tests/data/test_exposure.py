@@ -108,6 +108,26 @@ def test_gains_remove_the_disagreement_of_photographs():
     assert after < 0.01
 
 
+def test_ways_of_looking_do_not_add_up_from_photograph_to_photograph():
+    """The side towards the sun is brighter in every photograph of a long strip, and light changes now and then."""
+    count, each, random = 400, 60, np.random.default_rng(7)
+    photograph = np.repeat(np.arange(count), each)
+    point = (photograph * 20 + random.integers(0, 100, count * each)).astype(np.int64)
+    ahead = point / 20 - photograph - 2.5  # of -2.5 to 2.5 photographs
+    truth = 0.2 * np.sin(np.arange(count))
+    albedo = random.normal(0, 0.3, point.max() + 1)
+    value = (albedo[point] + truth[photograph] + 0.01 * ahead + random.normal(0, 0.01, len(point)))[:, None]
+    seen = exposure.Seen(np.repeat(value, 3, 1), point, photograph, np.arange(len(point)))
+    position = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float64)
+    order = np.arange(count)
+    error = exposure._solve(seen, np.zeros(count), order.astype(np.float64), position, order)[:, 0] - truth
+    slope = np.polyfit(order, error, 1)[0]
+    assert abs(slope) < 0.01 / 20
+    assert np.sqrt((np.diff(error) ** 2).mean()) < 0.01
+    alone = exposure.robust_gains(seen, np.zeros(count))[0][:, 0] - truth
+    assert abs(np.polyfit(order, alone, 1)[0]) > 0.01 / 2  # what the overlaps say
+
+
 def test_a_held_out_photograph_is_predicted_by_its_neighbours():
     truth = planted()
     photographs, cameras, points = survey(truth)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from scipy import sparse
 
-from tidefield.data.exposure import ITERATIONS, LOOSE, Seen, huber_weights, observe, robust_gains, weighted_gains
+from tidefield.data.exposure import ITERATIONS, Seen, held, huber_weights, observe, robust_gains, weighted_gains
 from tidefield.data.scene import Scene
 
 HELPS = 0.97
@@ -74,7 +74,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
     scores = np.zeros((2, 3))
     for k, (own, other) in enumerate((halves, halves[::-1])):
-        gains = robust_gains(own[0], np.zeros(count))[0]
+        gains = _gains(own[0], count)
         both = _gains_and_falloff(*own, lens, count)
         scores[k] = [_spread(*other, g, f, lens) for g, f in ((nothing, nothing), (gains, nothing), both)]
     before, alone, after = scores.mean(0)
@@ -85,7 +85,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     darkens = (falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
     sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
     if not sees:
-        gains, falloff = robust_gains(seen, np.zeros(count))[0], np.zeros_like(falloff)
+        gains, falloff = _gains(seen, count), np.zeros_like(falloff)
     gain = np.exp(gains - gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
     gain[list(scene.test)] = 1.0
     return ExposureCorrection(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
@@ -118,6 +118,11 @@ def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
     return replace(seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row")})
 
 
+def _gains(seen: Seen, count: int) -> Float64[np.ndarray, "V 3"]:
+    """Estimate log gains alone."""
+    return robust_gains(seen, np.zeros(count), prior_weight=held(seen, count))[0]
+
+
 def _gains_and_falloff(
     seen: Seen, power: Float64[np.ndarray, "O 3"], lens: Int64[np.ndarray, " V"], count: int
 ) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "L 3"]]:
@@ -128,12 +133,12 @@ def _gains_and_falloff(
     """
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
     terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)
-    loose, nothing = sparse.diags_array(np.full(count, LOOSE)), np.zeros(count)
+    as_taken, nothing = sparse.diags_array(held(seen, count)), np.zeros(count)
     weight = np.ones(len(seen.value))
     gains, falloff = np.zeros((count, 3)), np.zeros(3 * lenses)
     for _ in range(ITERATIONS):
         values = np.concatenate([seen.value, terms], axis=1)
-        fitted = weighted_gains(seen, values, weight, loose, nothing)
+        fitted = weighted_gains(seen, values, weight, as_taken, nothing)
         rest = seen.centred(values - fitted[seen.photograph], weight)
         root = np.sqrt(weight)[:, None]
         x, y = root * rest[:, 3:], root[:, 0] * rest[:, :3].mean(1)
