@@ -31,7 +31,7 @@ MAP = "map"
 TRAIN = "train"
 TRAINED_STEPS = 100
 FULL_MEGAPIXELS = 25
-"""Of all photographs together, from which on memory for their features is full (`model.cache.BUDGET_BYTES`)."""
+"""Of all photographs together, from which on memory for their features is full (`model.cache.LEAST_BYTES`)."""
 REDUCED_MEGAPIXELS = FeatureOptions().side_px ** 2 * 3 / 4 / 1e6
 """Of photographs of 4 : 3 as `prepare` looks for features in them."""
 GROUND_SHARE = (1 - 0.8) * (1 - 0.7)
@@ -370,7 +370,8 @@ def write_page(runs: Path, out: Path) -> None:
         "at 10 cm. `prepare` and training run on one machine; only maps are shared among several. Training takes the "
         "time it is given: 10 minutes, 1 and 10 hours for the coasts. Of memory, `prepare` needs that of a photograph "
         "for each core and something of every photograph; training and maps need that of a photograph, and keep "
-        f"features of photographs, until their memory is full ({FULL_MEGAPIXELS} megapixels in all). "
+        f"features of photographs, until their memory is full ({FULL_MEGAPIXELS} megapixels in all, on machines of "
+        "more than 15 GB more). "
         "GPUs: " + _gpus(measured),
         "## The model",
         stage_table(model).markdown(),

@@ -23,6 +23,20 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
+CONTAINER_LIMITS = tuple(Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory/memory.limit_in_bytes"))
+"""Files of Linux's control groups, of both versions, with the limit of a container's memory."""
+UNKNOWN_MEMORY = 8_000_000_000
+"""Assumed where the system does not say: Python has no such call on Windows."""
+
+
+def memory_bytes() -> int:
+    """Memory that this process may use: the machine's, or the limit of its container."""
+    known = hasattr(os, "sysconf")
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if known else UNKNOWN_MEMORY
+    limits = [path.read_text().strip() for path in CONTAINER_LIMITS if path.exists()]
+    return min([total, *(int(limit) for limit in limits if limit.isdigit())])
+
+
 def tune_process() -> None:
     """Set up threads and memory for training; call before torch is imported.
 
@@ -50,7 +64,7 @@ def describe() -> dict[str, Any]:
         "machine": {
             "processor": _processor(),
             "cores": cores(),
-            "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+            "memory_bytes": memory_bytes(),
             "system": f"{platform.system()} {platform.machine()}",
             "python": platform.python_version(),
             "torch": version("torch"),

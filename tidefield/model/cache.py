@@ -21,6 +21,7 @@ from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.machine import cores, memory_bytes
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
 from tidefield.parallel import in_parallel
@@ -30,8 +31,9 @@ BLOCK_PX = 512
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
-BUDGET_BYTES = 1_500_000_000
-"""Memory for features."""
+MEMORY_SHARE, LEAST_BYTES = 0.1, 1_500_000_000
+"""Memory for features: this share of the device's, or this much. Views of large photographs need more than the latter:
+what does not fit is encoded again for every view."""
 ENCODED_AT_ONCE = 4
 """Blocks that are encoded at the same time, each on one core: several times as fast as one after the other on all
 cores. More would take more memory."""
@@ -46,6 +48,15 @@ class Block(NamedTuple):
     row: int
 
 
+def memory_for_features(device: torch.device) -> int:
+    """Bytes for the features that one process keeps: of a machine's memory, it has the part of its threads."""
+    if device.type == "cuda":
+        total = torch.cuda.get_device_properties(device).total_memory
+    else:
+        total = memory_bytes() * min(1.0, torch.get_num_threads() / cores())
+    return max(LEAST_BYTES, int(MEMORY_SHARE * total))
+
+
 class CacheFull(Exception):
     """More blocks were asked for at once than the cache holds."""
 
@@ -58,7 +69,8 @@ class FeatureCache:
         scene: the photographs.
         device: where features are computed and kept.
         cones: read photographs at the size that a view shows them in, not at the scene's own (`data.pyramid`).
-        budget_bytes: memory for features; a few blocks are kept even if they need more.
+        budget_bytes: memory for features, `memory_for_features` if not given; a few blocks are kept even if they need
+            more.
     """
 
     def __init__(
@@ -67,9 +79,10 @@ class FeatureCache:
         scene: Scene,
         device: torch.device,
         cones: bool = True,
-        budget_bytes: int = BUDGET_BYTES,
+        budget_bytes: int | None = None,
     ) -> None:
-        self.network, self.scene, self.device, self.budget_bytes = network, scene, device, budget_bytes
+        self.network, self.scene, self.device = network, scene, device
+        self.budget_bytes = memory_for_features(device) if budget_bytes is None else budget_bytes
         self.pyramid = Pyramid(scene)
         self._cones = cones
         self._reading = threading.Lock()

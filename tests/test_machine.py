@@ -1,0 +1,30 @@
+"""What a process may use of its machine."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from tidefield import machine
+from tidefield.machine import memory_bytes
+from tidefield.model.cache import LEAST_BYTES, MEMORY_SHARE, memory_for_features
+
+
+@pytest.mark.skipif(not hasattr(os, "sysconf"), reason="the system does not say")
+def test_memory_is_the_machine_s_or_its_container_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(machine, "CONTAINER_LIMITS", (tmp_path / "none", limit))
+    own = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert memory_bytes() == own
+    for text, expected in (("max\n", own), (f"{own // 3}\n", own // 3), (f"{3 * own}\n", own)):
+        limit.write_text(text)
+        assert memory_bytes() == expected
+
+
+def test_features_have_a_share_of_the_memory_and_workers_of_one_core_a_part_of_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tidefield.model.cache.memory_bytes", lambda: 64_000_000_000)
+    monkeypatch.setattr("tidefield.model.cache.cores", lambda: 16)
+    for threads, expected in ((16, MEMORY_SHARE * 64e9), (8, MEMORY_SHARE * 32e9), (1, LEAST_BYTES), (32, 6.4e9)):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        assert memory_for_features(torch.device("cpu")) == expected
