@@ -371,7 +371,7 @@ def write_page(runs: Path, out: Path) -> None:
         "time it is given: 10 minutes, 1 and 10 hours for the coasts. Of memory, `prepare` needs that of a photograph "
         "for each core and something of every photograph; training and maps need that of a photograph, and keep "
         f"features of photographs, until their memory is full ({FULL_MEGAPIXELS} megapixels in all, on machines of "
-        "more than 15 GB more). "
+        "more than 19 GB more). "
         "GPUs: " + _gpus(measured),
         "## The model",
         stage_table(model).markdown(),

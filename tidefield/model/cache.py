@@ -31,7 +31,7 @@ BLOCK_PX = 512
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
-MEMORY_SHARE, LEAST_BYTES = 0.1, 1_500_000_000
+MEMORY_SHARE, LEAST_BYTES = 0.08, 1_500_000_000
 """Memory for features: this share of the device's, or this much. Views of large photographs need more than the latter:
 what does not fit is encoded again for every view."""
 ENCODED_AT_ONCE = 4
