@@ -18,6 +18,7 @@ TARGET = 3
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feature_cache, "BLOCK_PX", 64)
+    monkeypatch.setattr(feature_cache, "WHOLE_PX", 64)
     monkeypatch.setattr(feature_cache, "OVERLAP_PX", 32)
 
 
@@ -62,6 +63,21 @@ def test_evicted_blocks_are_encoded_again_alike(network: Network):
     assert cramped.cache.slots == SWIFT.network.views + EXTRA_VIEWS < roomy.cache.slots
     one, other = (renderer(at.cameras[TARGET]) for renderer in (roomy, cramped))
     torch.testing.assert_close(one.colour, other.colour, atol=1e-4, rtol=0)
+
+
+def test_photographs_that_are_not_large_are_encoded_whole(network: Network, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(feature_cache, "BLOCK_PX", 64)
+    monkeypatch.setattr(feature_cache, "OVERLAP_PX", 32)
+    at = scene()
+    found = []
+    for whole in (160, 159):
+        monkeypatch.setattr(feature_cache, "WHOLE_PX", whole)
+        renderer = Renderer(network, at, SWIFT, CPU)
+        found.append((renderer(at.cameras[TARGET]).colour, {block[2:] for block in renderer.cache._slots}))
+    (colour, blocks), (in_blocks, several) = found
+    assert blocks == {(0, 0)}
+    assert len(several) > 1
+    torch.testing.assert_close(colour, in_blocks, atol=0.02, rtol=0)
 
 
 @pytest.mark.usefixtures("small_blocks")

@@ -27,8 +27,9 @@ from tidefield.model.views import Encoded, FeatureMaps, Views
 from tidefield.parallel import in_parallel
 from tidefield.recording import moved
 
-BLOCK_PX = 512
-"""Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size."""
+BLOCK_PX, WHOLE_PX = 512, 832
+"""Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size. In a
+scene without a photograph larger than the second, whole ones are encoded: blocks would have up to twice the pixels."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
 MEMORY_SHARE, LEAST_BYTES = 0.08, 1_500_000_000
@@ -93,9 +94,10 @@ class FeatureCache:
         if scene.photographs.masks:
             self._like = self._like.masked(patch[:, :1], torch.zeros(1, 2, device=device))
         size = scene.cameras.size_px[list(scene.train)]
+        self._block_px = WHOLE_PX if size.max() <= WHOLE_PX else BLOCK_PX
         # Twice as many as the scene has at its own size: a moving camera reads some photographs at two.
-        self._blocks = 2 * int(_block_counts(size).prod(-1).sum())
-        self._make_slots(tuple(int(x) for x in size.clamp(max=BLOCK_PX).amax(0)))
+        self._blocks = 2 * int(_block_counts(size, self._block_px).prod(-1).sum())
+        self._make_slots(tuple(int(x) for x in size.clamp(max=self._block_px).amax(0)))
 
     def _make_slots(self, side: tuple[int, ...]) -> None:
         """Make empty slots for blocks of at most a size."""
@@ -128,7 +130,7 @@ class FeatureCache:
         rows = self.pyramid.row(photographs, levels).reshape(-1)
         keys = self._blocks_of(photographs.reshape(-1), levels.reshape(-1), rows, middle_world)
         distinct = dict.fromkeys(keys)
-        largest = self.pyramid.cameras.size_px[rows].clamp(max=BLOCK_PX).amax(0).tolist()
+        largest = self.pyramid.cameras.size_px[rows].clamp(max=self._block_px).amax(0).tolist()
         if any(needed > own for needed, own in zip(largest, self._side, strict=True)):
             self._make_slots(tuple(max(pair) for pair in zip(largest, self._side, strict=True)))
         if len(distinct) > self.slots:
@@ -152,9 +154,9 @@ class FeatureCache:
         cameras = self.pyramid.cameras[rows]
         points = middle_world.repeat_interleave(len(rows) // len(middle_world), 0)
         uv = cameras.project(points[:, None])[0][:, 0]
-        last = _block_counts(cameras.size_px) - 1
-        free = (cameras.size_px - BLOCK_PX).clamp(min=1)
-        index = torch.minimum(((uv - BLOCK_PX / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
+        last = _block_counts(cameras.size_px, self._block_px) - 1
+        free = (cameras.size_px - self._block_px).clamp(min=1)
+        index = torch.minimum(((uv - self._block_px / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
         parts = zip(photographs.tolist(), levels.tolist(), index.tolist(), strict=True)
         return [Block(photograph, level, *at) for photograph, level, at in parts]
 
@@ -175,9 +177,9 @@ class FeatureCache:
             if self._cones and self.network.reads_doubled:
                 doubled = self.pyramid.read_doubled(block.photograph, block.level)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
-        last = (_block_counts(size) - 1).clamp(min=1)
-        corner = ((size - BLOCK_PX).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
-        (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + BLOCK_PX, size).tolist()
+        last = (_block_counts(size, self._block_px) - 1).clamp(min=1)
+        corner = ((size - self._block_px).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
+        (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + self._block_px, size).tolist()
         camera = self.pyramid.camera(block.photograph, block.level).to(self.device)
 
         def window(photograph: Tensor, scale: int) -> Tensor:
@@ -217,7 +219,7 @@ def _maps(encoded: Encoded) -> list[FeatureMaps]:
     return [*encoded.features.values(), encoded.photographs, *([] if encoded.used is None else [encoded.used])]
 
 
-def _block_counts(size_px: Int[Tensor, "*B 2"]) -> Int[Tensor, "*B 2"]:
+def _block_counts(size_px: Int[Tensor, "*B 2"], block_px: int) -> Int[Tensor, "*B 2"]:
     """Columns and rows of blocks that cover a photograph, evenly spaced and overlapping."""
-    step = BLOCK_PX - OVERLAP_PX
-    return 1 + (-(-(size_px - BLOCK_PX) // step)).clamp(min=0).long()
+    step = block_px - OVERLAP_PX
+    return 1 + (-(-(size_px - block_px) // step)).clamp(min=0).long()
