@@ -33,7 +33,7 @@ def test_workers_are_killed_between_the_first_and_the_last_tiles() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_processes_that_work_on_tiles_are_found() -> None:
     sleep = "import time; time.sleep(60)"
-    with Popen(["ray::_work", "-c", sleep], executable=sys.executable) as worker:
+    with Popen(["ray::_each", "-c", sleep], executable=sys.executable) as worker:
         with Popen([sys.executable, "-c", sleep]) as other:
             end = time.monotonic() + 10
             while worker.pid not in cluster._workers() and time.monotonic() < end:

@@ -246,7 +246,7 @@ def robust_gains(
         gains = weighted_gains(seen, seen.value, weight, fixed, fixed @ prior, gains)
         weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
         if prior_weight is not None:
-            away = np.sqrt(((gains - gains.mean(0) - (prior - prior.mean())[:, None]) ** 2).mean(1))
+            away = np.sqrt(((gains - prior[:, None]) ** 2).mean(1))
             own = prior_weight * np.minimum(1.0, HELD_TO / np.maximum(away, 1e-12))
     return gains, noise
 
