@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, no_type_check
 
@@ -52,18 +53,16 @@ def connected(address: str) -> Iterator[Any]:
         ) from error
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's default from its next version on
     # Where a cluster was found is none of a user's business, and --quiet leaves out warnings, too.
-    level = max(logging.WARNING, log.getEffectiveLevel())
+    start = partial(ray.init, log_to_driver=False, logging_level=max(logging.WARNING, log.getEffectiveLevel()))
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     try:
         try:
-            ray.init(address=address, log_to_driver=False, logging_level=level)
+            start(address=address)
         except ConnectionError:
             if address != "auto":
                 raise
-            ray.init(
-                address="local", num_cpus=cores(), include_dashboard=False, log_to_driver=False, logging_level=level
-            )
+            start(address="local", num_cpus=cores(), include_dashboard=False)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise RunError(
             f"no Ray cluster answers at {address} ({error}): expected `auto` or an address such as 10.0.0.1:6379; "
@@ -86,7 +85,7 @@ def share_of(ray: Any, device: str, of: Literal["core", "gpu", "machine"]) -> Sh
         of: a core with its part of its machine's GPUs, a core with a GPU, or a whole machine: where machines differ,
             one with the most GPUs, else the most cores.
     """
-    machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    machines = _machines(ray)
     all_gpus = [0.0 if device == "cpu" else machine.get("GPU", 0.0) for machine in machines]
     gpus, own_cores = max((g, machine.get("CPU", 1.0)) for g, machine in zip(all_gpus, machines, strict=True))
     if of == "machine":
@@ -94,6 +93,16 @@ def share_of(ray: Any, device: str, of: Literal["core", "gpu", "machine"]) -> Sh
     if of == "gpu":
         return Share(1.0, min(1.0, gpus))
     return Share(1.0, int(1e4 * min(1.0, gpus / own_cores)) / 1e4)  # Ray counts in steps of 1e-4
+
+
+def cores_of(ray: Any) -> int:
+    """Cores of a cluster, all machines together."""
+    return max(1, int(sum(machine.get("CPU", 0) for machine in _machines(ray))))
+
+
+def _machines(ray: Any) -> list[dict[str, float]]:
+    """What each machine has."""
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 def on_cluster(

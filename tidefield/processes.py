@@ -9,9 +9,10 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from types import FrameType
+from typing import Any
 
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """The signals, other than Ctrl-C's SIGINT, that ask a process to end; Windows has no SIGHUP."""
@@ -101,18 +102,23 @@ def _end_after_parent() -> None:
     os._exit(1)
 
 
+class _Pool(ProcessPoolExecutor):
+    """Handles no signal while it submits: the first task starts all processes, and one whose start is interrupted waits
+    in vain for what it is to run, and is not among the children yet."""
+
+    def submit(self, *task: Any, **keywords: Any) -> Future[Any]:
+        with delayed_signals():
+            return super().submit(*task, **keywords)
+
+
 @contextmanager
 def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterator[ProcessPoolExecutor]:
     """Processes that work for this one, spawned, because forking a process with threads may hang.
 
     They end with the block. After an error or a signal they do not finish what they are doing.
     """
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), start_worker, initializers)
+    pool = _Pool(count, multiprocessing.get_context("spawn"), start_worker, initializers)
     try:
-        # The first task starts all processes. One whose start is interrupted waits in vain for what it is to run, and
-        # is not among the children yet.
-        with delayed_signals():
-            pool.submit(int)
         yield pool
     except BaseException:
         for process in multiprocessing.active_children():

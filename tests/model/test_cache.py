@@ -65,9 +65,8 @@ def test_evicted_blocks_are_encoded_again_alike(network: Network):
     torch.testing.assert_close(one.colour, other.colour, atol=1e-4, rtol=0)
 
 
+@pytest.mark.usefixtures("small_blocks")
 def test_photographs_that_are_not_large_are_encoded_whole(network: Network, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(feature_cache, "BLOCK_PX", 64)
-    monkeypatch.setattr(feature_cache, "OVERLAP_PX", 32)
     at = scene()
     found = []
     for whole in (160, 159):

@@ -103,10 +103,9 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
 
 def _in_blocks(ray: Any, job: Job, opened: Callable[..., Any], share: Share, numbers: list[int]) -> Iterator[int]:
     """Make tiles on a cluster, some neighbours in a task; yields their numbers."""
-    from tidefield.cluster import each_on_cluster
+    from tidefield.cluster import cores_of, each_on_cluster
 
-    workers = max(1, int(sum(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])))
-    yield from each_on_cluster(ray, job.key, opened, job.blocks(numbers, workers), share)
+    yield from each_on_cluster(ray, job.key, opened, job.blocks(numbers, cores_of(ray)), share)
 
 
 @contextmanager

@@ -205,7 +205,7 @@ def _solve(
         pairs.append(everyone)
         weights.append(noise**2 / (variance * everyone.distance))
     both = Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "distance")))
-    gains, _ = robust_gains(seen, prior, both, np.concatenate(weights), held(seen, count))
+    gains, _ = robust_gains(seen, prior, both, np.concatenate(weights), hold=True)
     return gains
 
 
@@ -219,7 +219,7 @@ def robust_gains(
     prior: Float64[np.ndarray, " V"],
     pairs: Pairs = _NO_PAIRS,
     pair_weight: Float64[np.ndarray, " N"] | None = None,
-    prior_weight: Float64[np.ndarray, " V"] | None = None,
+    hold: bool = False,
 ) -> tuple[Float64[np.ndarray, "V 3"], float]:
     """Estimate log gains by iteratively reweighted least squares, and the residuals' standard deviation.
 
@@ -231,7 +231,7 @@ def robust_gains(
         prior: log gains that are expected.
         pairs: of photographs with similar gains.
         pair_weight: of the pairs.
-        prior_weight: of the expected gains, with Huber's loss beyond `HELD_TO`; without, LOOSE.
+        hold: weight the expected gains by `held`, with Huber's loss beyond `HELD_TO`, instead of by LOOSE.
     """
     count, rows = len(prior), np.arange(len(pairs.a))
     pair_weight = np.zeros(0) if pair_weight is None else pair_weight
@@ -239,13 +239,14 @@ def robust_gains(
     where = (np.concatenate([rows, rows]), np.concatenate([pairs.a, pairs.b]))
     incidence = sparse.csr_array((minus_plus, where), shape=(len(rows), count))
     between = incidence.T @ sparse.diags_array(pair_weight) @ incidence
-    weight, own = np.ones(len(seen.value)), np.full(count, LOOSE) if prior_weight is None else prior_weight
+    prior_weight = held(seen, count) if hold else np.full(count, LOOSE)
+    weight, own = np.ones(len(seen.value)), prior_weight
     gains, noise = np.zeros((count, 3)), 0.0
     for _ in range(ITERATIONS):
         fixed = between + sparse.diags_array(own)
         gains = weighted_gains(seen, seen.value, weight, fixed, fixed @ prior, gains)
         weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
-        if prior_weight is not None:
+        if hold:
             away = np.sqrt(((gains - prior[:, None]) ** 2).mean(1))
             own = prior_weight * np.minimum(1.0, HELD_TO / np.maximum(away, 1e-12))
     return gains, noise

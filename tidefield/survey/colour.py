@@ -74,7 +74,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
     scores = np.zeros((2, 3))
     for k, (own, other) in enumerate((halves, halves[::-1])):
-        gains = _gains(own[0], count)
+        gains = robust_gains(own[0], np.zeros(count), hold=True)[0]
         both = _gains_and_falloff(*own, lens, count)
         scores[k] = [_spread(*other, g, f, lens) for g, f in ((nothing, nothing), (gains, nothing), both)]
     before, alone, after = scores.mean(0)
@@ -85,7 +85,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     darkens = (falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
     sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
     if not sees:
-        gains, falloff = _gains(seen, count), np.zeros_like(falloff)
+        gains, falloff = robust_gains(seen, np.zeros(count), hold=True)[0], np.zeros_like(falloff)
     gain = np.exp(gains - gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
     gain[list(scene.test)] = 1.0
     return ExposureCorrection(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
@@ -116,11 +116,6 @@ def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
 def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
     """Select some of the observations."""
     return replace(seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row")})
-
-
-def _gains(seen: Seen, count: int) -> Float64[np.ndarray, "V 3"]:
-    """Estimate log gains alone."""
-    return robust_gains(seen, np.zeros(count), prior_weight=held(seen, count))[0]
 
 
 def _gains_and_falloff(
