@@ -1,14 +1,25 @@
 """A lens gets the terms of distortion that it has, and none that would make the model curved."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly, quiet
 
-from tidefield.survey.georeference.bundle_adjustment import adjustment_options
-from tidefield.survey.sfm.mapping import MIN_SPREAD_DEG, TERMS, LensChoice, LensTrial, best_of, choose_lens, lens_notes
+from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, solve
+from tidefield.survey.sfm.mapping import (
+    MIN_SPREAD_DEG,
+    TERMS,
+    LensChoice,
+    LensTrial,
+    best_of,
+    choose_lens,
+    lens_notes,
+    reconstruct,
+)
+from tidefield.survey.sfm.model_files import write_model
 from tidefield.survey.survey import LensPrior
 
 
@@ -137,3 +148,20 @@ def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_ch
         assert ("the design one was used" if true > design else "the calibrated one was used") in lens_notes(choice)[0]
         assert choice.heights is not None
         assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)
+
+
+def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):
+    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D, noise.point2D_stddev = 1, 5, 5500, 0.5
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        pycolmap.synthesize_noise(noise, truth, database)
+    names = [image.name for image in truth.images.values()]
+
+    def points(number: int) -> bytes:
+        (model,) = reconstruct(tmp_path / "database.db", tmp_path / str(number), names, quiet, known=False)
+        solve(model, all_images(model))
+        write_model(model, tmp_path / f"{number}-model")
+        return (tmp_path / f"{number}-model" / "points3D.bin").read_bytes()
+
+    assert points(0) == points(1)

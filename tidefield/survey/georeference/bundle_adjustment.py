@@ -52,6 +52,9 @@ _SOLVED_DIRECTLY = 20_000
 """Photographs up to which the linear equations are factorized. A photograph shares points with its neighbours only, so
 the factors stay sparse. COLMAP's conjugate gradients, which it takes from 1,000 on, need many times as long for the
 bend of a long flight."""
+_ADJUSTED_ON_ONE_THREAD = 2_500_000
+"""Residuals, those of some 400 photographs, up to which one thread adjusts: several add up in an order that changes
+from run to run, and last digits change with it. Two are not faster with 170,000."""
 
 
 def adjust_to_positions(
@@ -205,6 +208,7 @@ def adjustment_options() -> pycolmap.BundleAdjustmentOptions:
     options.print_summary = options.refine_sensor_from_rig = options.refine_focal_length = False
     options.refine_principal_point = options.refine_extra_params = True
     options.ceres.max_num_images_direct_sparse_cpu_solver = _SOLVED_DIRECTLY
+    options.ceres.min_num_residuals_for_cpu_multi_threading = _ADJUSTED_ON_ONE_THREAD
     solver = options.ceres.solver_options
     solver.max_num_iterations, solver.function_tolerance = _STEPS, _TOLERANCE
     options.ceres.solver_options = solver
