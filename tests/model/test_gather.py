@@ -1,5 +1,6 @@
 """Both ways of reading pictures at pixels: photographs for the baselines, feature maps for the network."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,7 +11,15 @@ from torch.nn import functional as F
 
 from tidefield.baselines.untrained import read_photograph
 from tidefield.model.rendering import fill_unseen
-from tidefield.model.views import concatenate, gather, maps_from_images, pixel_means, upsample_twice, weighted_rows
+from tidefield.model.views import (
+    concatenate,
+    gather,
+    maps_from_images,
+    padded_channels,
+    pixel_means,
+    upsample_twice,
+    weighted_rows,
+)
 
 
 def test_reading_at_pixel_centres_gives_the_pixels_at_the_common_exposure():
@@ -92,6 +101,23 @@ def test_at_stride_one_pixel_centres_give_the_pixels():
     values, inside = gather(maps_from_images(pictures, corners(1), 1), torch.tensor([[0]]), uv[None, None])
     assert inside.all()
     torch.testing.assert_close(values[0, 0], pictures[0][:, [0, 6, 2], [0, 8, 3]].T)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float32])
+def test_padding_of_rows_is_not_read(kind: torch.dtype):
+    maps = maps_from_images(images()[:, :3].to(kind), corners(), 1)
+    padding = maps.rows.new_full((len(maps.rows), padded_channels(3) - 3), torch.nan)
+    padded = replace(maps, rows=torch.cat([maps.rows, padding], dim=1))
+    uv = spots(images(), corners(), 1).float()
+    (values, inside), (plain, plainly_inside) = (gather(m, torch.tensor([[0, 1, 2]]), uv[None]) for m in (padded, maps))
+    assert torch.equal(inside, plainly_inside)
+    torch.testing.assert_close(values[inside], plain[inside], atol=2e-3 if kind == torch.float16 else 1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+def test_rows_are_padded_to_whole_eight_bytes_and_no_more(channels: int):
+    assert 2 * padded_channels(channels) % 8 == 0
+    assert channels <= padded_channels(channels) < channels + 4
 
 
 @pytest.mark.parametrize("stride", [1, 2, 4])

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.data.exposure import windows_in_common_light
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
@@ -23,7 +24,7 @@ from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.machine import cores, memory_bytes
 from tidefield.model.network import Network
-from tidefield.model.views import Encoded, FeatureMaps, Views
+from tidefield.model.views import Encoded, FeatureMaps, Views, padded_channels
 from tidefield.parallel import in_parallel
 from tidefield.recording import moved
 
@@ -32,7 +33,7 @@ BLOCK_PX, WHOLE_PX = 512, 832
 scene without a photograph larger than the second, whole ones are encoded: blocks would have up to twice the pixels."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
-MEMORY_SHARE, LEAST_BYTES = 0.08, 1_500_000_000
+MEMORY_SHARE, LEAST_BYTES = 0.09, 1_500_000_000
 """Memory for features: this share of the device's, or this much. Views of large photographs need more than the latter:
 what does not fit is encoded again for every view."""
 ENCODED_AT_ONCE = 4
@@ -103,7 +104,7 @@ class FeatureCache:
         """Make empty slots for blocks of at most a size."""
         self._side = side
         like = self._like
-        texel_bytes = sum(2 * m.rows.shape[1] * self._texels(m.stride) for m in _maps(like))
+        texel_bytes = sum(2 * padded_channels(m.channels) * self._texels(m.stride) for m in _maps(like))
         blocks = min(self._blocks, self.budget_bytes // texel_bytes)
         self.slots = max(blocks, self.network.config.views + EXTRA_VIEWS)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
@@ -197,7 +198,8 @@ class FeatureCache:
             encoded = encoded.masked(used[None, None, top:bottom, left:right].to(first), corner_px)
         for maps, found in zip(_maps(self._encoded), _maps(encoded), strict=True):
             first = slot * self._texels(maps.stride)
-            maps.rows[first : first + len(found.rows)] = found.rows.to(maps.rows.dtype)
+            padding = (0, padded_channels(found.channels) - found.channels)
+            maps.rows[first : first + len(found.rows)] = F.pad(found.rows.to(maps.rows.dtype), padding)
             maps.size[slot], maps.origin_px[slot] = found.size[0], found.origin_px[0]
         self._slots[block] = slot
 
@@ -205,9 +207,10 @@ class FeatureCache:
         return math.prod(math.ceil(side / stride) for side in self._side)
 
     def _empty(self, like: FeatureMaps) -> FeatureMaps:
-        texels, channels = self._texels(like.stride), like.rows.shape[1]
+        texels, values = self._texels(like.stride), padded_channels(like.channels)
         return FeatureMaps(
-            rows=torch.empty(self.slots * texels, channels, dtype=torch.float16, device=self.device),
+            rows=torch.empty(self.slots * texels, values, dtype=torch.float16, device=self.device),
+            channels=like.channels,
             first=torch.arange(self.slots, device=self.device) * texels,
             size=torch.ones(self.slots, 2, dtype=torch.long, device=self.device),
             origin_px=torch.zeros(self.slots, 2, device=self.device),

@@ -32,8 +32,9 @@ from tidefield.parallel import in_parallel
 from tidefield.recording import Recorder, moved
 
 TILE_PX = 32
-VALUES_AT_ONCE = 1_250_000
-"""Numbers gathered at once by a pass on one core: few enough for its cache ..."""
+VALUES_AT_ONCE = 5_000_000
+"""Numbers gathered at once by a pass on one core: enough to outweigh the time of starting each operation, and few enough
+for the memory ..."""
 GPU_FACTOR = 32
 """... and so many times more keep a GPU busy."""
 BEHIND_PHOTOGRAPHS, BEHIND_STEP = 32, 16
