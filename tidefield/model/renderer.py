@@ -33,9 +33,9 @@ from tidefield.recording import Recorder, moved
 
 TILE_PX = 32
 VALUES_AT_ONCE = 5_000_000
-"""Numbers gathered at once by a pass on one core: enough to outweigh the time of starting each operation, and few enough
+"""Numbers gathered at once by a pass on one core: enough to outweigh the time of starting operations, and few enough
 for the memory ..."""
-GPU_FACTOR = 32
+GPU_FACTOR = 8
 """... and so many times more keep a GPU busy."""
 BEHIND_PHOTOGRAPHS, BEHIND_STEP = 32, 16
 """Photographs, and pixels between their pixels, whose mean colour lies behind pixels that let light through."""
