@@ -7,7 +7,7 @@ import torch
 from tidefield.config import SWIFT
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.model import cache as feature_cache
-from tidefield.model.cache import CacheFull, FeatureCache
+from tidefield.model.cache import CacheFull, FeatureCache, padded_channels
 from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
 
@@ -103,3 +103,9 @@ def test_masked_pixels_are_no_valid_samples(network: Network):
                 stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), torch.ones(4, 1), coarse
             )
             assert found.valid[:, 0, 0].tolist() == expected
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+def test_rows_are_padded_to_whole_eight_bytes_and_no_more(channels: int):
+    assert 2 * padded_channels(channels) % 8 == 0
+    assert channels <= padded_channels(channels) < channels + 4

@@ -181,8 +181,8 @@ class FeatureMaps:
     """K maps of features, of any sizes, one after the other.
 
     Attributes:
-        rows: the texels of all maps, each map row by row; single or half precision. Their first C values count: the
-            cache's rows are padded (`padded_channels`).
+        rows: the texels of all maps, each map row by row; single or half precision. Their first C values count; the
+            cache's rows have more (`cache.padded_channels`).
         channels: C.
         first: index in `rows` of each map's first texel.
         size: (width, height) of each map, texels.
@@ -299,11 +299,6 @@ def gather(
     values = weighted_rows(maps.rows, index.reshape(-1, 4), share.reshape(-1, 4))
     values = values.float() if values.dtype == torch.float16 else values
     return values[:, : maps.channels].reshape(*inside.shape, -1), inside
-
-
-def padded_channels(channels: int) -> int:
-    """Values of a row in half precision that holds some: rows of whole 8 bytes are read twice as fast as others."""
-    return 4 * -(-channels // 4)
 
 
 def weighted_rows(
