@@ -74,6 +74,19 @@ def test_the_light_is_found_and_foretold_for_held_out_photographs(caplog: pytest
     assert "applied" in caplog.text
 
 
+def test_forming_the_normal_matrix_and_iterating_find_the_same(monkeypatch: pytest.MonkeyPatch):
+    value, cameras, points = observed(planted())
+    seen = seen_in(TRAIN, value, points)
+    formed = estimate_shading(seen, cameras, points, LENSES, TRAIN)
+    monkeypatch.setattr("tidefield.data.shading.MOST_DENSE", 0)
+    monkeypatch.setattr("tidefield.data.shading.TOLERANCE", 1e-7)
+    iterated = estimate_shading(seen, cameras, points, LENSES, TRAIN)
+    assert formed is not None
+    assert iterated is not None
+    lit = [light(cameras, points, shading) for shading in (formed, iterated)]
+    torch.testing.assert_close(*lit, atol=0.01 * NOISE, rtol=0)
+
+
 def test_photographs_in_one_light_get_no_shading(caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.DEBUG, "tidefield")
     value, cameras, points = observed(None)

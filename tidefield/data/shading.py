@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from scipy import sparse
+from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
@@ -54,6 +54,11 @@ LEAST_GAIN = 0.01
 MOST_OBSERVATIONS = 40_000
 ROUNDS = 3
 """Of robust weights."""
+MOST_DENSE = 500
+"""Unknowns up to which their normal matrix is formed: there this takes less time than iterating without."""
+TOLERANCE = 1e-3
+"""Of iterative solutions, relative to the right side: left-out photographs' differences are the same as with 1e-7 to
+3%."""
 
 _log = logging.getLogger(__name__)
 
@@ -166,7 +171,8 @@ class _Model:
         back = sparse.csr_array((sparse.diags_array(to_mean) @ sums).T)
         products = self.design.T @ (sparse.diags_array(weight) @ self.design)
         right = self.design.T @ (weight[:, None] * self.value) - back @ (to_points @ self.value)
-        return _Equations(sparse.csr_array(products), sums, back, right)
+        eliminated = back.toarray() @ sums.toarray() if len(right) <= MOST_DENSE else None
+        return _Equations(sparse.csr_array(products), sums, back, right, eliminated)
 
     def solve(
         self,
@@ -178,12 +184,14 @@ class _Model:
         """Find the most probable unknowns.
 
         Args:
-            start: unknowns near the solution, from which the iterative solution starts.
+            start: unknowns near the solution, from which an iterative solution starts.
         """
         own, right = OWN_TERMS * len(self.lens), equations.right
         ridge = sparse.diags_array(SHARED_RIDGE * equations.products.diagonal()[own:] + 1e-9)
         prior = sparse.block_diag([self.prior * (noise / spread) ** 2, ridge])
         quadratic = sparse.csr_array(equations.products + prior)
+        if equations.eliminated is not None:
+            return linalg.solve(quadratic.toarray() - equations.eliminated, right, assume_a="pos")
 
         def normal(x: np.ndarray) -> np.ndarray:
             x = x.reshape(-1, 3)
@@ -191,9 +199,8 @@ class _Model:
 
         system = LinearOperator(shape=(right.size, right.size), matvec=normal, dtype=np.float64)  # type: ignore[call-arg]
         inverse = sparse.diags_array(np.repeat(1 / quadratic.diagonal(), 3))
-        return cg(system, right.ravel(), None if start is None else start.ravel(), rtol=1e-3, M=inverse)[0].reshape(
-            -1, 3
-        )
+        first = None if start is None else start.ravel()
+        return cg(system, right.ravel(), first, rtol=TOLERANCE, M=inverse)[0].reshape(-1, 3)
 
     def cost(self, unknowns: Float64[np.ndarray, "N 3"] | None, left: Bool[np.ndarray, " V"], noise: float) -> float:
         """Huber's cost of how the left-out photographs' values differ from the points' colours in the others."""
@@ -227,12 +234,14 @@ class _Equations:
         sums: those of the derivatives over the observations of each point.
         back: their transpose, each point's divided by its weight: `products - back @ sums` are the normal equations.
         right: their right side, for each channel.
+        eliminated: `back @ sums` of at most MOST_DENSE unknowns.
     """
 
     products: sparse.csr_array
     sums: sparse.csr_array
     back: sparse.csr_array
     right: Float64[np.ndarray, "N 3"]
+    eliminated: Float64[np.ndarray, "N N"] | None
 
 
 def _blocks(terms: Float64[np.ndarray, "O K"], group: Int64[np.ndarray, " O"], count: int) -> sparse.csr_array:
