@@ -15,6 +15,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
+SOFTWARE = f"tidefield {__version__}"
+"""As files name what made them."""
 __all__ = ["Cameras", "OpenRun", "Rendering", "Scene", "__version__", "load_scene", "open_run", "zero_shot"]
 
 if TYPE_CHECKING:

@@ -13,23 +13,11 @@ import torch
 from PIL import Image
 from pyproj import CRS
 
+from tidefield.change.kinds import COLOUR, HIGHER, LIGHT, LOWER, SAME, UNKNOWN, View, colour_kinds
 from tidefield.change.measure import Change, Options, measure
 from tidefield.change.pictures import difference, side_by_side, swipe_page, write_views
 from tidefield.change.surfaces import ChangeError, open_surface
-from tidefield.change.views import (
-    COLOUR,
-    HIGHER,
-    LIGHT,
-    LOWER,
-    SAME,
-    UNKNOWN,
-    Site,
-    View,
-    carried,
-    choose_camera,
-    colour_kinds,
-    make_view,
-)
+from tidefield.change.views import Site, carried, choose_camera, make_view
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.geometry.geodesy import LocalFrame

@@ -21,9 +21,9 @@ from tidefield.change.figures import (
     draw_waterlines,
     thinned,
 )
+from tidefield.change.kinds import View
 from tidefield.change.measure import Change
 from tidefield.change.pictures import difference, jpeg, side_by_side
-from tidefield.change.views import View
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text

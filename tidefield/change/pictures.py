@@ -12,15 +12,14 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from tidefield import SOFTWARE
 from tidefield.change.figures import GAINED as GREEN
 from tidefield.change.figures import HIGHER as BLUE
 from tidefield.change.figures import LOST as BROWN
 from tidefield.change.figures import LOWER as RED
-from tidefield.change.views import COLOUR, GAINED, HIGHER, LIGHT, LOST, LOWER, UNKNOWN, View
+from tidefield.change.kinds import COLOUR, GAINED, HIGHER, LIGHT, LOST, LOWER, UNKNOWN, View
 from tidefield.files import completed_file, write_text
 from tidefield.pages import template_environment
-from tidefield.render.stills import SOFTWARE
-from tidefield.render.video import write_video
 
 KINDS = {
     LOWER: ("lower", RED, 0.6),
@@ -46,6 +45,8 @@ def write_views(view: View, names: tuple[str, str], folder: Path) -> list[Path]:
         names: of both dates, for people.
         folder: an existing one.
     """
+    from tidefield.render.video import write_video
+
     pictures = {
         "earlier.png": view.earlier,
         "later.png": view.later,

@@ -2,12 +2,6 @@
 
 The earlier photograph's camera is carried into the later survey through map coordinates and co-registration, so that
 both views show the same ground at the same pixel.
-
-What only light changes is told from what changed on the ground: light makes a place brighter or darker and moves its
-colour along the line from blue to yellow, which shade and other times of the day share. Along that line log(R B / G^2)
-is constant (after Finlayson, Drew and Lu, Entropy minimization for shadow removal, 2009, doi
-10.1007/s11263-008-0171-3, with the line of a camera whose channels are sRGB's). Heights and plants come from the
-change itself. Ground that became wet is darker, too: pictures cannot tell it from shade.
 """
 
 from __future__ import annotations
@@ -15,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from pyproj import CRS, Transformer
 
 from tidefield.change.cover import Cover
-from tidefield.change.errors import nmad
+from tidefield.change.kinds import GAINED, HIGHER, LOST, LOWER, UNKNOWN, View, colour_kinds
 from tidefield.change.light import light_gains, with_light
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import ChangeError, Grid
@@ -33,13 +26,6 @@ from tidefield.maps.grid import MapFrame, map_frame
 from tidefield.model.rendering import Render, Rendering
 from tidefield.render.stills import MIN_OPACITY, colour_picture
 
-SAME, LIGHT, COLOUR, LOWER, HIGHER, GAINED, LOST, UNKNOWN = range(8)
-"""Kinds of difference: none, light only, colour of the ground, height, plants; not seen or not compared."""
-_DARK = 6.0
-_SMOOTH_PX = 2.0
-_STANDS_OUT = 3.0
-_LEAST_LIGHT, _LEAST_COLOUR = 0.15, 0.12
-"""Differences of log values that are worth showing."""
 _ARM = 10.0
 """Length of the axes by which a camera's attitude is carried over, in scene units."""
 _HIDDEN = 0.05
@@ -57,26 +43,6 @@ class Site:
     @classmethod
     def of(cls, scene: Scene, render: Render) -> Site:
         return cls(scene, render, map_frame(scene, read_georeference(scene.root)))
-
-
-@dataclass(frozen=True)
-class View:
-    """Views of both dates from one camera, the later one in the earlier one's light.
-
-    Attributes:
-        name: of the earlier photograph.
-        kinds: of difference at each pixel.
-    """
-
-    name: str
-    earlier: UInt8[np.ndarray, "H W 3"]
-    later: UInt8[np.ndarray, "H W 3"]
-    kinds: UInt8[np.ndarray, "H W"]
-
-    def share(self, kind: int) -> float:
-        """Of the pixels that are seen and compared at both dates."""
-        seen = self.kinds != UNKNOWN
-        return float((self.kinds[seen] == kind).mean()) if seen.any() else 0.0
 
 
 def carried(
@@ -231,34 +197,6 @@ def _compared(
     ):
         kinds[where] = kind
     return View(name, one, evened, kinds)
-
-
-def colour_kinds(
-    earlier: UInt8[np.ndarray, "H W 3"], later: UInt8[np.ndarray, "H W 3"], steady: np.ndarray
-) -> UInt8[np.ndarray, "H W"]:
-    """Where pictures differ by light only, and where by the colour of the ground.
-
-    Args:
-        earlier, later: in one light, but for shadows.
-        steady: pixels that noise is measured on.
-    """
-    logs = [
-        np.log(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX) + np.float32(_DARK))
-        for picture in (earlier, later)
-    ]
-    difference = logs[1] - logs[0]
-    bright = difference.mean(axis=2)
-    across = difference[..., 0] + difference[..., 2] - 2 * difference[..., 1]
-    kinds = np.full(bright.shape, SAME, np.uint8)
-    if not steady.any():
-        return kinds
-    limits = [
-        max(least, _STANDS_OUT * nmad(values[steady]))
-        for values, least in ((bright, _LEAST_LIGHT), (across, _LEAST_COLOUR))
-    ]
-    kinds[np.abs(bright - np.median(bright[steady])) > limits[0]] = LIGHT
-    kinds[np.abs(across - np.median(across[steady])) > limits[1]] = COLOUR
-    return kinds
 
 
 def _sampled(values: np.ndarray, grid: Grid, place: Float64[np.ndarray, "P 2"], outside: int) -> np.ndarray:

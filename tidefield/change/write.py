@@ -15,7 +15,7 @@ import shapely
 from jaxtyping import Bool
 from shapely.geometry.base import BaseGeometry
 
-from tidefield import __version__
+from tidefield import SOFTWARE, __version__
 from tidefield.change.cover import LEAST_M2, Cover
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
@@ -73,7 +73,7 @@ def cog(
     try:
         with rasterio.Env(GDAL_CACHEMAX=256):
             with rasterio.open(plain, "w", **profile) as file:
-                file.update_tags(TIFFTAG_SOFTWARE=f"tidefield {__version__}", **(tags or {}))
+                file.update_tags(TIFFTAG_SOFTWARE=SOFTWARE, **(tags or {}))
                 for k, text in enumerate(bands, start=1):
                     file.set_band_description(k, text)
 

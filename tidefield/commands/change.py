@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from tidefield.change.cover import Cover
     from tidefield.change.inputs import Pair
+    from tidefield.change.kinds import View
     from tidefield.change.measure import Change as Measured
-    from tidefield.change.views import View
     from tidefield.change.water import Water
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from tidefield import __version__
+from tidefield import SOFTWARE
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.maps.grid import Grid
@@ -104,7 +104,7 @@ def raster_writer(raster: Raster, grid: Grid) -> Iterator[RasterWriter]:
     if raster.nodata is not None:
         profile["nodata"] = raster.nodata
     about = {
-        "TIFFTAG_SOFTWARE": f"Tidefield {__version__}",
+        "TIFFTAG_SOFTWARE": SOFTWARE,
         "VERTICAL_DATUM": grid.frame.heights,
         "COORDINATES": grid.frame.name,
         **raster.tags,

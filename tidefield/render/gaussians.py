@@ -20,12 +20,13 @@ import torch
 from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from tidefield import SOFTWARE
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.rendering import Render, Rendering
 from tidefield.render.consistency import ViewPoints, choose_points
-from tidefield.render.stills import MIN_OPACITY, SOFTWARE
+from tidefield.render.stills import MIN_OPACITY
 
 SH_0 = math.sqrt(1 / (4 * math.pi))
 """The constant harmonic: colour = 0.5 + SH_0 f_dc (Kerbl et al.)."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, PngImagePlugin
 
-from tidefield import __version__
+from tidefield import SOFTWARE
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.files import completed_file, require_writable
@@ -20,7 +20,6 @@ from tidefield.model.rendering import Rendering, to_8_bit
 
 MIN_OPACITY = 0.5
 """Share of the light that the scene must stop for a pixel's depth to mean anything."""
-SOFTWARE = f"tidefield {__version__}"
 CONVENTION = (
     "OpenCV: +x right, +y down, +z forward; pixel centres at +0.5; T_world_camera maps camera coordinates into the "
     "world coordinates of the scene's files"

@@ -12,10 +12,11 @@ from av.container import OutputContainer
 from av.video.reformatter import Colorspace
 from jaxtyping import UInt8
 
+from tidefield import SOFTWARE
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.model.rendering import Rendering
-from tidefield.render.stills import SOFTWARE, colour_picture
+from tidefield.render.stills import colour_picture
 
 QUALITY = {"crf": "18", "preset": "medium"}
 """x264's constant rate factor; 0 is lossless, and at 18 differences become invisible (FFmpeg's H.264 guide)."""
