@@ -126,9 +126,7 @@ def on_cluster(
     Raises:
         RunError: workers died again and again with one item. Errors of the function itself are raised as they are.
     """
-    task = ray.remote(num_cpus=share.cores, num_gpus=share.gpus, max_retries=RETRIES)(_work)
-    shared = ray.put(prepare)
-    waiting = {task.remote(key, shared, item): item for item in items}
+    waiting = _started(ray, _work, key, prepare, items, share)
     while waiting:
         done = next(iter(waiting)) if in_order else ray.wait(list(waiting), num_returns=1)[0][0]
         item = waiting.pop(done)
@@ -152,9 +150,7 @@ def each_on_cluster(
     Raises:
         RunError: as of `on_cluster`.
     """
-    task = ray.remote(num_cpus=share.cores, num_gpus=share.gpus, max_retries=RETRIES, num_returns="streaming")(_each)
-    shared = ray.put(prepare)
-    waiting = {task.remote(key, shared, group): group for group in groups}
+    waiting = _started(ray, _each, key, prepare, groups, share, num_returns="streaming")
     while waiting:
         made = ray.wait(list(waiting), num_returns=1)[0][0]
         try:
@@ -163,6 +159,21 @@ def each_on_cluster(
             del waiting[made]
         else:
             yield _made(ray, one, waiting[made])
+
+
+def _started(
+    ray: Any,
+    function: Callable[..., Any],
+    key: str,
+    prepare: object,
+    items: Sequence[Item],
+    share: Share,
+    **options: str,
+) -> dict[Any, Item]:
+    """Start a task for each item; returns what to wait for, with the items."""
+    task = ray.remote(num_cpus=share.cores, num_gpus=share.gpus, max_retries=RETRIES, **options)(function)
+    shared = ray.put(prepare)
+    return {task.remote(key, shared, item): item for item in items}
 
 
 def _made(ray: Any, reference: Any, item: object) -> Any:

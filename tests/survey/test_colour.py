@@ -49,6 +49,14 @@ def test_gains_and_falloff_are_found():
     np.testing.assert_allclose((found - found.min()) - (true - true.min()), 0, atol=0.03)
 
 
+def test_gains_that_rise_along_a_flight_are_not_pulled_to_their_mean():
+    gains = np.exp(np.linspace(-0.6, 0.6, 12))[:, None] * np.ones(3)
+    correction = estimate_correction(shaded(gains, FALLOFF), [0] * 12)
+    assert correction.sees_falloff
+    relative = np.log(correction.gain / gains)
+    np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.006)
+
+
 def test_the_memory_of_a_photograph_is_given_back_once_it_was_looked_at(monkeypatch: pytest.MonkeyPatch):
     released = []
     monkeypatch.setattr(Photographs, "release", lambda photographs: released.append(photographs))

@@ -209,9 +209,16 @@ def _solve(
     return gains
 
 
-def held(seen: Seen, count: int) -> Float64[np.ndarray, " V"]:
-    """Weights with which the prior gains of photographs hold theirs (`HOLD`)."""
-    return LOOSE + HOLD * np.bincount(seen.photograph, minlength=count)
+def held(seen: Seen, count: int, away: Float64[np.ndarray, "V 3"] | None = None) -> Float64[np.ndarray, " V"]:
+    """Weights with which the prior gains of photographs hold theirs (`HOLD`).
+
+    Args:
+        away: log gains less the prior ones; beyond HELD_TO they are held less (Huber's loss).
+    """
+    weight = LOOSE + HOLD * np.bincount(seen.photograph, minlength=count)
+    if away is None:
+        return weight
+    return weight * np.minimum(1.0, HELD_TO / np.maximum(np.sqrt((away**2).mean(1)), 1e-12))
 
 
 def robust_gains(
@@ -231,7 +238,7 @@ def robust_gains(
         prior: log gains that are expected.
         pairs: of photographs with similar gains.
         pair_weight: of the pairs.
-        hold: weight the expected gains by `held`, with Huber's loss beyond `HELD_TO`, instead of by LOOSE.
+        hold: weight the expected gains by `held` instead of by LOOSE.
     """
     count, rows = len(prior), np.arange(len(pairs.a))
     pair_weight = np.zeros(0) if pair_weight is None else pair_weight
@@ -239,16 +246,14 @@ def robust_gains(
     where = (np.concatenate([rows, rows]), np.concatenate([pairs.a, pairs.b]))
     incidence = sparse.csr_array((minus_plus, where), shape=(len(rows), count))
     between = incidence.T @ sparse.diags_array(pair_weight) @ incidence
-    prior_weight = held(seen, count) if hold else np.full(count, LOOSE)
-    weight, own = np.ones(len(seen.value)), prior_weight
+    weight, own = np.ones(len(seen.value)), held(seen, count) if hold else np.full(count, LOOSE)
     gains, noise = np.zeros((count, 3)), 0.0
     for _ in range(ITERATIONS):
         fixed = between + sparse.diags_array(own)
         gains = weighted_gains(seen, seen.value, weight, fixed, fixed @ prior, gains)
         weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
         if hold:
-            away = np.sqrt(((gains - prior[:, None]) ** 2).mean(1))
-            own = prior_weight * np.minimum(1.0, HELD_TO / np.maximum(away, 1e-12))
+            own = held(seen, count, gains - prior[:, None])
     return gains, noise
 
 

@@ -128,11 +128,12 @@ def _gains_and_falloff(
     """
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
     terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)
-    as_taken, nothing = sparse.diags_array(held(seen, count)), np.zeros(count)
+    nothing = np.zeros(count)
     weight = np.ones(len(seen.value))
     gains, falloff = np.zeros((count, 3)), np.zeros(3 * lenses)
     for _ in range(ITERATIONS):
         values = np.concatenate([seen.value, terms], axis=1)
+        as_taken = sparse.diags_array(held(seen, count, gains))
         fitted = weighted_gains(seen, values, weight, as_taken, nothing)
         rest = seen.centred(values - fitted[seen.photograph], weight)
         root = np.sqrt(weight)[:, None]
