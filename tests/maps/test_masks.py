@@ -53,6 +53,18 @@ def test_level_ground_with_lower_ground_beside_it_is_no_water():
     assert not find_water(height, agreement, ~wet & (x < 7), GRID)[1]
 
 
+def test_a_lake_goes_on_to_the_edge_of_the_map_and_a_blotch_is_no_shore():
+    random = np.random.default_rng(5)
+    height = (LEVEL + NOISE * random.standard_normal((GRID.rows, GRID.columns))).astype(np.float32)
+    height[100:112, 288:] -= 0.3
+    nowhere, blank = np.zeros(height.shape, bool), np.full_like(height, 0.05)
+    labels, [body] = find_water(height, blank, nowhere, GRID)
+    assert abs(body.level - LEVEL) < 0.004
+    corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert (corners == 1).all()
+    assert (labels > 0).mean() > 0.97
+
+
 def test_plants_are_green_and_black_is_not():
     colour = np.zeros((3, 20, 20), np.uint8)
     colour[:, :, 10:] = np.array([70, 110, 50], np.uint8)[:, None, None]

@@ -43,7 +43,9 @@ TOLERANCE_M = 0.03
 SPREAD_M, SPREAD_CELLS = 0.01, 0.15
 """Largest spread of the smoothed heights of a body of water, in metres or in cells of the map."""
 LOWER_M, LOWER_SHARE = 0.01, 0.15
-"""A body is none if more than such a share of its shore is lower by so much."""
+"""A body is none if more than such a share of its shore is lower by so much, ..."""
+LEAST_SHORE = 0.05
+"""... and the shore is more than this share of what surrounds a disc: less is a blotch of the matching."""
 SMALLEST_M2 = 1.0
 """Smallest body of water."""
 BLOCK_M = 2.0
@@ -119,14 +121,15 @@ def find_water(
         mine[places[k - 1]] |= inside
         parts = _components(mine)[1]
         touched = np.unique(parts[places[k - 1]][inside])
-        body = ndimage.binary_opening(_closed(np.isin(parts, touched[touched > 0])), iterations=2) & (labels == 0)
+        body = _opened(_closed(np.isin(parts, touched[touched > 0]))) & (labels == 0)
         wet = body & known
         side = 2 * math.ceil(LEVEL_M / cell) + 1
         shore = cv2.dilate(body.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         shore &= known & ~body
         if not wet.any() or _spread(mean[wet] - level) > max(SPREAD_M, SPREAD_CELLS * cell):
             continue
-        if shore.any() and (mean[shore] < level - LOWER_M).mean() > LOWER_SHARE:
+        ring = 2 * math.sqrt(math.pi * wet.sum()) * LEVEL_M / cell  # around a disc of the same area, cells
+        if shore.sum() > LEAST_SHORE * ring and (mean[shore] < level - LOWER_M).mean() > LOWER_SHARE:
             continue
         error = _level_error(above, wet, level, max(1, round(BLOCK_M / cell)))
         labels[body] = len(bodies) + 1
@@ -143,6 +146,12 @@ def _smooth(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
 
 def _closed(mask: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+def _opened(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Without what is narrower than five cells; what goes on beyond the map's edge is not."""
+    padded = np.pad(mask, 2, mode="edge")
+    return ndimage.binary_opening(padded, iterations=2)[2:-2, 2:-2]
 
 
 def _components(mask: np.ndarray) -> tuple[int, np.ndarray]:

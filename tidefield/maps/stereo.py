@@ -33,9 +33,10 @@ STEEPEST = 0.35
 """Largest rise of a base: beyond, rows of cameras that look down cannot follow it."""
 OFF_NADIR_DEG = 28.0
 """Angle from the vertical at which a photograph's worth has fallen to 1/e."""
-WINDOW = 5
-P1, P2 = 8, 32
-"""Penalties of disparities that differ by 1, and by more, times the window's area: those of OpenCV's documentation."""
+WINDOW = 3
+P1, P2 = 4, 16
+"""Penalties of disparities that differ by 1, and by more, times the window's area: half of those of OpenCV's
+documentation, which widen crowns, as larger windows do (docs/experiments.md, Maps)."""
 MOST_DISPARITIES = 512
 UNIQUE, SPECKLE, SPECKLE_RANGE = 10, 100, 2
 """Per cent by which the best cost must win, and the size and step of specks that are removed, as is usual."""

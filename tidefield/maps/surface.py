@@ -64,11 +64,12 @@ DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 the mean difference, as a share of that, against the correlation."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
 """Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
-SHARE_MATCHING, SHARE_ROUGHNESS, ROUGHNESS_CELLS = 0.2, 1.35, 6.0
-"""Shares of the standard error: of that of single cells' matching, and of the roughness within windows of so many
-cells. The second was found on built-in flats of other seeds than those of `python -m benchmarks maps`, at two sizes:
-narrower windows, or of a fixed size on the ground, state too small errors at one of them. The first was raised from
-0.07 for the deep water of that benchmark."""
+SHARE_MATCHING, SHARE_ROUGHNESS = 0.25, 6.0
+DETAIL_CELLS, ROUGHNESS_CELLS = 1.0, 3.0
+"""Shares of the standard error: of that of single cells' matching, and of the roughness. Roughness is what windows of
+the first size take off the surface, over windows of the second: of slopes and ripples that is little, and these are
+measured well. The shares were found on built-in flats of other seeds than those of `python -m benchmarks maps`, at two
+sizes (docs/experiments.md, Maps)."""
 FLOOR = 3.0
 """Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
 PULL = 0.02
@@ -391,12 +392,11 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
 def standard_error(height: Height, matching: Height) -> Height:
     """Estimate the standard error of heights from that of the matching of single cells, and the roughness around them.
 
-    Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. Its
-    standard deviation there is that of the heights within a window. The shares are such that on built-in flats 95% of
-    the cells lie within 1.96 standard errors (`python -m benchmarks maps`).
+    Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. The shares
+    are such that on built-in flats some 95% of the cells lie within 1.96 standard errors, or more.
     """
-    mean = _blur(height, ROUGHNESS_CELLS)
-    roughness = np.sqrt(np.maximum(_blur((height - mean) ** 2, ROUGHNESS_CELLS), 0))
+    detail = height - _blur(height, DETAIL_CELLS)
+    roughness = np.sqrt(_blur(detail**2, ROUGHNESS_CELLS))
     return np.hypot(SHARE_MATCHING * _blur(matching, 2.0), SHARE_ROUGHNESS * roughness).astype(np.float32)
 
 
