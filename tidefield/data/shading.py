@@ -167,7 +167,7 @@ class _Model:
         """The normal equations of weighted observations; the points' colours are eliminated."""
         of_point = np.bincount(self.seen.point, weight)
         to_points = sparse.csr_array((weight, (self.seen.point, np.arange(len(weight)))))
-        sums, to_mean = to_points @ self.design, 1 / np.maximum(of_point, 1e-12)
+        sums, to_mean = sparse.csr_array(to_points @ self.design), 1 / np.maximum(of_point, 1e-12)
         back = sparse.csr_array((sparse.diags_array(to_mean) @ sums).T)
         products = self.design.T @ (sparse.diags_array(weight) @ self.design)
         right = self.design.T @ (weight[:, None] * self.value) - back @ (to_points @ self.value)
