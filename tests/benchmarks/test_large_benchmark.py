@@ -21,7 +21,8 @@ time.sleep(0.8)
 def test_time_and_memory_are_counted_for_the_stage_that_runs():
     stages = run_by_stage([sys.executable, "-c", STAGES], threads=1)
     assert list(stages)[-2:] == ["one", "two"]
-    assert stages["one"]["cpu_seconds"] > 0.8 > stages["two"]["cpu_seconds"]
+    assert stages["one"]["cpu_seconds"] > 0.8
+    assert stages["two"]["cpu_seconds"] < 0.5
     assert stages["two"]["seconds"] > 0.6
     assert stages["two"]["peak_bytes"] > 40e6 > stages["one"]["peak_bytes"]
     assert total(stages)["peak_bytes"] == stages["two"]["peak_bytes"]
