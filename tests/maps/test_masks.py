@@ -13,7 +13,7 @@ import shapely
 from tidefield.maps import contours, masks
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
-from tidefield.maps.masks import excess_green, find_water, read_water, write_classes, write_masks
+from tidefield.maps.masks import excess_green, find_water, level_water, read_water, write_classes, write_masks
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
 
 pytest.importorskip("rasterio")
@@ -79,12 +79,14 @@ def test_classes_polygons_and_waterline_are_written(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(contours, "MOST_CELLS", most)
     height, agreement, wet = flat()
     height[:20, :30] = np.nan
+    height[116:118, 136:138] += 0.5  # a post in the water
     plants = np.zeros(wet.shape, bool)
     plants[200:220, 200:230] = True
     colour = np.where(plants, np.array([70, 110, 50])[:, None, None], np.array([120, 110, 90])[:, None, None])
     known = np.isfinite(height)
     for name, kind, nodata, bands in (
         ("dsm", "float32", -9999.0, np.where(known, height, -9999)[None]),
+        ("sigma", "float32", -9999.0, np.where(known, 0.02, -9999)[None]),
         ("agreement", "uint8", 255.0, np.where(known, 100 * agreement, 255)[None]),
         ("colour", "uint8", None, np.concatenate([colour, 255 * known[None]])),
     ):
@@ -98,6 +100,17 @@ def test_classes_polygons_and_waterline_are_written(tmp_path: Path, monkeypatch:
     assert np.isnan(classes[:20, :30]).all()
     for value, true in ((GROUND, ~wet & ~plants & known), (VEGETATION, plants), (WATER, wet & ~plants)):
         assert ((classes == value) & true).sum() / ((classes == value) | true).sum() > 0.7
+    rasters = [Raster(tmp_path / f"{name}.tif", (name,)) for name in ("dsm", "sigma")]
+    level_water(*rasters, tmp_path / "classes.tif", water, GRID)
+    levelled, errors = (read_raster(raster.path)[0] for raster in rasters)
+    lake, post = classes == WATER, np.s_[116:118, 136:138]
+    lake[post] = False
+    [body] = water[1]
+    np.testing.assert_array_equal(levelled[lake], np.float32(body.level))
+    np.testing.assert_array_equal(errors[lake], np.float32(body.sigma))
+    np.testing.assert_array_equal(levelled[~lake], height[~lake])
+    assert (errors[~lake & known] == np.float32(0.02)).all()
+    assert np.isnan(errors[~known]).all()
     write_masks(tmp_path / "classes.tif", water, GRID, tmp_path / "masks")
     assert {name for name, _ in pyogrio.list_layers(tmp_path / "masks" / "masks.gpkg")} == {
         "vegetation",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tidefield.maps.surface import SHARE_MATCHING, standard_error
+from tidefield.maps.surface import SHARE_MATCHING, _smoothed, standard_error
 
 SIDE = 60
 
@@ -20,3 +20,17 @@ def test_slopes_add_little_to_the_error_and_rims_their_height():
     crown = standard_error((x >= 30).astype(np.float32), matching)
     assert (crown[middle][:, 9:11] > 0.5).all()  # a rim of 1 m, a cell to either side
     np.testing.assert_allclose(crown[20:40, 5:15], level[20:40, 5:15], rtol=0.05)
+
+
+def test_noise_is_taken_off_slopes_and_rims_stay():
+    random = np.random.default_rng(2)
+    y, x = np.mgrid[:80, :120].astype(np.float32)
+    slope, rim = 0.25 * x, np.where((x > 60) & (y > 40), 8.0, 0.0)
+    noise = 0.25 * random.standard_normal(x.shape)
+    made = _smoothed((slope + noise).astype(np.float32), 1.0) - slope
+    inner = np.s_[8:-8, 8:-8]
+    assert made[inner].std() < 0.4 * noise[inner].std()
+    high = _smoothed((rim + noise).astype(np.float32), 1.0)
+    assert np.abs(high[45:, 56:60]).max() < 1.0
+    assert np.abs(high[45:, 61:65] - 8).max() < 1.0
+    assert (high - rim)[48:-8, 50:-8].std() < 0.8 * noise.std()

@@ -31,7 +31,7 @@ from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
-from tidefield.maps.masks import Body, read_water, write_classes, write_masks
+from tidefield.maps.masks import Body, level_water, read_water, write_classes, write_masks
 from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
 from tidefield.maps.report import write_report
@@ -306,13 +306,13 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
             out / MAIN, ("photograph that contributes most",), "uint16", 0.0,
             tags={"PHOTOGRAPHS": names, "VALUES": "1 is the first of PHOTOGRAPHS"}, average=False,
         ),
-        "dsm": Raster(out / DSM, ("height of the surface",), unit=unit),
-        "sigma": Raster(out / SIGMA, ("standard error of the height",), unit=unit),
+        "dsm": _surface(out, unit),
+        "sigma": _errors(out, unit),
         "agreement": Raster(out / AGREEMENT, ("mean correlation of the photographs, per cent",), "uint8", 255.0),
     }  # fmt: skip
     if job.fill:
         rasters["filled"] = Raster(out / FILLED, ("1 where the map is filled",), "uint8", 255.0, average=False)
-    totals = {"cells": 0, "seen": 0, "sigma": [], "views": []}
+    totals = {"cells": 0, "seen": 0, "views": []}
     with ExitStack() as stack:
         writers: dict[str, RasterWriter] = {
             name: stack.enter_context(raster_writer(raster, grid)) for name, raster in rasters.items()
@@ -333,39 +333,44 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
                 writer.write(strip.row, bands[name])
             totals["cells"] += int(strip.shown.sum())
             totals["seen"] += int(strip.seen.sum())
-            some = strip.sigma[strip.seen][::97]
-            totals["sigma"].append(some)
             totals["views"].append(strip.count[strip.seen][::97])
             progress(strip.row + strip.height.shape[0], grid.rows)
-    sigma, views = (np.concatenate(totals[name]) for name in ("sigma", "views"))
+    views = np.concatenate(totals["views"])
     return {
         "cells": totals["cells"],
         "cells_seen": totals["seen"],
         "area": totals["seen"] * grid.cell**2,
-        "sigma_median": float(np.median(sigma)) if len(sigma) else None,
-        "sigma_95": float(np.percentile(sigma, 95)) if len(sigma) else None,
         "views_median": float(np.median(views)) if len(views) else None,
     }
 
 
+def _surface(out: Path, unit: str) -> Raster:
+    return Raster(out / DSM, ("height of the surface",), unit=unit)
+
+
+def _errors(out: Path, unit: str) -> Raster:
+    return Raster(out / SIGMA, ("standard error of the height",), unit=unit)
+
+
 def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Write what follows from surface and orthophoto: terrain, hillshades, classes, points, contours and sections.
+    """Level the water of the surface, and write what follows: terrain, hillshades, classes, points and lines.
 
     Returns:
         Figures of them.
     """
     grid, unit = job.grid, job.grid.frame.unit
-    write_terrain(out / DSM, out / SIGMA, Raster(out / DTM, ("height of the ground",), unit=unit), grid)
-    progress(1, 6)
-    for heights, shaded in ((DSM, DSM_HILLSHADE), (DTM, DTM_HILLSHADE)):
-        write_hillshade(out / heights, Raster(out / shaded, ("hillshade",), "uint8", 0.0), grid)
-    progress(2, 6)
     water = read_water(out / DSM, out / AGREEMENT, out / ORTHOPHOTO, grid)
     classes = Raster(
         out / CLASSES, ("class",), "uint8", 0.0, tags={"VALUES": "2 ground, 3 vegetation, 9 water"}, average=False
     )
     write_classes(classes, out / DSM, out / ORTHOPHOTO, water, grid)
     write_masks(out / CLASSES, water, grid, out / MASKS)
+    progress(1, 6)
+    level_water(_surface(out, unit), _errors(out, unit), out / CLASSES, water, grid)
+    progress(2, 6)
+    write_terrain(out / DSM, out / SIGMA, Raster(out / DTM, ("height of the ground",), unit=unit), grid)
+    for heights, shaded in ((DSM, DSM_HILLSHADE), (DTM, DTM_HILLSHADE)):
+        write_hillshade(out / heights, Raster(out / shaded, ("hillshade",), "uint8", 0.0), grid)
     progress(3, 6)
     points, found = write_cloud(out, grid)
     progress(4, 6)
@@ -378,12 +383,20 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
         write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, unit)
     progress(6, 6)
     return {
+        **_typical_errors(out),
         "points": points,
         "classes": found,
         "water": [_described(body) for body in water[1]],
         "contours": {"interval": interval, "lines": len(lines)},
         "sections": len(job.sections),
     }
+
+
+def _typical_errors(out: Path) -> dict[str, float]:
+    """Median and 95th percentile of the standard errors, of a part of the cells that two photographs see."""
+    parts = zip(blocks(out / SIGMA), blocks(out / VIEWS), strict=True)
+    sigma = np.concatenate([error[views >= FEWEST_VIEWS][::97] for (_, _, error), (_, _, views) in parts])
+    return {"sigma_median": float(np.median(sigma)), "sigma_95": float(np.percentile(sigma, 95))}
 
 
 def _described(body: Body) -> dict[str, float]:
@@ -438,7 +451,7 @@ def make_map(
         make_tiles(job, out, meter, elsewhere)
     with bar("Writing") as meter:
         found = join(job, out, meter)
-    if not found["cells"]:
+    if not found["cells_seen"]:
         raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
     grid = job.grid
     with bar("Terrain") as meter:

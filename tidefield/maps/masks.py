@@ -1,4 +1,4 @@
-"""Find plants and water on a map: a raster of classes, polygons, and the waterline with its height.
+"""Find plants and water on a map: a raster of classes, polygons, and the waterline with its height; level the water.
 
 Plants are green: their excess green (Woebbecke and others, Color indices for weed identification under various soil,
 residue, and lighting conditions, 1995) is above a threshold. Water is where photographs do not agree, for its surface
@@ -19,14 +19,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.contours import read_reduced
 from tidefield.maps.grid import Grid
-from tidefield.maps.rasters import Raster, need, raster_writer
+from tidefield.maps.rasters import NODATA, Raster, need, raster_writer
 from tidefield.maps.terrain import blocks
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
@@ -39,7 +39,9 @@ LEVEL_M, AGREEMENT_M = 0.15, 0.2
 SLOPE, ROUGHNESS_M = 0.02, 0.02
 """Slope of, and deviation of heights in, windows of level water, at most."""
 TOLERANCE_M = 0.03
-"""Heights of water differ from its level by so much, or twice their spread, at most."""
+"""Smoothed heights of water differ from its level by so much, or twice their spread, at most, ..."""
+OUTLIERS = 3
+"""... and those of single cells by so many times that."""
 SPREAD_M, SPREAD_CELLS = 0.01, 0.15
 """Largest spread of the smoothed heights of a body of water, in metres or in cells of the map."""
 LOWER_M, LOWER_SHARE = 0.01, 0.15
@@ -62,7 +64,7 @@ class Body:
     Attributes:
         level: its height, vertical units.
         sigma: standard error of the level, without that of the map's datum.
-        tolerance: by which heights of its cells may differ.
+        tolerance: by which smoothed heights of its cells may differ.
         area: square horizontal units.
     """
 
@@ -70,6 +72,10 @@ class Body:
     sigma: float
     tolerance: float
     area: float
+
+
+Water = tuple[np.ndarray, Sequence[Body], Grid]
+"""The number of the body in each cell, from 1, 0 for none; the bodies; and the cells, larger than a large map's."""
 
 
 def excess_green(colour: UInt8[np.ndarray, "3 h w"]) -> Float[np.ndarray, "h w"]:
@@ -117,7 +123,7 @@ def find_water(
         level = float(np.median(heights))
         tolerance = max(TOLERANCE_M, 2 * _spread(heights - level))
         mine = known & (np.abs(mean - level) <= tolerance) & (agree < SHORE_AGREEMENT)
-        mine &= np.abs(above - level) <= 3 * tolerance
+        mine &= np.abs(above - level) <= OUTLIERS * tolerance
         mine[places[k - 1]] |= inside
         parts = _components(mine)[1]
         touched = np.unique(parts[places[k - 1]][inside])
@@ -180,8 +186,8 @@ def _level_error(height: np.ndarray, wet: np.ndarray, level: float, side: int) -
     return float(np.std(medians, ddof=1))
 
 
-def read_water(dsm: Path, agreement: Path, orthophoto: Path, grid: Grid) -> tuple[np.ndarray, list[Body], Grid]:
-    """Find water on a finished map, in cells that are as much larger as memory asks; returns those cells, too.
+def read_water(dsm: Path, agreement: Path, orthophoto: Path, grid: Grid) -> Water:
+    """Find water on a map's rasters, in cells that are as much larger as memory asks.
 
     Args:
         dsm, agreement, orthophoto: of the map; agreement in per cent.
@@ -194,34 +200,72 @@ def read_water(dsm: Path, agreement: Path, orthophoto: Path, grid: Grid) -> tupl
     return labels, bodies, coarse
 
 
-def write_classes(
-    out: Raster, dsm: Path, orthophoto: Path, water: tuple[np.ndarray, Sequence[Body], Grid], grid: Grid
-) -> None:
+def write_classes(out: Raster, dsm: Path, orthophoto: Path, water: Water, grid: Grid) -> None:
     """Write the class of each cell: ground, vegetation or water, as LAS numbers them; 0 where there is no surface.
 
     Args:
         out: what to write.
         dsm, orthophoto: of the map.
-        water: number of the body in coarse cells, the bodies, and those cells.
+        water: see `read_water`.
         grid: of the map.
     """
-    labels, bodies, coarse = water
-    factor = round(coarse.cell / grid.cell)
-    if factor > 1:  # the shore within a coarse cell is found by its height
-        labels = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
-    level = np.array([np.nan, *(body.level for body in bodies)], np.float32)
-    tolerance = np.array([0, *(body.tolerance for body in bodies)], np.float32)
+    level, tolerance = _levels(water[1]), _tolerances(water[1])
     with raster_writer(out, grid) as writer:
         for (row, count, height), colour in zip(blocks(dsm), _colours(orthophoto, around=4), strict=True):
-            rows = np.minimum(np.arange(row, row + count) // factor, labels.shape[0] - 1)
-            columns = np.minimum(np.arange(grid.columns) // factor, labels.shape[1] - 1)
-            body = labels[np.ix_(rows, columns)]
+            body = _body_of_cells(water, grid, row, count)
             wet = body > 0
-            if factor > 1:
+            if water[2].cell > grid.cell:  # the shore within a coarse cell is found by its height
                 wet &= height <= level[body] + tolerance[body]
             green = excess_green(colour)[4 : 4 + count] > GREEN
             classes = np.where(green, VEGETATION, np.where(wet, WATER, GROUND))
             writer.write(row, np.where(np.isfinite(height), classes, 0)[None])
+
+
+def level_water(dsm: Raster, sigma: Raster, classes: Path, water: Water, grid: Grid) -> None:
+    """Give the water of a surface its level and the level's standard error ("hydro-flattening"), in place.
+
+    Matching has little to hold on to on water: its cells are much less certain than the level that they share. What
+    rises from the water, or is far from its level for another reason, stays as it was measured.
+
+    Args:
+        dsm, sigma: heights of the surface and their standard errors, which are there, and are written again.
+        classes: of the cells.
+        water: see `read_water`.
+        grid: of the map.
+    """
+    if not water[1]:
+        return
+    level, tolerance = _levels(water[1]), _tolerances(water[1])
+    error = np.array([np.nan, *(body.sigma for body in water[1])], np.float32)
+    with raster_writer(dsm, grid) as heights, raster_writer(sigma, grid) as errors:
+        parts = zip(blocks(dsm.path), blocks(sigma.path), blocks(classes), strict=True)
+        for (row, count, height), (_, _, own), (_, _, kind) in parts:
+            body = _body_of_cells(water, grid, row, count)
+            wet = (kind == WATER) & (np.abs(height - level[body]) <= OUTLIERS * tolerance[body])
+            heights.write(row, np.nan_to_num(np.where(wet, level[body], height), nan=NODATA)[None])
+            errors.write(row, np.nan_to_num(np.where(wet, error[body], own), nan=NODATA)[None])
+
+
+def _levels(bodies: Sequence[Body]) -> Float32[np.ndarray, " bodies"]:
+    """Level of the body of each number, NaN for 0."""
+    return np.array([np.nan, *(body.level for body in bodies)], np.float32)
+
+
+def _tolerances(bodies: Sequence[Body]) -> Float32[np.ndarray, " bodies"]:
+    return np.array([0, *(body.tolerance for body in bodies)], np.float32)
+
+
+def _body_of_cells(water: Water, grid: Grid, row: int, count: int) -> Int[np.ndarray, "h w"]:
+    """Number of the body of water in some whole rows of cells, 0 for none; coarse cells reach one further."""
+    labels, _, coarse = water
+    factor = round(coarse.cell / grid.cell)
+    rows = np.minimum(np.arange(row, row + count) // factor, labels.shape[0] - 1)
+    columns = np.minimum(np.arange(grid.columns) // factor, labels.shape[1] - 1)
+    if factor > 1:
+        first, last = max(rows[0] - 1, 0), rows[-1] + 2
+        labels = cv2.dilate(labels[first:last].astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+        rows = rows - first
+    return labels[np.ix_(rows, columns)]
 
 
 def _colours(path: Path, around: int) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
@@ -230,7 +274,7 @@ def _colours(path: Path, around: int) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
         yield np.stack([np.nan_to_num(band[2]).astype(np.uint8) for band in (red, green, blue)])
 
 
-def write_masks(classes: Path, water: tuple[np.ndarray, Sequence[Body], Grid], grid: Grid, folder: Path) -> None:
+def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
     """Write masks.gpkg with the layers vegetation, water and waterline, and a GeoJSON of each, into a folder.
 
     Plants are outlined in cells that are as much larger as memory asks.

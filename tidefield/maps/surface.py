@@ -6,7 +6,7 @@ mean of the others by windowed normalised cross-correlation, and with their medi
 the surface (the vertical line locus of photogrammetry; Collins, A space-sweep approach to true multi-image matching,
 1996, with windows that follow the surface found so far). A parabola through the best score and its neighbours places it
 between the heights that were tried. Where that is not determined, as on blank and mirroring water, the surface of the
-pairs stays.
+pairs stays. A bilateral and a guided filter take noise off after each search, and keep rims and slopes.
 
 The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
 score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
@@ -63,8 +63,11 @@ DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 """Grey values of 255 beyond which a photograph's difference from the median of all is an occlusion, and the weight of
 the mean difference, as a share of that, against the correlation."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
-"""Range, in steps, and radius, in cells, of the bilateral filter that takes noise off level ground."""
-SHARE_MATCHING, SHARE_ROUGHNESS = 0.25, 6.0
+"""Range, in steps, and radius, in cells, of the bilateral filter that takes noise off between rims."""
+GUIDED_STEPS, GUIDED_CELLS = 0.45, 3
+"""Deviation of heights, in steps, at which half of the guided filter's result is smoothed, and radius of its windows,
+in cells."""
+SHARE_MATCHING, SHARE_ROUGHNESS = 0.3, 7.0
 DETAIL_CELLS, ROUGHNESS_CELLS = 1.0, 3.0
 """Shares of the standard error: of that of single cells' matching, and of the roughness. Roughness is what windows of
 the first size take off the surface, over windows of the second: of slopes and ripples that is little, and these are
@@ -527,4 +530,24 @@ def _cleaned(found: np.ndarray, sigma: np.ndarray, before: np.ndarray, step: flo
     height = (before + share * (share * shift + (1 - share) * around)).astype(np.float32)
     median = cv2.medianBlur(height, 5)
     height = np.where(np.abs(height - median) > 3 * step, median, height).astype(np.float32)
-    return cv2.bilateralFilter(height, 9, float(BILATERAL_STEPS * step), BILATERAL_CELLS)
+    return _smoothed(height, step)
+
+
+def _smoothed(height: Height, step: float) -> Height:
+    """Take noise off a surface, and keep its rims and slopes.
+
+    A bilateral filter keeps rims, but makes stairs of slopes. A guided filter (He, Sun and Tang, Guided image
+    filtering, 2013, section 3, guided by its own input) keeps slopes, for it fits lines to windows where the surface is
+    smooth. What it would leave as it is, at rims, is the bilateral filter's result here.
+    """
+    side = (2 * GUIDED_CELLS + 1, 2 * GUIDED_CELLS + 1)
+
+    def mean(values: Height) -> Height:
+        return cv2.blur(values, side, borderType=cv2.BORDER_REPLICATE)
+
+    base = float(height.mean())  # squares of what is small keep their digits
+    around = mean(height - base)
+    variance = np.maximum(mean((height - base) ** 2) - around**2, 0)
+    rough = variance / (variance + (GUIDED_STEPS * step) ** 2)
+    sharp = cv2.bilateralFilter(height, 9, float(BILATERAL_STEPS * step), BILATERAL_CELLS)
+    return (mean(rough) * (sharp - base) + mean((1 - rough) * around) + base).astype(np.float32)
