@@ -22,7 +22,7 @@ from tidefield.files import completed_folder, read_json, write_json
 from tidefield.machine import describe
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, map_frame
-from tidefield.maps.make import CLASSES, DSM, MAP_FILE, ORTHOPHOTO, SIGMA
+from tidefield.maps.make import CLASSES, DSM, DTM, MAP_FILE, ORTHOPHOTO, SIGMA
 from tidefield.maps.surface import COARSEST, sparse_surface
 
 MAPS_FILE = "maps.json"
@@ -86,13 +86,15 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
         transform = dataset.transform
     with rasterio.open(out / SIGMA) as dataset:
         sigma = dataset.read(1, masked=True).filled(np.nan)
+    with rasterio.open(out / DTM) as dataset:
+        terrain = dataset.read(1, masked=True).filled(np.nan)
     with rasterio.open(out / ORTHOPHOTO) as dataset:
         shown = dataset.read([1, 2, 3]).transpose(1, 2, 0).astype(np.float64)
     assert scene.points is not None
     middle = float(np.median(scene.points.xyz_world[:, 2].numpy()))
     frame = map_frame(scene, None)
     grid = Grid(frame, transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
-    true, colour, classes = _truth(root, grid)
+    true, bare, colour, classes = _truth(root, grid)
     with rasterio.open(out / CLASSES) as dataset:
         found_classes = dataset.read(1)
     # The grid of coarse cells begins at the same corner.
@@ -108,6 +110,7 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
         "cells": int(kept.sum()),
         "cell_m": grid.cell,
         "heights": {name: errors((values - true)[kept]) for name, values in found.items()},
+        "terrain": {name: errors((values - bare)[kept]) for name, values in (("map", terrain), ("surface", height))},
         "within": float((np.abs(height - true) < 1.96 * sigma)[kept].mean()),
         "sigma_median_m": float(np.median(sigma[kept])),
         "orthophoto_psnr": float(10 * np.log10(255**2 / mse)),
@@ -150,21 +153,23 @@ def _whole(grid: Grid) -> Any:
     return Tile(grid, 0, 0, max(grid.rows, grid.columns), 0)
 
 
-def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights, colours and classes of a flat at the centres of cells."""
+def _truth(root: Path, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Heights with and without plants, colours and classes of a flat at the centres of cells."""
     about = json.loads((root / "truth" / "truth.json").read_text())["map"]
     west, north = about["first_pixel_centre_east_north_m"]
     cell = about["pixel_step_east_north_m"][0]
     east = (grid.west + (np.arange(grid.columns) + 0.5) * grid.cell - west) / cell
     south = (north - (grid.north - (np.arange(grid.rows) + 0.5) * grid.cell)) / cell
     u, v = np.meshgrid(east.astype(np.float32), south.astype(np.float32))
-    height = cv2.remap(np.load(root / "truth" / "surface.npy"), u, v, cv2.INTER_LINEAR)
+    height, bare = (
+        cv2.remap(np.load(root / "truth" / f"{name}.npy"), u, v, cv2.INTER_LINEAR) for name in ("surface", "bare")
+    )
     picture = cv2.imread(str(root / "truth" / "orthophoto.png"))
     assert picture is not None
     classes = cv2.imread(str(root / "truth" / "classes.png"), cv2.IMREAD_GRAYSCALE)
     assert classes is not None
     colour = cv2.remap(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), u, v, cv2.INTER_LINEAR).astype(np.float64)
-    return height, colour, cv2.remap(classes, u, v, cv2.INTER_NEAREST)
+    return height, bare, colour, cv2.remap(classes, u, v, cv2.INTER_NEAREST)
 
 
 def semi_global(scene: Scene, grid: Grid) -> np.ndarray:
@@ -278,6 +283,22 @@ def tables(record: dict[str, Any]) -> list[Table]:
         )
         for name, found in record["figures"].items()
     ]
+    ground = ("map", "surface")
+    without = [
+        (
+            name,
+            *(
+                f"{100 * found['terrain'][method][measure]:.1f}"
+                for method in ground
+                for measure in ("rmse_m", "nmad_m", "mean_m")
+            ),
+        )
+        for name, found in record["figures"].items()
+    ]
+    of_ground = [
+        "flat",
+        *(f"{name}: {measure}" for name in ("terrain", "surface") for measure in ("RMSE", "NMAD", "mean")),
+    ]
     others = [
         "flat",
         "cell, cm",
@@ -329,6 +350,7 @@ def tables(record: dict[str, Any]) -> list[Table]:
     ]
     return [
         Table("Errors of heights, cm", columns, rows),
+        Table("Errors of the ground, cm: terrain, and the surface as it is", of_ground, without),
         Table("Maps", others, more),
         Table("Classes: shares of the cells, and intersection over union", shares, masks),
         Table("Waterlines, cm", ["flat", "area, m2", "height", "error", "standard error"], levels),

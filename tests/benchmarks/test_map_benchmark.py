@@ -44,11 +44,14 @@ def test_tables_show_what_was_stored():
         "water": water,
         "cell_m": 0.05,
         "heights": heights,
+        "terrain": {"map": heights["map"], "surface": {"rmse_m": 0.6, "nmad_m": 0.1, "mean_m": 0.2}},
         "within": 0.951,
         "sigma_median_m": 0.012,
     }
-    first, second, third, fourth = tables({"figures": {"creek": {**figures, "orthophoto_psnr": 31.26, "seconds": 3.0}}})
+    record = {"figures": {"creek": {**figures, "orthophoto_psnr": 31.26, "seconds": 3.0}}}
+    first, ground, second, third, fourth = tables(record)
     assert "| creek | 2.0 | 1.0 | -0.5 |" in first.markdown()
+    assert "| creek | 2.0 | 1.0 | -0.5 | 60.0 | 10.0 | 20.0 |" in ground.markdown()
     assert "95.1%" in second.markdown()
     assert "31.3" in second.markdown()
     assert "| 25.0% | 50.0% | - |" in third.markdown()
@@ -89,7 +92,7 @@ def test_an_orthophoto_is_warped_to_where_the_photograph_shows_it(tmp_path: Path
     write_survey(survey, tmp_path / "scene")
     scene = load_scene(tmp_path / "scene", hold_out=False, cache=tmp_path / "cache")
     grid = Grid(map_frame(scene, None), -6.0, 6.0, 0.1, 120, 120, 0.0)
-    height, colour, _ = _truth(tmp_path / "scene", grid)
+    height, _, colour, _ = _truth(tmp_path / "scene", grid)
     position = (scene.cameras.position_world + scene.origin_world).numpy()
     index = int(np.linalg.norm(position[:, :2], axis=1).argmin())
     view = View(scene.cameras[index], Tile(grid, 0, 0, 120, 0))

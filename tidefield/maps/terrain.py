@@ -3,7 +3,7 @@
 Ground is found on coarse cells, from the low part of each, by progressive morphological opening (Pingel, Clarke and
 McBride, An improved simple morphological filter for the terrain classification of airborne LIDAR data, 2013): what an
 opening of a growing window removes, and is higher than the ground could rise within the window, is no ground. The
-ground between is interpolated. Fine cells near it keep their own heights.
+ground between is interpolated. Fine cells near it keep their own heights, but around what was taken off.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ LEAST_RISE_M = 0.1
 """What rises less above the ground belongs to it: ripples, and errors."""
 GROUND_SIGMAS = 2.0
 """A fine cell belongs to the ground if it is not higher above it than so many standard errors, or `LEAST_RISE_M`."""
+RIM_M = 0.15
+"""So far around what is taken off, or one cell, higher fine cells are no ground either: matching widens rims."""
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
 ROWS = 512
 """Of a raster that are read at once."""
@@ -114,15 +116,19 @@ def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
         first += whole
         held = [joined[whole * factor :]]
     ground, _ = coarse_ground(low, factor * cell_m, grid.frame.metre_up)
+    rim = max(1, round(RIM_M / cell_m))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
     with raster_writer(out, grid) as writer:
-        for (row, count, height), (_, _, error) in zip(blocks(dsm), blocks(sigma), strict=True):
+        for (row, count, height), (_, _, error) in zip(blocks(dsm, rim), blocks(sigma, rim), strict=True):
             u = ((np.arange(grid.columns) + 0.5) / factor - 0.5).astype(np.float32)
-            v = ((np.arange(row, row + count) + 0.5) / factor - 0.5).astype(np.float32)
+            v = ((np.arange(row - rim, row + count + rim) + 0.5) / factor - 0.5).astype(np.float32)
             u, v = np.meshgrid(u, v)
             below = cv2.remap(ground, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             rise = np.maximum(GROUND_SIGMAS * np.minimum(np.nan_to_num(error), LEAST_RISE_M), LEAST_RISE_M)
-            terrain = np.where(height - below <= rise * grid.frame.metre_up, height, below)
-            writer.write(row, np.where(np.isfinite(height), terrain, NODATA)[None])
+            other = height - below > rise * grid.frame.metre_up
+            near = cv2.dilate(other.astype(np.uint8), disk) > 0
+            terrain = np.where(near, np.minimum(height, below), height)[rim : rim + count]
+            writer.write(row, np.nan_to_num(terrain, nan=NODATA)[None])
 
 
 def _quantile(part: np.ndarray) -> np.ndarray:
