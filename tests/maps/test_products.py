@@ -112,6 +112,8 @@ def test_contours_of_a_cone_are_circles_at_their_heights():
 
 def test_the_interval_is_round_and_large_maps_are_reduced(tmp_path: Path):
     assert interval_of(np.linspace(0, 10, 100, dtype=np.float32).reshape(10, 10)) == 0.5
+    assert interval_of(np.full((10, 10), 2.0, np.float32)) == 0.01
+    assert interval_of(np.full((10, 10), 2.0, np.float32), scale=3.28) == pytest.approx(0.05)
     large = Grid(LOCAL, 0.0, 0.0, 0.1, 2002, 2001, 0.0)
     y, x = np.mgrid[: large.rows, : large.columns].astype(np.float32)
     small, grid = read_reduced(written(tmp_path / "large.tif", x + 3 * y, large), large)

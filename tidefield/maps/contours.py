@@ -18,7 +18,9 @@ from tidefield.maps.rasters import need
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
 ABOUT = 20
-"""Contours that a map has about, if no interval is given."""
+"""Contours that a map has about, if no interval is given, ..."""
+LEAST_M = 0.01
+"""... and the least interval then: a level map has errors, which are no shapes."""
 MOST_CELLS = 4_000_000
 """Contours are drawn on cells that are as much larger as this many allow."""
 SHORTEST_CELLS = 8.0
@@ -28,11 +30,16 @@ SIMPLIFIED_CELLS = 0.3
 LAYER = "contours"
 
 
-def interval_of(height: Float[np.ndarray, "h w"]) -> float:
-    """Choose an interval of 1, 2 or 5 times a power of ten for about `ABOUT` contours."""
+def interval_of(height: Float[np.ndarray, "h w"], scale: float = 1.0) -> float:
+    """Choose an interval of 1, 2 or 5 times a power of ten for about `ABOUT` contours.
+
+    Args:
+        height: of cells, NaN where there are none.
+        scale: vertical units per metre.
+    """
     known = height[np.isfinite(height)]
     spread = float(np.ptp(np.percentile(known, [1, 99]))) if len(known) else 1.0
-    least = max(spread / ABOUT, 1e-6)
+    least = max(spread / ABOUT, LEAST_M * scale)
     power = 10.0 ** math.floor(math.log10(least))
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= least * (1 - 1e-9))
 

@@ -375,7 +375,7 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
     points, found = write_cloud(out, grid)
     progress(4, 6)
     height, coarse = read_reduced(out / DTM, grid)
-    interval = job.interval or interval_of(height)
+    interval = job.interval or interval_of(height, grid.frame.metre_up)
     lines = contours(height, coarse, interval)
     write_contours(lines, grid.frame, out / CONTOURS)
     progress(5, 6)
