@@ -110,7 +110,7 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
         "cells": int(kept.sum()),
         "cell_m": grid.cell,
         "heights": {name: errors((values - true)[kept]) for name, values in found.items()},
-        "terrain": {name: errors((values - bare)[kept]) for name, values in (("map", terrain), ("surface", height))},
+        "ground": {"terrain": errors((terrain - bare)[kept]), "surface": errors((height - bare)[kept])},
         "within": float((np.abs(height - true) < 1.96 * sigma)[kept].mean()),
         "sigma_median_m": float(np.median(sigma[kept])),
         "orthophoto_psnr": float(10 * np.log10(255**2 / mse)),
@@ -270,35 +270,6 @@ def _stereo_points(scene: Scene, i: int, j: int, ground: np.ndarray) -> np.ndarr
 
 def tables(record: dict[str, Any]) -> list[Table]:
     """The stored figures as tables: heights, and what else there is of each map."""
-    methods = ("map", "sparse points", "semi-global")
-    columns = ["flat", *(f"{name}: {measure}" for name in methods for measure in ("RMSE", "NMAD", "mean"))]
-    rows = [
-        (
-            name,
-            *(
-                f"{100 * found['heights'][method][measure]:.1f}"
-                for method in methods
-                for measure in ("rmse_m", "nmad_m", "mean_m")
-            ),
-        )
-        for name, found in record["figures"].items()
-    ]
-    ground = ("map", "surface")
-    without = [
-        (
-            name,
-            *(
-                f"{100 * found['terrain'][method][measure]:.1f}"
-                for method in ground
-                for measure in ("rmse_m", "nmad_m", "mean_m")
-            ),
-        )
-        for name, found in record["figures"].items()
-    ]
-    of_ground = [
-        "flat",
-        *(f"{name}: {measure}" for name in ("terrain", "surface") for measure in ("RMSE", "NMAD", "mean")),
-    ]
     others = [
         "flat",
         "cell, cm",
@@ -349,9 +320,28 @@ def tables(record: dict[str, Any]) -> list[Table]:
         for body in found["water"]
     ]
     return [
-        Table("Errors of heights, cm", columns, rows),
-        Table("Errors of the ground, cm: terrain, and the surface as it is", of_ground, without),
+        _errors_table("Errors of heights, cm", record, "heights", ("map", "sparse points", "semi-global")),
+        _errors_table(
+            "Errors of the ground, cm: terrain, and the surface as it is", record, "ground", ("terrain", "surface")
+        ),
         Table("Maps", others, more),
         Table("Classes: shares of the cells, and intersection over union", shares, masks),
         Table("Waterlines, cm", ["flat", "area, m2", "height", "error", "standard error"], levels),
     ]
+
+
+def _errors_table(title: str, record: dict[str, Any], key: str, methods: Sequence[str]) -> Table:
+    """Stored errors, in cm, of what stands side by side under a key of every flat."""
+    rows = [
+        (
+            name,
+            *(
+                f"{100 * found[key][method][measure]:.1f}"
+                for method in methods
+                for measure in ("rmse_m", "nmad_m", "mean_m")
+            ),
+        )
+        for name, found in record["figures"].items()
+    ]
+    columns = ["flat", *(f"{name}: {measure}" for name in methods for measure in ("RMSE", "NMAD", "mean"))]
+    return Table(title, columns, rows)

@@ -44,7 +44,7 @@ def test_tables_show_what_was_stored():
         "water": water,
         "cell_m": 0.05,
         "heights": heights,
-        "terrain": {"map": heights["map"], "surface": {"rmse_m": 0.6, "nmad_m": 0.1, "mean_m": 0.2}},
+        "ground": {"terrain": heights["map"], "surface": {"rmse_m": 0.6, "nmad_m": 0.1, "mean_m": 0.2}},
         "within": 0.951,
         "sigma_median_m": 0.012,
     }

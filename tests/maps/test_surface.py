@@ -1,4 +1,4 @@
-"""Standard errors of surfaces whose shapes are known."""
+"""Standard errors and smoothing of surfaces whose shapes are known."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def write_classes(out: Raster, dsm: Path, orthophoto: Path, water: Water, grid: 
         water: see `read_water`.
         grid: of the map.
     """
-    level, tolerance = _levels(water[1]), _tolerances(water[1])
+    level, tolerance = (_of_bodies(name, water[1]) for name in ("level", "tolerance"))
     with raster_writer(out, grid) as writer:
         for (row, count, height), colour in zip(blocks(dsm), _colours(orthophoto, around=4), strict=True):
             body = _body_of_cells(water, grid, row, count)
@@ -235,8 +235,7 @@ def level_water(dsm: Raster, sigma: Raster, classes: Path, water: Water, grid: G
     """
     if not water[1]:
         return
-    level, tolerance = _levels(water[1]), _tolerances(water[1])
-    error = np.array([np.nan, *(body.sigma for body in water[1])], np.float32)
+    level, tolerance, error = (_of_bodies(name, water[1]) for name in ("level", "tolerance", "sigma"))
     with raster_writer(dsm, grid) as heights, raster_writer(sigma, grid) as errors:
         parts = zip(blocks(dsm.path), blocks(sigma.path), blocks(classes), strict=True)
         for (row, count, height), (_, _, own), (_, _, kind) in parts:
@@ -246,13 +245,9 @@ def level_water(dsm: Raster, sigma: Raster, classes: Path, water: Water, grid: G
             errors.write(row, np.nan_to_num(np.where(wet, error[body], own), nan=NODATA)[None])
 
 
-def _levels(bodies: Sequence[Body]) -> Float32[np.ndarray, " bodies"]:
-    """Level of the body of each number, NaN for 0."""
-    return np.array([np.nan, *(body.level for body in bodies)], np.float32)
-
-
-def _tolerances(bodies: Sequence[Body]) -> Float32[np.ndarray, " bodies"]:
-    return np.array([0, *(body.tolerance for body in bodies)], np.float32)
+def _of_bodies(attribute: str, bodies: Sequence[Body]) -> Float32[np.ndarray, " bodies"]:
+    """An attribute of the body of each number, NaN for 0."""
+    return np.array([np.nan, *(getattr(body, attribute) for body in bodies)], np.float32)
 
 
 def _body_of_cells(water: Water, grid: Grid, row: int, count: int) -> Int[np.ndarray, "h w"]:

@@ -546,8 +546,9 @@ def _smoothed(height: Height, step: float) -> Height:
         return cv2.blur(values, side, borderType=cv2.BORDER_REPLICATE)
 
     base = float(height.mean())  # squares of what is small keep their digits
-    around = mean(height - base)
-    variance = np.maximum(mean((height - base) ** 2) - around**2, 0)
+    above = height - base
+    around = mean(above)
+    variance = np.maximum(mean(above**2) - around**2, 0)
     rough = variance / (variance + (GUIDED_STEPS * step) ** 2)
     sharp = cv2.bilateralFilter(height, 9, float(BILATERAL_STEPS * step), BILATERAL_CELLS)
     return (mean(rough) * (sharp - base) + mean((1 - rough) * around) + base).astype(np.float32)
