@@ -13,7 +13,7 @@ from tidefield.data.load import load_scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps import surface
 from tidefield.maps.grid import Grid, Tile, map_frame
-from tidefield.maps.stereo import Rectified, choose_pairs, fill_from_nearest, stereo_heights
+from tidefield.maps.stereo import Rectified, choose_pairs, fill_gaps, stereo_heights
 from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
 
@@ -101,6 +101,48 @@ def test_cells_are_projected_into_the_photographs_above_them_only(scene, monkeyp
     assert len(projected) == len(loaded.names) - len(away)
 
 
-def test_holes_have_the_nearest_height():
-    height = np.array([[1.0, np.nan, np.nan, 4.0]], np.float32)
-    assert fill_from_nearest(height).tolist() == [[1.0, 1.0, 4.0, 4.0]]
+def test_the_error_is_large_where_neither_pairs_nor_photographs_determine_the_height(
+    scene, monkeypatch: pytest.MonkeyPatch
+):
+    loaded, _ = scene
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    start = sparse_surface(loaded, grid.coarser(COARSEST))
+    rough = start.on(tile, surface.PAD) + np.random.default_rng(0).normal(0, 0.5, (128, 128)).astype(np.float32)
+    rough[:, 48:80] = np.nan
+    monkeypatch.setattr(surface, "stereo_heights", lambda *_: rough)
+    blank = GreyPhotographs(loaded)
+    monkeypatch.setattr(blank, "read", lambda index, factor: np.full((240, 320), 100, np.uint8))
+    matched = surface.match(tile, start, loaded, blank, CELL)
+    assert matched is not None
+    assert np.median(matched.sigma[:, 24:40]) > 0.3  # metres, in the gap
+    sharp = surface.match(tile, start, loaded, GreyPhotographs(loaded), CELL)
+    assert sharp is not None
+    assert np.median(sharp.sigma[:, 24:40]) < 0.5 * np.median(matched.sigma[:, 24:40])
+
+
+def test_gaps_are_filled_smoothly_and_say_how_heights_around_them_are_spread():
+    rng = np.random.default_rng(0)
+    across = np.arange(90, dtype=np.float32)
+    height = np.broadcast_to(300 + 0.02 * across, (75, 90)) + rng.normal(0, 0.01, (75, 90)).astype(np.float32)
+    with_gaps = height.copy()
+    with_gaps[20:50, 30:60] = np.nan
+    with_gaps[60, 10] = np.nan
+    gap = np.isnan(with_gaps)
+    filled, spread = fill_gaps(with_gaps)
+    assert (filled[~gap] == height[~gap]).all()
+    assert (spread[~gap] == 0).all()
+    error = filled - height
+    assert np.abs(error[gap]).max() < 0.15  # nearest heights are off by 15 cells' rise, 30 cm, along two ridges
+    steps = np.abs(np.diff(filled[21:49, 31:59], axis=1))
+    assert steps.max() < 0.06
+    assert (np.abs(error[gap]) < 1.96 * spread[gap]).mean() > 0.95
+    assert spread[60, 10] < 0.05 < spread[35, 45]
+
+
+def test_gaps_of_a_single_known_cell_have_its_height():
+    height = np.full((5, 3), np.nan, np.float32)
+    height[4, 0] = 7.0
+    filled, spread = fill_gaps(height)
+    assert filled == pytest.approx(7.0)
+    assert spread == pytest.approx(0.0)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
-from scipy.ndimage import distance_transform_edt
 
 if TYPE_CHECKING:
     from tidefield.maps.grid import Tile
@@ -216,7 +215,40 @@ def _pair(
     return result.reshape(side, side)
 
 
-def fill_from_nearest(height: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """Fill NaN with the nearest value."""
-    nearest = np.asarray(distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True))
-    return height[nearest[0], nearest[1]]
+def fill_gaps(height: Float32[np.ndarray, "H W"]) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Fill NaN with means over squares that grow with the distance from known cells.
+
+    Squares are halved in number along each side until all are known, and fade into each other on the way back (pull and
+    push; Gortler and others, The lumigraph, 1996, section 3.4).
+
+    Returns:
+        The heights; and of each the standard deviation in its square, 0 of known cells.
+    """
+    known = np.isfinite(height)
+    base = height[known].mean(dtype=np.float64).astype(np.float32)  # squares of what is small keep their digits
+    above = np.where(known, height - base, 0)
+    levels = [np.stack([above, above**2, known.astype(np.float32)])]
+    while levels[-1][2].min() < 1:
+        levels.append(_halved(levels[-1]))
+    mean = levels[-1][:2]
+    for finer in reversed(levels[:-1]):
+        rows, columns = finer.shape[1:]
+        coarse = np.stack([_doubled(band)[:rows, :columns] for band in mean])
+        mean = finer[2] * finer[:2] + (1 - finer[2]) * coarse
+    spread = np.sqrt(np.maximum(mean[1] - mean[0] ** 2, 0))
+    return np.where(known, height, mean[0] + base), np.where(known, 0, spread)
+
+
+def _halved(bands: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 i j"]:
+    """Means over two by two cells, by the last band, the share of a cell that is known; four quarters are a whole."""
+    rows, columns = bands.shape[1:]
+    even = np.pad(bands, ((0, 0), (0, rows % 2), (0, columns % 2)))
+    even[:2] *= even[2]
+    sums = even[:, ::2, ::2] + even[:, 1::2, ::2] + even[:, ::2, 1::2] + even[:, 1::2, 1::2]
+    sums[:2] /= np.maximum(sums[2], 1e-6)
+    sums[2] = np.minimum(sums[2], 1)
+    return sums
+
+
+def _doubled(band: Float32[np.ndarray, "i j"]) -> Float32[np.ndarray, "h w"]:
+    return cv2.resize(band, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)

@@ -10,6 +10,8 @@ pairs stays. A bilateral and a guided filter take noise off after each search, a
 
 The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
 score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
+Where no pair matches, the sparse points' surface continues the heights around, and the error is that of doing so, unless
+the photographs determine the height then.
 
 Alphabet: V photographs, K heights, H W cells of a tile.
 """
@@ -34,7 +36,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
-from tidefield.maps.stereo import choose_pairs, fill_from_nearest, stereo_heights
+from tidefield.maps.stereo import choose_pairs, fill_gaps, stereo_heights
 
 COARSEST = 8
 """Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
@@ -362,8 +364,11 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     above = float(np.median([view.position[2] for view in views]) - np.median(expected))
     low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
     height = stereo_heights(choice.pairs, views, indices, grey, factor, tile, PAD, low, high)
-    unmatched = np.isnan(height).all()
-    height = expected if unmatched else fill_from_nearest(height)
+    if np.isnan(height).all():
+        height, spread = expected, np.full_like(expected, (high - low) / 4)
+    else:
+        above_points, spread = fill_gaps(height - expected)
+        height = expected + above_points
     matching = score = np.zeros_like(height)
     used = [(views[k], indices[k]) for k in choice.chosen]
     east, north = tile.offsets(PAD)
@@ -374,9 +379,8 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
         height = _cleaned(found, matching, height, step * share)
     matching = np.nan_to_num(matching, nan=10 * step).astype(np.float32)
     score = np.nan_to_num(score).astype(np.float32)
-    sigma = standard_error(height, matching)
-    if unmatched:
-        sigma += np.float32((high - low) / 4)
+    by_gap = (1 - _blur(_determined(matching, step * SWEEPS[-1][0]), BRIDGED_CELLS)) * spread
+    sigma = np.hypot(standard_error(height, matching), by_gap).astype(np.float32)
     inner = slice(PAD, PAD + tile.side)
     height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
     east, north = tile.offsets()
@@ -526,11 +530,16 @@ def _cleaned(found: np.ndarray, sigma: np.ndarray, before: np.ndarray, step: flo
     sigma = np.nan_to_num(sigma, nan=10 * step)
     weight = (1 / (sigma**2 + (0.05 * step) ** 2)).astype(np.float32)
     around = _blur((shift * weight).astype(np.float32), BRIDGED_CELLS) / _blur(weight, BRIDGED_CELLS)
-    share = 1 / (1 + (sigma / (UNDETERMINED * step)) ** 4)
+    share = _determined(sigma, step)
     height = (before + share * (share * shift + (1 - share) * around)).astype(np.float32)
     median = cv2.medianBlur(height, 5)
     height = np.where(np.abs(height - median) > 3 * step, median, height).astype(np.float32)
     return _smoothed(height, step)
+
+
+def _determined(sigma: np.ndarray, step: float) -> np.ndarray:
+    """How much a sweep's height counts, 0 to 1."""
+    return 1 / (1 + (sigma / (UNDETERMINED * step)) ** 4)
 
 
 def _smoothed(height: Height, step: float) -> Height:
