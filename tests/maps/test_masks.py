@@ -65,6 +65,18 @@ def test_a_lake_goes_on_to_the_edge_of_the_map_and_a_blotch_is_no_shore():
     assert (labels > 0).mean() > 0.97
 
 
+def test_small_lower_places_that_water_surrounds_are_water_and_large_ones_are_not():
+    random = np.random.default_rng(6)
+    level = (LEVEL + NOISE * random.standard_normal((GRID.rows, GRID.columns))).astype(np.float32)
+    nowhere, blank = np.zeros(level.shape, bool), np.full_like(level, 0.05)
+    y, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
+    blotches = (np.hypot(y % 2.4 - 1.2, x % 2.4 - 1.2) < 0.3).astype(np.float32)
+    labels, [_] = find_water(level - 0.3 * blotches, blank, nowhere, GRID)
+    assert (labels > 0).mean() > 0.97
+    pool = (np.hypot(y - GRID.rows * GRID.cell / 2, x - GRID.columns * GRID.cell / 2) < 2).astype(np.float32)
+    assert not find_water(level - 0.3 * pool, np.where(pool > 0, 0.4, blank).astype(np.float32), nowhere, GRID)[1]
+
+
 def test_plants_are_green_and_black_is_not():
     colour = np.zeros((3, 20, 20), np.uint8)
     colour[:, :, 10:] = np.array([70, 110, 50], np.uint8)[:, None, None]

@@ -41,7 +41,7 @@ def test_rows_of_both_pictures_show_the_same_points(scene):
     points = np.array([[1.0, 2.0, 0.3], [-3.0, 4.0, -0.4], [5.0, -2.0, 0.0]])
     for i, j in choice.pairs:
         left, right = choice.views[i], choice.views[j]
-        pair = Rectified(left, right, tile, 64 * CELL, -1.0, 1.0)
+        pair = Rectified(left, right, CELL, 64, -1.0, 1.0)
         local = (points - pair.centre) @ pair.rotation.T
         other = (points - right.position) @ pair.rotation.T
         np.testing.assert_allclose(local[:, 1] / local[:, 2], other[:, 1] / other[:, 2], atol=1e-9)
@@ -64,7 +64,7 @@ def test_heights_are_those_of_the_flat(scene):
     [tile] = grid.tiles(64, 0)
     choice = choose_views(tile, loaded, sparse_surface(loaded, grid.coarser(COARSEST)))
     grey = GreyPhotographs(loaded)
-    found = stereo_heights(choice.pairs, choice.views, choice.indices, grey, 1, tile, 0, -2.0, 3.0)
+    found = stereo_heights(choice.pairs, choice.views, choice.indices, grey, 1, CELL, 64, -2.0, 3.0)
     east, north = (part.ravel() for part in np.broadcast_arrays(*tile.offsets()))
     places = torch.from_numpy(np.stack([east + tile.centre[0], north + tile.centre[1]])).float()
     true = survey.flat.surface.sample(places)[0].reshape(64, 64).numpy()

@@ -62,7 +62,7 @@ FEWEST_VIEWS = 2
 """Photographs that must see a cell: what one alone shows has no height."""
 CLOUD_ROWS = 64
 """Rows of which points are made at once."""
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,11 @@ def find_water(
         mine[places[k - 1]] |= inside
         parts = _components(mine)[1]
         touched = np.unique(parts[places[k - 1]][inside])
-        body = _opened(_closed(np.isin(parts, touched[touched > 0]))) & (labels == 0)
+        body = _opened(_closed(np.isin(parts, touched[touched > 0])))
+        # Small places that water surrounds are not lower: those are blotches of the matching.
+        _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean < level))
+        body |= (holes > 0) & (np.bincount(holes.ravel())[holes] * cell**2 < SMALLEST_M2)
+        body &= labels == 0
         wet = body & known
         side = 2 * math.ceil(LEVEL_M / cell) + 1
         shore = cv2.dilate(body.astype(np.uint8), np.ones((side, side), np.uint8)) > 0

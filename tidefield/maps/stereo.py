@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 if TYPE_CHECKING:
-    from tidefield.maps.grid import Tile
     from tidefield.maps.surface import GreyPhotographs, View
 
 PAIRS = 12
@@ -37,6 +36,9 @@ P1, P2 = 4, 16
 """Penalties of disparities that differ by 1, and by more, times the window's area: half of those of OpenCV's
 documentation, which widen crowns, as larger windows do (docs/experiments.md, Maps)."""
 MOST_DISPARITIES = 512
+NARROWED, MARGIN = 4, 0.1
+"""How much larger the cells are in which the range of heights is found, and the share of the range as it was that is
+added on both sides, for what is too small for them."""
 UNIQUE, SPECKLE, SPECKLE_RANGE = 10, 100, 2
 """Per cent by which the best cost must win, and the size and step of specks that are removed, as is usual."""
 
@@ -86,12 +88,12 @@ class Rectified:
 
     Args:
         left, right: their projections; the base points from left to right.
-        tile: the cells.
-        side: length of the tile's side with its surroundings, horizontal units.
+        cell: side of a cell, horizontal units.
+        side: cells along a side of the square around the origin.
         low, high: heights between which the surface is searched.
     """
 
-    def __init__(self, left: View, right: View, tile: Tile, side: float, low: float, high: float) -> None:
+    def __init__(self, left: View, right: View, cell: float, side: int, low: float, high: float) -> None:
         base = right.position - left.position
         self.base = float(np.linalg.norm(base))
         x = base / self.base
@@ -99,11 +101,11 @@ class Rectified:
         z /= np.linalg.norm(z)
         self.rotation = np.stack([x, np.cross(z, x), z])
         self.centre = left.position
-        half = side / 2
+        half = side * cell / 2
         corners = np.array([(e, n, h) for e in (-half, half) for n in (-half, half) for h in (low, high)])
         local = (corners - self.centre) @ self.rotation.T
         depth = np.maximum(local[:, 2], 1e-6)
-        self.focal = float(np.median(depth)) / tile.grid.cell
+        self.focal = float(np.median(depth)) / cell
         u, v = self.focal * local[:, 0] / depth, self.focal * local[:, 1] / depth
         nearest, farthest = self.focal * self.base / depth.min(), self.focal * self.base / depth.max()
         self.least = int(np.floor(farthest)) - 1
@@ -151,8 +153,8 @@ def stereo_heights(
     indices: Sequence[int],
     grey: GreyPhotographs,
     factor: int,
-    tile: Tile,
-    pad: int,
+    cell: float,
+    side: int,
     low: float,
     high: float,
 ) -> Float32[np.ndarray, "H W"]:
@@ -162,15 +164,14 @@ def stereo_heights(
         pairs: indices of `views`.
         views, indices: projections of photographs, and their numbers in the scene.
         grey: the photographs, read at a `factor`-th of their size.
-        tile: the cells.
-        pad: cells around the tile.
+        cell: side of a cell, horizontal units.
+        side: cells along a side of the square around the origin.
         low, high: heights between which the surface is searched.
     """
-    side = tile.side + 2 * pad
     found = [np.full((side, side), np.nan, np.float32)]
     for i, j in pairs:
         pictures = grey.read(indices[i], factor), grey.read(indices[j], factor)
-        one = _pair(views[i], views[j], *pictures, tile, side, low, high)
+        one = _pair(views[i], views[j], *pictures, cell, side, low, high)
         if one is not None:
             found.append(one)
     heights = np.sort(np.stack(found), axis=0)  # NaN last
@@ -180,12 +181,35 @@ def stereo_heights(
     return np.where(number > 0, (low_middle + high_middle) / 2, np.nan).astype(np.float32)
 
 
+def narrowed(
+    pairs: Sequence[tuple[int, int]],
+    views: Sequence[View],
+    indices: Sequence[int],
+    grey: GreyPhotographs,
+    factor: int,
+    cell: float,
+    side: int,
+    low: float,
+    high: float,
+) -> tuple[float, float]:
+    """Heights between which the surface lies, by matching pairs in cells `NARROWED` times as large.
+
+    The time of matching is proportional to the heights that are searched, and level ground lies in a few of those where
+    trees might stand. Arguments are those of `stereo_heights`.
+    """
+    large = cell * NARROWED
+    found = stereo_heights(pairs, views, indices, grey, factor * NARROWED, large, -(-side // NARROWED), low, high)
+    if np.isnan(found).all():
+        return low, high
+    margin = MARGIN * (high - low)
+    return max(low, float(np.nanmin(found)) - margin), min(high, float(np.nanmax(found)) + margin)
+
+
 def _pair(
-    left: View, right: View, first: np.ndarray, second: np.ndarray, tile: Tile, side: int, low: float, high: float
+    left: View, right: View, first: np.ndarray, second: np.ndarray, cell: float, side: int, low: float, high: float
 ) -> Float32[np.ndarray, "H W"] | None:
     """Heights of cells by one pair, the highest in each; NaN where it has none."""
-    cell = tile.grid.cell
-    rectified = Rectified(left, right, tile, side * cell, low, high)
+    rectified = Rectified(left, right, cell, side, low, high)
     if rectified.count > MOST_DISPARITIES:
         return None
     a, inside_a = rectified.resample(left, first, 0.0)

@@ -10,8 +10,8 @@ pairs stays. A bilateral and a guided filter take noise off after each search, a
 
 The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
 score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
-Where no pair matches, the sparse points' surface continues the heights around, and the error is that of doing so, unless
-the photographs determine the height then.
+Where no pair matches, the sparse points' surface continues the heights around, and the error is that of doing so,
+unless the photographs determine the height then.
 
 Alphabet: V photographs, K heights, H W cells of a tile.
 """
@@ -36,7 +36,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
-from tidefield.maps.stereo import choose_pairs, fill_gaps, stereo_heights
+from tidefield.maps.stereo import choose_pairs, fill_gaps, narrowed, stereo_heights
 
 COARSEST = 8
 """Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
@@ -363,7 +363,9 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     expected = start.on(tile, PAD) - np.float32(tile.grid.height)
     above = float(np.median([view.position[2] for view in views]) - np.median(expected))
     low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
-    height = stereo_heights(choice.pairs, views, indices, grey, factor, tile, PAD, low, high)
+    matching_of = choice.pairs, views, indices, grey, factor, tile.grid.cell, tile.side + 2 * PAD
+    low, high = narrowed(*matching_of, low, high)
+    height = stereo_heights(*matching_of, low, high)
     if np.isnan(height).all():
         height, spread = expected, np.full_like(expected, (high - low) / 4)
     else:
