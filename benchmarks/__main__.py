@@ -539,6 +539,19 @@ def map_views(scene: tyro.conf.Positional[Path], runs: Path = Path("runs/map_vie
     print(table(measure_views(scene, runs, half, partial(print, flush=True))).markdown())
 
 
+def map_surveys(scenes: tyro.conf.Positional[tuple[Path, ...]], runs: Path = Path("runs/map_surveys")) -> None:
+    """Maps of real surveys and the time they take, beside what users of ODM published (minutes each).
+
+    Args:
+        scenes: Scenes of tidefield prepare; times are those of the same machine if it was prepared there.
+        runs: Folder for the maps and map_surveys.json.
+    """
+    tune_process()
+    from benchmarks.map_surveys import measure_surveys, table
+
+    print(table(measure_surveys(scenes, runs, partial(print, flush=True))).markdown())
+
+
 def map_memory(
     scene: tyro.conf.Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
 ) -> None:
@@ -765,7 +778,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["speed", *words]
-    mapped = (maps, map_control, map_views, map_memory, cluster)
+    mapped = (maps, map_control, map_views, map_surveys, map_memory, cluster)
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
     surveyed = (surveys, flight, large, cost, areas)
