@@ -121,6 +121,13 @@ def test_the_interval_is_round_and_large_maps_are_reduced(tmp_path: Path):
     assert grid.cell == pytest.approx(0.2)
     assert small[0, 0] == pytest.approx(0.5 + 1.5)
     assert small[-1, -1] == pytest.approx(2000.5 + 3 * 1998.5)
+    ragged = np.where(np.hypot(x - 1000, y - 1000) < 500 + 300 * np.sin(x / 7), x + 3 * y, np.nan)
+    small, _ = read_reduced(written(tmp_path / "ragged.tif", ragged, large), large)
+    quarters = ragged[:2000].reshape(1000, 2, 1001, 2).swapaxes(1, 2).reshape(1000, 1001, 4)
+    known = np.isfinite(quarters)
+    exact = np.where(known, quarters, 0).sum(-1) / known.sum(-1).clip(1)
+    assert (np.isfinite(small) == known.any(-1)).all()
+    np.testing.assert_allclose(small[known.any(-1)], exact[known.any(-1)], rtol=1e-5)
 
 
 def test_contours_are_read_again_by_gdal_and_in_longitude_and_latitude(tmp_path: Path):

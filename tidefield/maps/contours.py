@@ -81,7 +81,8 @@ def contours(
 def read_reduced(
     path: Path, grid: Grid, band: int = 1, resampling: str = "average"
 ) -> tuple[Float[np.ndarray, "h w"], Grid]:
-    """Read a raster in at most `MOST_CELLS` cells, each the mean of those that are known; NaN where none is.
+    """Read a raster in at most `MOST_CELLS` cells, each the mean of those that are known; NaN where none is, unless the
+    raster has no value for that.
 
     Args:
         path: of the raster.
@@ -98,8 +99,10 @@ def read_reduced(
     # Overviews would not lie on these cells where the raster's size is odd.
     with need("rasterio").open(path, OVERVIEW_LEVEL="NONE") as dataset:
         shape = (coarse.rows, coarse.columns)
-        values = dataset.read(band, window=window, out_shape=shape, resampling=Resampling[resampling], masked=True)
-    return values.astype(np.float32).filled(np.nan), coarse
+        values = dataset.read(band, window=window, out_shape=shape, resampling=Resampling[resampling])
+        nodata = dataset.nodata
+    # GDAL's mask of larger cells has some more than those of which it knows a value.
+    return np.where(values == nodata, np.nan, values).astype(np.float32), coarse
 
 
 def write_contours(lines: Sequence[tuple[float, LineString]], frame: MapFrame, folder: Path) -> list[Path]:

@@ -6,7 +6,7 @@ mean of the others by windowed normalised cross-correlation, and with their medi
 the surface (the vertical line locus of photogrammetry; Collins, A space-sweep approach to true multi-image matching,
 1996, with windows that follow the surface found so far). A parabola through the best score and its neighbours places it
 between the heights that were tried. Where that is not determined, as on blank and mirroring water, the surface of the
-pairs stays. A bilateral and a guided filter take noise off after each search, and keep rims and slopes.
+pairs stays. A bilateral filter and planes take noise off after each search, and keep rims and slopes.
 
 The standard error comes from the spread of the heights that the photographs give one by one, from the curvature of the
 score, and from the roughness of the surface within the window, whose smoothing no comparison of photographs can show.
@@ -66,9 +66,13 @@ DIFFERENCE, DIFFERENCE_WEIGHT = 20.0, 2.0
 the mean difference, as a share of that, against the correlation."""
 BILATERAL_STEPS, BILATERAL_CELLS = 0.6, 2.5
 """Range, in steps, and radius, in cells, of the bilateral filter that takes noise off between rims."""
-GUIDED_STEPS, GUIDED_CELLS = 0.45, 3
-"""Deviation of heights, in steps, at which half of the guided filter's result is smoothed, and radius of its windows,
-in cells."""
+PLANE_ERRORS, PLANE_CELLS = 1.2, 7
+"""Deviation of heights from planes, in standard errors of cells' matching, at which half of the surface is planes, and
+radius, in cells, of the windows that these are fitted to."""
+NOISIEST_STEPS = 3.0
+"""Largest standard error of cells' matching there, in steps: rims are no noise."""
+ERROR_CELLS = 2.0
+"""Standard deviation of the windows in which standard errors of cells' matching are means, in cells."""
 SHARE_MATCHING, SHARE_ROUGHNESS = 0.3, 7.0
 DETAIL_CELLS, ROUGHNESS_CELLS = 1.0, 3.0
 """Shares of the standard error: of that of single cells' matching, and of the roughness. Roughness is what windows of
@@ -406,7 +410,7 @@ def standard_error(height: Height, matching: Height) -> Height:
     """
     detail = height - _blur(height, DETAIL_CELLS)
     roughness = np.sqrt(_blur(detail**2, ROUGHNESS_CELLS))
-    return np.hypot(SHARE_MATCHING * _blur(matching, 2.0), SHARE_ROUGHNESS * roughness).astype(np.float32)
+    return np.hypot(SHARE_MATCHING * _blur(matching, ERROR_CELLS), SHARE_ROUGHNESS * roughness).astype(np.float32)
 
 
 def _parallax(views: list[View], chosen: Sequence[int]) -> float:
@@ -529,14 +533,14 @@ def _cleaned(found: np.ndarray, sigma: np.ndarray, before: np.ndarray, step: flo
     Of cells with a large standard error the shift is a weighted mean over their surroundings, and counts the less.
     """
     shift = np.nan_to_num(found - before)
-    sigma = np.nan_to_num(sigma, nan=10 * step)
+    sigma = np.nan_to_num(sigma, nan=10 * step).astype(np.float32)
     weight = (1 / (sigma**2 + (0.05 * step) ** 2)).astype(np.float32)
     around = _blur((shift * weight).astype(np.float32), BRIDGED_CELLS) / _blur(weight, BRIDGED_CELLS)
     share = _determined(sigma, step)
     height = (before + share * (share * shift + (1 - share) * around)).astype(np.float32)
     median = cv2.medianBlur(height, 5)
     height = np.where(np.abs(height - median) > 3 * step, median, height).astype(np.float32)
-    return _smoothed(height, step)
+    return _smoothed(height, sigma, step)
 
 
 def _determined(sigma: np.ndarray, step: float) -> np.ndarray:
@@ -544,22 +548,35 @@ def _determined(sigma: np.ndarray, step: float) -> np.ndarray:
     return 1 / (1 + (sigma / (UNDETERMINED * step)) ** 4)
 
 
-def _smoothed(height: Height, step: float) -> Height:
-    """Take noise off a surface, and keep its rims and slopes.
+def _smoothed(height: Height, sigma: Height, step: float) -> Height:
+    """Take noise off a surface, and keep its rims, slopes and bends.
 
-    A bilateral filter keeps rims, but makes stairs of slopes. A guided filter (He, Sun and Tang, Guided image
-    filtering, 2013, section 3, guided by its own input) keeps slopes, for it fits lines to windows where the surface is
-    smooth. What it would leave as it is, at rims, is the bilateral filter's result here.
+    A bilateral filter keeps rims, but makes stairs of slopes. Where windows are plane but for noise, the mean of the
+    planes that are fitted to all windows around a cell takes its place: a guided filter (He, Sun and Tang, Guided image
+    filtering, 2013, section 3) whose guides are the axes. The square of the variance decides which, so that little is
+    left of either where the other is right.
+
+    Args:
+        height: of cells.
+        sigma: standard error of their matching, not zero.
+        step: between heights that were tried.
     """
-    side = (2 * GUIDED_CELLS + 1, 2 * GUIDED_CELLS + 1)
+    across = 2 * PLANE_CELLS + 1
+    away = np.arange(-PLANE_CELLS, PLANE_CELLS + 1, dtype=np.float32)
+    flat = np.full(across, 1 / across, np.float32)
+    spread = float((away**2).mean())
 
-    def mean(values: Height) -> Height:
-        return cv2.blur(values, side, borderType=cv2.BORDER_REPLICATE)
+    def mean(values: Height, columns: np.ndarray = flat, rows: np.ndarray = flat) -> Height:
+        return cv2.sepFilter2D(values, cv2.CV_32F, columns, rows, borderType=cv2.BORDER_REPLICATE)
 
     base = float(height.mean())  # squares of what is small keep their digits
     above = height - base
-    around = mean(above)
-    variance = np.maximum(mean(above**2) - around**2, 0)
-    rough = variance / (variance + (GUIDED_STEPS * step) ** 2)
+    middle = mean(above)
+    east, south = mean(above, away / across) / spread, mean(above, flat, away / across) / spread
+    variance = mean(above**2) - middle**2 - spread * (east**2 + south**2)
+    noise = PLANE_ERRORS * np.minimum(_blur(sigma, ERROR_CELLS), NOISIEST_STEPS * step)
+    smooth = 1 / (1 + (np.maximum(variance, 0) / noise**2) ** 2)
+    rough = 1 - smooth
+    plane = mean(smooth * middle) - mean(smooth * east, away / across) - mean(smooth * south, flat, away / across)
     sharp = cv2.bilateralFilter(height, 9, float(BILATERAL_STEPS * step), BILATERAL_CELLS)
-    return (mean(rough) * (sharp - base) + mean((1 - rough) * around) + base).astype(np.float32)
+    return (mean(rough) * (sharp - base) + plane + base).astype(np.float32)
