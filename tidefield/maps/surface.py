@@ -73,12 +73,12 @@ NOISIEST_STEPS = 3.0
 """Largest standard error of cells' matching there, in steps: rims are no noise."""
 ERROR_CELLS = 2.0
 """Standard deviation of the windows in which standard errors of cells' matching are means, in cells."""
-SHARE_MATCHING, SHARE_ROUGHNESS = 0.3, 7.0
-DETAIL_CELLS, ROUGHNESS_CELLS = 1.0, 3.0
-"""Shares of the standard error: of that of single cells' matching, and of the roughness. Roughness is what windows of
-the first size take off the surface, over windows of the second: of slopes and ripples that is little, and these are
-measured well. The shares were found on built-in flats of other seeds than those of `python -m benchmarks maps`, at two
-sizes (docs/experiments.md, Maps)."""
+SHARE_MATCHING, SHARE_SLOPE, SHARE_ROUGHNESS = 0.3, 4.0, 7.0
+DETAIL_CELLS, ROUGHNESS_CELLS, SLOPE_CELLS, STEEPEST_SLOPE = 1.0, 3.0, 2.0, 2.0
+"""Shares of the standard error: of that of single cells' matching, of that times the slope, and of the roughness.
+Roughness is what windows of the first size take off the surface, over windows of the second: of slopes and ripples that
+is little, and these are measured well. Slopes are those after a blur of the third. The shares were found on built-in
+flats of other seeds than those of `python -m benchmarks maps`, at two sizes (docs/experiments.md, Maps)."""
 FLOOR = 3.0
 """Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
 PULL = 0.02
@@ -386,7 +386,8 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     matching = np.nan_to_num(matching, nan=10 * step).astype(np.float32)
     score = np.nan_to_num(score).astype(np.float32)
     by_gap = (1 - _blur(_determined(matching, step * SWEEPS[-1][0]), BRIDGED_CELLS)) * spread
-    sigma = np.hypot(standard_error(height, matching), by_gap).astype(np.float32)
+    cell = tile.grid.cell / tile.grid.frame.metre * tile.grid.frame.metre_up
+    sigma = np.hypot(standard_error(height, matching, cell), by_gap).astype(np.float32)
     inner = slice(PAD, PAD + tile.side)
     height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
     east, north = tile.offsets()
@@ -402,15 +403,24 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, count, main)
 
 
-def standard_error(height: Height, matching: Height) -> Height:
-    """Estimate the standard error of heights from that of the matching of single cells, and the roughness around them.
+def standard_error(height: Height, matching: Height, cell: float) -> Height:
+    """Estimate the standard error of heights from that of the matching of single cells, and the surface around them.
 
-    Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. The shares
-    are such that on built-in flats some 95% of the cells lie within 1.96 standard errors, or more.
+    Most of the error lies where the surface is rough: windows widen plants, and hide the gaps between them. On slopes
+    photographs show windows differently, and what matching misses across is missed in height. The shares are such that
+    on built-in flats some 95% of the cells lie within 1.96 standard errors, or more.
+
+    Args:
+        height: of cells.
+        matching: standard error of the matching of single cells.
+        cell: side of a cell, in the unit of heights.
     """
     detail = height - _blur(height, DETAIL_CELLS)
     roughness = np.sqrt(_blur(detail**2, ROUGHNESS_CELLS))
-    return np.hypot(SHARE_MATCHING * _blur(matching, ERROR_CELLS), SHARE_ROUGHNESS * roughness).astype(np.float32)
+    south, east = np.gradient(_blur(height, SLOPE_CELLS), cell)
+    slope = np.minimum(_blur(np.hypot(south, east), ROUGHNESS_CELLS), STEEPEST_SLOPE)
+    matched = _blur(matching, ERROR_CELLS) * np.hypot(SHARE_MATCHING, SHARE_SLOPE * slope)
+    return np.hypot(matched, SHARE_ROUGHNESS * roughness).astype(np.float32)
 
 
 def _parallax(views: list[View], chosen: Sequence[int]) -> float:
