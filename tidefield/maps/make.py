@@ -33,7 +33,7 @@ from tidefield.maps.contours import contours, interval_of, read_reduced, write_c
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.masks import Body, level_water, read_water, write_classes, write_masks
 from tidefield.maps.orthophoto import render_tile
-from tidefield.maps.rasters import NODATA, Raster, RasterWriter, raster_writer
+from tidefield.maps.rasters import NODATA, Raster, RasterWriter, need, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, Matched, match, sparse_surface
@@ -62,6 +62,10 @@ FEWEST_VIEWS = 2
 """Photographs that must see a cell: what one alone shows has no height."""
 CLOUD_ROWS = 64
 """Rows of which points are made at once."""
+STRIP_CELLS = 1_000_000
+"""Cells of a strip, about: what is made of them takes a hundred bytes of each."""
+GDAL_CACHE_MB = 256
+"""GDAL would take a twentieth of the machine's memory."""
 VERSION = 3
 
 
@@ -276,10 +280,11 @@ def strips(job: Job, out: Path) -> Iterator[Strip]:
                 mine = mine[own_rows, own_columns]
                 for k, name in enumerate(("count", "main", "seen", "shown")):
                     single[k][at][mine] = values[name][own_rows, own_columns][mine]
-        first = max(row, 0)
         last = min(row + side, grid.rows) if row != rows[-1] else grid.rows
-        own = slice(first - row, last - row)
-        yield _strip(first, sums[:, own], single[:, own], grid)
+        step = max(1, STRIP_CELLS // grid.columns)
+        for first in range(max(row, 0), last, step):
+            own = slice(first - row, min(first + step, last) - row)
+            yield _strip(first, sums[:, own], single[:, own], grid)
         sums[:, : high - side], single[:, : high - side] = sums[:, side:].copy(), single[:, side:].copy()
         sums[:, high - side :], single[:, high - side :] = 0, 0
 
@@ -449,13 +454,14 @@ def make_map(
     before = (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
     with bar("Mapping") as meter:
         make_tiles(job, out, meter, elsewhere)
-    with bar("Writing") as meter:
-        found = join(job, out, meter)
-    if not found["cells_seen"]:
-        raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
+    with need("rasterio").Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
+        with bar("Writing") as meter:
+            found = join(job, out, meter)
+        if not found["cells_seen"]:
+            raise RunError("no two photographs see any of the area: expected some overlap there; choose another area")
+        with bar("Terrain") as meter:
+            found |= derive(job, out, meter)
     grid = job.grid
-    with bar("Terrain") as meter:
-        found |= derive(job, out, meter)
     if job.check_points:
         found["check_points"] = summary(check(job.check_points, job.scene, grid, out / DSM, out / SIGMA))
     result = {
