@@ -55,6 +55,13 @@ def tune_process() -> None:
         mallopt(arena_max, 1)
 
 
+def release_memory() -> None:
+    """Give memory back to the system that `tune_process` lets glibc keep; between stages that need it differently."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
+
+
 def describe() -> dict[str, Any]:
     """Date, program version and machine, for the record of a measurement."""
     return {

@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.files import completed_file, delete_partials, read_json, write_json
-from tidefield.machine import cores
+from tidefield.machine import cores, release_memory
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
@@ -33,7 +33,7 @@ from tidefield.maps.contours import contours, interval_of, read_reduced, write_c
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.masks import Body, level_water, read_water, write_classes, write_masks
 from tidefield.maps.orthophoto import render_tile
-from tidefield.maps.rasters import NODATA, Raster, RasterWriter, need, raster_writer
+from tidefield.maps.rasters import BLOCK, NODATA, Raster, RasterWriter, need, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, Matched, match, sparse_surface
@@ -64,9 +64,10 @@ CLOUD_ROWS = 64
 """Rows of which points are made at once."""
 STRIP_CELLS = 1_000_000
 """Cells of a strip, about: what is made of them takes a hundred bytes of each."""
-GDAL_CACHE_MB = 256
-"""GDAL would take a twentieth of the machine's memory."""
-VERSION = 3
+GDAL_CACHE_BYTES = 128_000_000
+"""Memory of GDAL for blocks, beside those of a row of them in each raster, which would be written again and again
+otherwise. By itself it takes a twentieth of the machine's."""
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -454,7 +455,9 @@ def make_map(
     before = (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
     with bar("Mapping") as meter:
         make_tiles(job, out, meter, elsewhere)
-    with need("rasterio").Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
+    release_memory()
+    cell_bytes = 20  # of a cell in all rasters that are written at once
+    with need("rasterio").Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES + BLOCK * job.grid.columns * cell_bytes):
         with bar("Writing") as meter:
             found = join(job, out, meter)
         if not found["cells_seen"]:

@@ -80,7 +80,8 @@ class RasterWriter:
         try:
             self._dataset.write(values.astype(self.raster.kind), window=window)
         except RasterioError as error:
-            raise OSError(28, f"writing failed: {error}", str(self.raster.path)) from error
+            reason = error.__cause__ or error
+            raise OSError(28, f"writing failed: {reason}", str(self.raster.path)) from error
 
 
 @contextmanager
