@@ -101,6 +101,19 @@ def test_cells_are_projected_into_the_photographs_above_them_only(scene, monkeyp
     assert len(projected) == len(loaded.names) - len(away)
 
 
+def test_heights_that_are_tried_do_not_depend_on_where_the_map_counts_heights_from(scene):
+    loaded, _ = scene
+    found = []
+    for zero in (0.0, -15.0):
+        grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, zero)
+        [tile] = grid.tiles(64, 0)
+        start = sparse_surface(loaded, grid.coarser(COARSEST))
+        choice = choose_views(tile, loaded, start)
+        ground = float(np.median(start.on(tile, 0))) - zero
+        found.append(surface._parallax(choice.views, choice.chosen, ground))
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
+
+
 def test_the_error_is_large_where_neither_pairs_nor_photographs_determine_the_height(
     scene, monkeypatch: pytest.MonkeyPatch
 ):

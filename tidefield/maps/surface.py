@@ -378,7 +378,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     matching = score = np.zeros_like(height)
     used = [(views[k], indices[k]) for k in choice.chosen]
     east, north = tile.offsets(PAD)
-    step = STEP_PX * tile.grid.cell / _parallax(views, choice.chosen)
+    step = STEP_PX * tile.grid.cell / _parallax(views, choice.chosen, float(np.median(expected)))
     for share, half in SWEEPS:
         offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
         found, matching, score = _sweep(used, grey, factor, east, north, height, offsets)
@@ -423,9 +423,9 @@ def standard_error(height: Height, matching: Height, cell: float) -> Height:
     return np.hypot(matched, SHARE_ROUGHNESS * roughness).astype(np.float32)
 
 
-def _parallax(views: list[View], chosen: Sequence[int]) -> float:
+def _parallax(views: list[View], chosen: Sequence[int], ground: float) -> float:
     """Shift of the photographs farthest apart per height, in the middle of the tile."""
-    slope = np.array([views[k].position[:2] / max(views[k].position[2], 1e-6) for k in chosen])
+    slope = np.array([views[k].position[:2] / max(views[k].position[2] - ground, 1e-6) for k in chosen])
     apart = np.linalg.norm(slope[:, None] - slope[None], axis=-1)
     return float(np.clip(np.percentile(apart[np.triu_indices(len(slope), 1)], 90), 0.1, 2.0))
 
