@@ -21,7 +21,7 @@ from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
 from tidefield.maps.grid import Grid, make_grid, map_frame
-from tidefield.maps.make import DSM, TILES, Job, _file, make_map, make_tiles
+from tidefield.maps.make import DSM, TILES, Job, TileMaker, _file, finish_map, make_missing
 
 SQUARE = "square"
 """Folder of the map."""
@@ -53,7 +53,7 @@ def measure_memory(
     scene = load_scene(scene_folder, hold_out=False)
     render, record = open_zero_shot(ZeroShot(zero_shot=True), scene, choose_device("cpu"))
     grid = make_grid(map_frame(scene, None), scene, cell)
-    job = Job(scene, grid, render, None, False, {})
+    job = Job(scene, grid, None, False, {})
     side = job.tiles()[0].side - 2 * job.tiles()[0].margin
     if min(grid.columns, grid.rows) < 2 * side:
         raise RunError(
@@ -64,7 +64,8 @@ def measure_memory(
     middle = replace(job, grid=replace(grid, west=west, north=north, columns=2 * side, rows=2 * side))
     started = time.monotonic()
     say(f"4 tiles of {side} x {side} cells")
-    make_tiles(middle, few, lambda done, whole: None)
+    make_missing(middle, few, lambda done, whole: None, TileMaker(middle, render, few).several)
+    del render
     tiles_bytes, tiles_seconds = _peak(), time.monotonic() - started
     count = round(metres / cell)
     large = replace(job, grid=Grid(grid.frame, 0.0, metres, cell, count, count, grid.height))
@@ -82,7 +83,7 @@ def measure_memory(
         return _Quiet()
 
     started = time.monotonic()
-    made = make_map(large, out, False, {"scene": scene_folder.name, "method": record}, bar)
+    made = finish_map(large, out, {"scene": scene_folder.name, "method": record}, bar)
     result = {
         "square_metres": made["area"],
         "cells": made["cells"],

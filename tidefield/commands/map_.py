@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from tidefield.cluster import Share
     from tidefield.maps.make import Job
+    from tidefield.model.rendering import Render
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
     from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
-    from tidefield.maps.make import delete_tiles, make_map
+    from tidefield.maps.make import TileMaker, delete_tiles, finish_map, make_tiles
     from tidefield.maps.rasters import need
     from tidefield.progress import ProgressBar
 
@@ -72,7 +73,8 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
-        job, about = stack.enter_context(_open(options, console))
+        opened = stack.enter_context(ExitStack())
+        job, render, about = opened.enter_context(_open(options, console))
         grid, frame = job.grid, job.grid.frame
         console.print(
             f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
@@ -80,15 +82,17 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             highlight=False,
             soft_wrap=True,
         )
-        elsewhere = None
-        if options.cluster is not None:
-            ray = stack.enter_context(connected(options.cluster))
-            opened = partial(_tile_maker, absolute(options), job.key)
+        if options.cluster is None:
+            makes = TileMaker(job, render, options.out).several
+        else:
+            ray = opened.enter_context(connected(options.cluster))
+            open_maker = partial(_tile_maker, absolute(options), job.key)
             share = share_of(ray, options.device, "core")
-            elsewhere = partial(_in_blocks, ray, job, opened, share)
-        result = make_map(
-            job, options.out, options.overwrite, about, lambda name: ProgressBar(console, name), elsewhere
-        )
+            makes = partial(_in_blocks, ray, job, open_maker, share)
+        make_tiles(job, options.out, options.overwrite, partial(ProgressBar, console), makes)
+        del render, makes
+        opened.close()
+        result = finish_map(job, options.out, about, partial(ProgressBar, console))
         delete_tiles(options.out)
     console.print(
         f"{options.out}: {result['area']:,.0f} square {frame.unit}, {result['points']:,} points",
@@ -109,8 +113,8 @@ def _in_blocks(ray: Any, job: Job, opened: Callable[..., Any], share: Share, num
 
 
 @contextmanager
-def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """What a map is made of, while the block lasts, and the record of its source."""
+def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[str, Any]]]:
+    """What a map is made of, the method while the block lasts, and the record of its source."""
     from shapely import union_all
 
     from tidefield.data.georeference import read_georeference
@@ -136,8 +140,8 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, dict[str, Any]]
         grid = make_grid(frame, full, options.gsd, bounds_of(area))
         lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
         points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
-        job = Job(full, grid, render, area, options.fill, {"method": record}, tuple(points), interval, lines)
-        yield job, {"scene": scene.root.resolve().name, "method": record}
+        job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)
+        yield job, render, {"scene": scene.root.resolve().name, "method": record}
 
 
 @contextmanager
@@ -150,9 +154,9 @@ def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], It
     from tidefield.progress import make_console
 
     torch.set_num_threads(1)  # a task has one core
-    with _open(options, make_console(quiet=True)) as (job, _):
+    with _open(options, make_console(quiet=True)) as (job, render, _):
         require_same(options.source, key, job.key)
-        yield TileMaker(job, options.out).block
+        yield TileMaker(job, render, options.out).block
 
 
 def _describe(found: dict[str, Any], unit: str) -> str:

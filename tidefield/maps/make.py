@@ -77,7 +77,6 @@ class Job:
     Attributes:
         scene: all of its photographs are sources; opened at the size to match at.
         grid: the cells.
-        render: the method that renders the orthophoto.
         area: outside of which nothing is mapped; None for no limit.
         fill: fill cells that fewer than two photographs see, and mark them.
         settings: what else the tiles depend on, for resuming.
@@ -88,7 +87,6 @@ class Job:
 
     scene: Scene
     grid: Grid
-    render: Render
     area: BaseGeometry | None
     fill: bool
     settings: dict[str, Any]
@@ -131,12 +129,12 @@ class Job:
 
 BLOCKS_EACH, LARGEST_BLOCK = 4, 8
 """Blocks of tiles for each worker, so that none waits long for the last, and the most tiles along the side of one."""
-Elsewhere = Callable[[list[int]], Iterator[int]]
-"""Makes tiles, given by their numbers among `Job.tiles`, by other processes; yields the number of each that is done."""
+MakesTiles = Callable[[list[int]], Iterator[int]]
+"""Makes tiles, given by their numbers among `Job.tiles`, here or elsewhere; yields the number of each that is done."""
 
 
-def make_tiles(job: Job, out: Path, progress: Callable[[int, int], None], elsewhere: Elsewhere | None = None) -> None:
-    """Measure and render all tiles that are not on disk yet; here, if not elsewhere."""
+def make_missing(job: Job, out: Path, progress: Callable[[int, int], None], makes: MakesTiles) -> None:
+    """Measure and render all tiles that are not on disk yet."""
     folder = out / TILES
     all_tiles = job.tiles()
     wanted = [number for number, tile in enumerate(all_tiles) if touches(job.area, tile)]
@@ -147,7 +145,7 @@ def make_tiles(job: Job, out: Path, progress: Callable[[int, int], None], elsewh
     if not missing:
         return
     delete_partials(*(_file(folder, all_tiles[number]) for number in missing))
-    for _ in elsewhere(missing) if elsewhere else TileMaker(job, out).several(missing):
+    for _ in makes(missing):
         done += 1
         progress(done, len(wanted))
 
@@ -157,11 +155,12 @@ class TileMaker:
 
     Args:
         job: of the map.
-        out: its folder.
+        render: the method that renders the orthophoto.
+        out: folder of the map.
     """
 
-    def __init__(self, job: Job, out: Path) -> None:
-        self._job, self._folder, self._tiles = job, out / TILES, job.tiles()
+    def __init__(self, job: Job, render: Render, out: Path) -> None:
+        self._job, self._render, self._folder, self._tiles = job, render, out / TILES, job.tiles()
         self._start = sparse_surface(job.scene, job.grid.coarser(COARSEST))
         self._grey = GreyPhotographs(job.scene)
         self._gsd = ground_sampling_distance(job.scene) * job.grid.frame.metre
@@ -200,7 +199,7 @@ class TileMaker:
             shown = wanted if job.fill else seen
             if shown.any():
                 above = matched.height - np.float32(job.grid.height)
-                colour = render_tile(job.render, tile, above, matched.sigma)
+                colour = render_tile(self._render, tile, above, matched.sigma)
                 values = {
                     "height": matched.height,
                     "sigma": matched.sigma,
@@ -429,32 +428,40 @@ def write_cloud(out: Path, grid: Grid) -> tuple[int, dict[str, float]]:
     return cloud.count, {name: number[value] / max(cloud.count, 1) for name, value in names.items()}
 
 
-def make_map(
-    job: Job,
-    out: Path,
-    overwrite: bool,
-    record: dict[str, Any],
-    bar: Callable[[str], Any],
-    elsewhere: Elsewhere | None = None,
-) -> dict[str, Any]:
-    """Make a map in a folder: a new one, or one that was interrupted.
+def make_tiles(job: Job, out: Path, overwrite: bool, bar: Callable[[str], Any], makes: MakesTiles) -> None:
+    """Begin or continue a map in a folder, and make its tiles. They take hours; all that follows takes minutes.
 
     Args:
         job: what to make.
         out: the folder.
         overwrite: begin again where the folder holds another map.
-        record: stored in map.json.
         bar: returns a progress bar of a name, a context manager.
-        elsewhere: makes the tiles, if not this process.
+        makes: the tiles.
 
     Raises:
-        RunError: the folder holds something else, cannot be written to, or no two photographs see any of the area.
+        RunError: the folder holds something else, or cannot be written to.
     """
     begin(out, job.key, overwrite)
-    started = time.monotonic()
-    before = (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
+    started, record = time.monotonic(), read_json(out / MAP_FILE) or {}
     with bar("Mapping") as meter:
-        make_tiles(job, out, meter, elsewhere)
+        make_missing(job, out, meter, makes)
+    seconds = record.get("seconds", 0.0) + time.monotonic() - started
+    write_json(out / MAP_FILE, {**record, "seconds": seconds})
+
+
+def finish_map(job: Job, out: Path, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
+    """Make the files of a map from its tiles. The method that rendered these may be forgotten before, for its memory.
+
+    Args:
+        job: what to make.
+        out: the folder.
+        record: stored in map.json.
+        bar: returns a progress bar of a name, a context manager.
+
+    Raises:
+        RunError: the folder cannot be written to, or no two photographs see any of the area.
+    """
+    started, before = time.monotonic(), (read_json(out / MAP_FILE) or {}).get("seconds", 0.0)
     release_memory()
     cell_bytes = 20  # of a cell in all rasters that are written at once
     with need("rasterio").Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES + BLOCK * job.grid.columns * cell_bytes):
