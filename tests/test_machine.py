@@ -1,6 +1,8 @@
 """What a process may use of its machine."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,3 +35,29 @@ def test_features_have_a_share_of_the_memory_and_workers_of_one_core_a_part_of_i
     ):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         assert memory_for_features(torch.device("cpu")) == expected
+
+
+KEPT = """
+import numpy as np
+from tidefield.machine import release_memory, tune_process
+
+def resident():
+    with open("/proc/self/status") as status:
+        return int(next(line for line in status if line.startswith("VmRSS")).split()[1]) / 1000
+
+tune_process()
+large = [np.ones(5_000_000) for _ in range(10)]
+del large
+kept = resident()
+release_memory()
+print(kept, resident())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc keeps memory, other C libraries do not")
+def test_memory_that_is_kept_for_the_next_step_can_be_given_back():
+    done = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
+    kept, left = map(float, done.stdout.split())
+    if kept < 300:
+        pytest.skip("this C library keeps nothing")
+    assert left < 0.5 * kept  # megabytes
