@@ -13,7 +13,15 @@ import shapely
 from tidefield.maps import contours, masks
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
-from tidefield.maps.masks import excess_green, find_water, level_water, read_water, write_classes, write_masks
+from tidefield.maps.masks import (
+    _grown,
+    excess_green,
+    find_water,
+    level_water,
+    read_water,
+    write_classes,
+    write_masks,
+)
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
 
 pytest.importorskip("rasterio")
@@ -75,6 +83,23 @@ def test_small_lower_places_that_water_surrounds_are_water_and_large_ones_are_no
     assert (labels > 0).mean() > 0.97
     pool = (np.hypot(y - GRID.rows * GRID.cell / 2, x - GRID.columns * GRID.cell / 2) < 2).astype(np.float32)
     assert not find_water(level - 0.3 * pool, np.where(pool > 0, 0.4, blank).astype(np.float32), nowhere, GRID)[1]
+
+
+def test_a_body_is_found_whole_however_far_it_reaches_from_where_it_was_seen():
+    lake = np.zeros((500, 600), bool)
+    lake[20:420, 100:] = True
+    tried = []
+
+    def body_in(window: tuple[slice, slice]) -> np.ndarray:
+        tried.append(window)
+        return lake[window]
+
+    window, body = _grown((slice(200, 210), slice(300, 305)), lake.shape, 7, body_in)
+    assert len(tried) > 1
+    assert body.sum() == lake.sum()
+    assert window[1].stop == 600  # it goes on to the edge of the map
+    small, _ = _grown((slice(450, 460), slice(300, 305)), lake.shape, 7, lambda window: lake[window] & False)
+    assert small == (slice(422, 488), slice(272, 333))
 
 
 def test_plants_are_green_and_black_is_not():

@@ -12,7 +12,7 @@ water on both.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,6 +113,7 @@ def find_water(
     count, seeds = _components(_closed(seed))
     areas = np.bincount(seeds.ravel(), minlength=count) * cell**2
     places = ndimage.find_objects(seeds)
+    reach = 2 * math.ceil(LEVEL_M / cell) + 1
     for k in sorted(range(1, count), key=lambda k: -areas[k]):
         if areas[k] < SMALLEST_M2:
             break
@@ -122,29 +123,56 @@ def find_water(
         heights = above[places[k - 1]][inside & known[places[k - 1]]]
         level = float(np.median(heights))
         tolerance = max(TOLERANCE_M, 2 * _spread(heights - level))
-        mine = known & (np.abs(mean - level) <= tolerance) & (agree < SHORE_AGREEMENT)
-        mine &= np.abs(above - level) <= OUTLIERS * tolerance
-        mine[places[k - 1]] |= inside
-        parts = _components(mine)[1]
-        touched = np.unique(parts[places[k - 1]][inside])
-        body = _opened(_closed(np.isin(parts, touched[touched > 0])))
-        # Small places that water surrounds are not lower: those are blotches of the matching.
-        _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean < level))
-        body |= (holes > 0) & (np.bincount(holes.ravel())[holes] * cell**2 < SMALLEST_M2)
-        body &= labels == 0
-        wet = body & known
-        side = 2 * math.ceil(LEVEL_M / cell) + 1
-        shore = cv2.dilate(body.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-        shore &= known & ~body
-        if not wet.any() or _spread(mean[wet] - level) > max(SPREAD_M, SPREAD_CELLS * cell):
+
+        def body_in(window: tuple[slice, slice], k: int = k, level: float = level, most: float = tolerance):
+            mine = known[window] & (np.abs(mean[window] - level) <= most) & (agree[window] < SHORE_AGREEMENT)
+            mine &= np.abs(above[window] - level) <= OUTLIERS * most
+            seed = seeds[window] == k
+            parts = _components(mine | seed)[1]
+            body = _opened(_closed(np.isin(parts, np.unique(parts[seed]))))
+            # Small places that water surrounds are not lower: those are blotches of the matching.
+            _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean[window] < level))
+            body |= (holes > 0) & (np.bincount(holes.ravel())[holes] * cell**2 < SMALLEST_M2)
+            return body & (labels[window] == 0)
+
+        window, body = _grown(places[k - 1], labels.shape, reach, body_in)
+        wet = body & known[window]
+        shore = cv2.dilate(body.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+        shore &= known[window] & ~body
+        if not wet.any() or _spread(mean[window][wet] - level) > max(SPREAD_M, SPREAD_CELLS * cell):
             continue
         ring = 2 * math.sqrt(math.pi * wet.sum()) * LEVEL_M / cell  # around a disc of the same area, cells
-        if shore.sum() > LEAST_SHORE * ring and (mean[shore] < level - LOWER_M).mean() > LOWER_SHARE:
+        lower = mean[window][shore] < level - LOWER_M
+        if shore.sum() > LEAST_SHORE * ring and lower.mean() > LOWER_SHARE:
             continue
-        error = _level_error(above, wet, level, max(1, round(BLOCK_M / cell)))
-        labels[body] = len(bodies) + 1
+        error = _level_error(above[window], wet, level, max(1, round(BLOCK_M / cell)))
+        labels[window][body] = len(bodies) + 1
         bodies.append(Body(base + level * up, error * up, tolerance * up, float(body.sum()) * grid.cell**2))
     return labels, bodies
+
+
+def _grown(
+    window: tuple[slice, slice],
+    shape: tuple[int, ...],
+    reach: int,
+    body_in: Callable[[tuple[slice, slice]], Bool[np.ndarray, "h w"]],
+) -> tuple[tuple[slice, slice], Bool[np.ndarray, "h w"]]:
+    """Find a body in windows that grow until it keeps away from their edges, but for those of the map.
+
+    A large map has hundreds of ponds: to look for each on all of it would take hours.
+    """
+    pad = 4 * reach
+    while True:
+        rows, columns = (
+            slice(max(0, side.start - pad), min(most, side.stop + pad))
+            for side, most in zip(window, shape, strict=True)
+        )
+        body = body_in((rows, columns))
+        beyond = (rows.start > 0 and body[:reach].any()) or (rows.stop < shape[0] and body[-reach:].any())
+        beyond |= (columns.start > 0 and body[:, :reach].any()) or (columns.stop < shape[1] and body[:, -reach:].any())
+        if not beyond:
+            return (rows, columns), body
+        pad *= 3
 
 
 def _smooth(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
