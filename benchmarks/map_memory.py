@@ -71,7 +71,6 @@ def measure_memory(
     large = replace(job, grid=Grid(grid.frame, 0.0, metres, cell, count, count, grid.height))
     say(f"{len(large.tiles())} tiles, {count} x {count} cells")
     (out / TILES).mkdir(parents=True)
-    write_json(out / "map.json", {"key": large.key, "complete": False})
     four = [_file(few / TILES, tile) for tile in middle.tiles()]
     across = -(-count // side)
     for number, tile in enumerate(large.tiles()):

@@ -430,8 +430,6 @@ def _known(
     part = file.read(bands, window=window, out_shape=out, resampling=average, masked=True)
     known = file.dataset_mask(window=window, out_shape=shape or part.shape[1:]) > 0
     known &= ~np.ma.getmaskarray(part).any(axis=0)
-    if file.nodata is not None:
-        known &= (part.data != file.nodata).all(axis=0)
     if part.dtype.kind == "f":
         known &= np.isfinite(part.data).all(axis=0)
     return part.data, known
