@@ -13,7 +13,7 @@ from tidefield.data.load import load_scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps import surface
 from tidefield.maps.grid import Grid, Tile, map_frame
-from tidefield.maps.stereo import Rectified, choose_pairs, fill_gaps, stereo_heights
+from tidefield.maps.stereo import Pairs, Rectified, choose_pairs, fill_gaps
 from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
 
@@ -64,7 +64,7 @@ def test_heights_are_those_of_the_flat(scene):
     [tile] = grid.tiles(64, 0)
     choice = choose_views(tile, loaded, sparse_surface(loaded, grid.coarser(COARSEST)))
     grey = GreyPhotographs(loaded)
-    found = stereo_heights(choice.pairs, choice.views, choice.indices, grey, 1, CELL, 64, -2.0, 3.0)
+    found = Pairs(choice.pairs, choice.views, choice.indices, grey, 1, CELL, 64).heights(-2.0, 3.0)
     east, north = (part.ravel() for part in np.broadcast_arrays(*tile.offsets()))
     places = torch.from_numpy(np.stack([east + tile.centre[0], north + tile.centre[1]])).float()
     true = survey.flat.surface.sample(places)[0].reshape(64, 64).numpy()
@@ -123,7 +123,7 @@ def test_the_error_is_large_where_neither_pairs_nor_photographs_determine_the_he
     start = sparse_surface(loaded, grid.coarser(COARSEST))
     rough = start.on(tile, surface.PAD) + np.random.default_rng(0).normal(0, 0.5, (128, 128)).astype(np.float32)
     rough[:, 48:80] = np.nan
-    monkeypatch.setattr(surface, "stereo_heights", lambda *_: rough)
+    monkeypatch.setattr(Pairs, "heights", lambda *_: rough)
     blank = GreyPhotographs(loaded)
     monkeypatch.setattr(blank, "read", lambda index, factor: np.full((240, 320), 100, np.uint8))
     matched = surface.match(tile, start, loaded, blank, CELL)

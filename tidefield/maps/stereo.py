@@ -12,6 +12,7 @@ Coordinates are a tile's: east, north and height from its middle (`Tile.affine`)
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -147,62 +148,59 @@ class Rectified:
         return np.column_stack([x, y, z]) @ self.rotation + self.centre
 
 
-def stereo_heights(
-    pairs: Sequence[tuple[int, int]],
-    views: Sequence[View],
-    indices: Sequence[int],
-    grey: GreyPhotographs,
-    factor: int,
-    cell: float,
-    side: int,
-    low: float,
-    high: float,
-) -> Float32[np.ndarray, "H W"]:
-    """Match pairs; returns the median height of each cell, NaN where no pair has any.
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of photographs to match, and the square of cells around the origin whose heights they give.
 
-    Args:
-        pairs: indices of `views`.
-        views, indices: projections of photographs, and their numbers in the scene.
+    Attributes:
+        indices: pairs of indices of `views`.
+        views, photographs: projections of photographs, and their numbers in the scene.
         grey: the photographs, read at a `factor`-th of their size.
         cell: side of a cell, horizontal units.
-        side: cells along a side of the square around the origin.
-        low, high: heights between which the surface is searched.
+        side: cells along a side of the square.
     """
-    found = [np.full((side, side), np.nan, np.float32)]
-    for i, j in pairs:
-        pictures = grey.read(indices[i], factor), grey.read(indices[j], factor)
-        one = _pair(views[i], views[j], *pictures, cell, side, low, high)
-        if one is not None:
-            found.append(one)
-    heights = np.sort(np.stack(found), axis=0)  # NaN last
-    number = np.isfinite(heights).sum(0)
-    low_middle = np.take_along_axis(heights, np.maximum((number - 1) // 2, 0)[None], 0)[0]
-    high_middle = np.take_along_axis(heights, np.minimum(number // 2, len(heights) - 1)[None], 0)[0]
-    return np.where(number > 0, (low_middle + high_middle) / 2, np.nan).astype(np.float32)
 
+    indices: Sequence[tuple[int, int]]
+    views: Sequence[View]
+    photographs: Sequence[int]
+    grey: GreyPhotographs
+    factor: int
+    cell: float
+    side: int
 
-def narrowed(
-    pairs: Sequence[tuple[int, int]],
-    views: Sequence[View],
-    indices: Sequence[int],
-    grey: GreyPhotographs,
-    factor: int,
-    cell: float,
-    side: int,
-    low: float,
-    high: float,
-) -> tuple[float, float]:
-    """Heights between which the surface lies, by matching pairs in cells `NARROWED` times as large.
+    def coarser(self, times: int) -> Pairs:
+        """The same in cells so many times as large, which may reach a little beyond the square."""
+        return replace(self, factor=self.factor * times, cell=self.cell * times, side=-(-self.side // times))
 
-    The time of matching is proportional to the heights that are searched, and level ground lies in a few of those where
-    trees might stand. Arguments are those of `stereo_heights`.
-    """
-    large = cell * NARROWED
-    found = stereo_heights(pairs, views, indices, grey, factor * NARROWED, large, -(-side // NARROWED), low, high)
-    if np.isnan(found).all():
-        return low, high
-    margin = MARGIN * (high - low)
-    return max(low, float(np.nanmin(found)) - margin), min(high, float(np.nanmax(found)) + margin)
+    def heights(self, low: float, high: float) -> Float32[np.ndarray, "H W"]:
+        """Match pairs; returns the median height of each cell, NaN where no pair has any.
+
+        Args:
+            low, high: heights between which the surface is searched.
+        """
+        found = [np.full((self.side, self.side), np.nan, np.float32)]
+        for i, j in self.indices:
+            first, second = (self.grey.read(self.photographs[k], self.factor) for k in (i, j))
+            one = _pair(self.views[i], self.views[j], first, second, self.cell, self.side, low, high)
+            if one is not None:
+                found.append(one)
+        heights = np.sort(np.stack(found), axis=0)  # NaN last
+        number = np.isfinite(heights).sum(0)
+        low_middle = np.take_along_axis(heights, np.maximum((number - 1) // 2, 0)[None], 0)[0]
+        high_middle = np.take_along_axis(heights, np.minimum(number // 2, len(heights) - 1)[None], 0)[0]
+        return np.where(number > 0, (low_middle + high_middle) / 2, np.nan).astype(np.float32)
+
+    def narrowed(self, low: float, high: float) -> tuple[float, float]:
+        """Heights between which the surface lies, by matching in cells `NARROWED` times as large.
+
+        The time of matching is proportional to the heights that are searched, and level ground lies in a few of those
+        where trees might stand.
+        """
+        found = self.coarser(NARROWED).heights(low, high)
+        if np.isnan(found).all():
+            return low, high
+        margin = MARGIN * (high - low)
+        return max(low, float(np.nanmin(found)) - margin), min(high, float(np.nanmax(found)) + margin)
 
 
 def _pair(

@@ -36,7 +36,7 @@ from tidefield.data.scene import Scene
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
-from tidefield.maps.stereo import choose_pairs, fill_gaps, narrowed, stereo_heights
+from tidefield.maps.stereo import Pairs, choose_pairs, fill_gaps
 
 COARSEST = 8
 """Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
@@ -367,9 +367,9 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     expected = start.on(tile, PAD) - np.float32(tile.grid.height)
     above = float(np.median([view.position[2] for view in views]) - np.median(expected))
     low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
-    matching_of = choice.pairs, views, indices, grey, factor, tile.grid.cell, tile.side + 2 * PAD
-    low, high = narrowed(*matching_of, low, high)
-    height = stereo_heights(*matching_of, low, high)
+    pairs = Pairs(choice.pairs, views, indices, grey, factor, tile.grid.cell, tile.side + 2 * PAD)
+    low, high = pairs.narrowed(low, high)
+    height = pairs.heights(low, high)
     if np.isnan(height).all():
         height, spread = expected, np.full_like(expected, (high - low) / 4)
     else:
