@@ -14,15 +14,15 @@ import numpy as np
 import torch
 
 from benchmarks.change_pairs import compared
+from benchmarks.maps import made_map
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, dilated, measure
 from tidefield.change.regions import Region
 from tidefield.change.surfaces import Grid
 from tidefield.change.write import polygons_of
 from tidefield.data.load import load_scene
-from tidefield.files import completed_folder, read_json, write_json
+from tidefield.files import completed_folder, write_json
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.make import MAP_FILE
 from tidefield.synthetic.flights import BARE, write_flights
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import Difference, Pair, make_pair
@@ -99,11 +99,8 @@ def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) 
     """
     from rich.console import Console
 
-    from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
     from tidefield.commands.prepare import Prepare, prepare
 
-    console = Console(quiet=True)
     surveys = work / "surveys"
     if not surveys.exists():
         say(f"photographs: {views} of {width} px at each date")
@@ -115,10 +112,9 @@ def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) 
         photographs, scene, out = surveys / date / "photographs", work / f"scene-{date}", work / f"map-{date}"
         if not (scene / "report.html").exists():
             say(f"{date}: prepare")
-            prepare(Prepare(photographs, scene), console)
-        if not (read_json(out / MAP_FILE) or {}).get("complete"):
-            say(f"{date}: map")
-            map_(Map(scene, out, ZeroShot(zero_shot=True), gsd=_CELL_M, area=_area(work)), console)
+            prepare(Prepare(photographs, scene), Console(quiet=True))
+        say(f"{date}: map")
+        made_map(scene, out, gsd=_CELL_M, area=_area(work))
         record["steps"][date] = {**_poses(scene, surveys, k), **_heights(out, surveys, k)}
         say(f"{date}: {record['steps'][date]}")
     say("change")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from benchmarks.maps import made_map
 from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
 from tidefield.change.light import greenness, smoothed
@@ -24,8 +25,7 @@ from tidefield.change.regions import Region, rasterised
 from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import Grid, Surface, common_grid
 from tidefield.change.write import polygons_of
-from tidefield.files import completed_folder, read_json, write_text
-from tidefield.maps.make import MAP_FILE
+from tidefield.files import completed_folder, write_text
 
 FLIGHTS = {"first": (1414, 1481), "third": (1548, 1618)}
 CELL_M = 0.15
@@ -61,11 +61,8 @@ def measure_null(photographs: Path, work: Path, say: Callable[[str], object]) ->
     """
     from rich.console import Console
 
-    from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
     from tidefield.commands.prepare import Prepare, prepare
 
-    console = Console(quiet=True)
     record: dict[str, Any] = {}
     for name, flight in FLIGHTS.items():
         own = work / name
@@ -73,11 +70,9 @@ def measure_null(photographs: Path, work: Path, say: Callable[[str], object]) ->
             copy_flight(photographs, flight, own / "photographs")
         if not (own / "scene" / "report.html").exists():
             say(f"{name}: prepare")
-            prepare(Prepare(own / "photographs", own / "scene"), console)
-        if not (read_json(own / "map" / MAP_FILE) or {}).get("complete"):
-            say(f"{name}: map")
-            map_(Map(own / "scene", own / "map", ZeroShot(zero_shot=True), gsd=CELL_M), console)
-        made = read_json(own / "map" / MAP_FILE)
+            prepare(Prepare(own / "photographs", own / "scene"), Console(quiet=True))
+        say(f"{name}: map")
+        made = made_map(own / "scene", own / "map", gsd=CELL_M)
         record[name] = {key: made[key] for key in ("area", "sigma_median", "views_median")}
     return {**record, **compare(work, say)}
 

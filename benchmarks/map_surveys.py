@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.maps import made_map
 from tidefield.compare.tables import Table
 from tidefield.files import read_json, write_json
 from tidefield.machine import describe
-from tidefield.maps.make import MAP_FILE
 
 PUBLISHED = (
     "brighton_beach by ODM 3.5.3, 4000 px (users' reports, 2024; machines not stated)",
@@ -31,19 +31,10 @@ def measure_surveys(scenes: Sequence[Path], out: Path, say: Callable[[str], obje
         out: folder for the maps and map_surveys.json.
         say: reports progress.
     """
-    from rich.console import Console
-
-    from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
-
     record: dict[str, Any] = {**describe(), "surveys": {}}
     for scene in scenes:
-        folder = out / scene.name
-        if not (read_json(folder / MAP_FILE) or {}).get("complete"):
-            say(f"{scene.name}: map")
-            map_(Map(scene, folder, ZeroShot(zero_shot=True)), Console(quiet=True))
-        made, prepared = read_json(folder / MAP_FILE), read_json(scene / "report.json")
-        assert made is not None
+        say(f"{scene.name}: map")
+        made, prepared = made_map(scene, out / scene.name), read_json(scene / "report.json")
         assert prepared is not None, f"{scene} is not of `tidefield prepare`"
         errors = prepared["gps_errors"]
         record["surveys"][scene.name] = {

@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.maps import _whole
+from benchmarks.maps import _whole, made_map, write_square
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.evaluation.metrics import fit_colours, flip_map, ssim_map
 from tidefield.files import completed_folder, write_json
 from tidefield.machine import describe
 from tidefield.maps.grid import Grid, map_frame
-from tidefield.maps.make import DSM, MAP_FILE, ORTHOPHOTO
+from tidefield.maps.make import DSM, ORTHOPHOTO
 from tidefield.maps.surface import COARSEST, View, sparse_surface
 
 ROUNDS = 30
@@ -39,10 +39,6 @@ def measure_views(root: Path, out: Path, half_m: float, say: Callable[[str], obj
         say: reports progress.
     """
     import rasterio
-    from rich.console import Console
-
-    from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
 
     scene = load_scene(root, hold_out=False)
     position = (scene.cameras.position_world.double() + scene.origin_world.double()).numpy()
@@ -52,12 +48,8 @@ def measure_views(root: Path, out: Path, half_m: float, say: Callable[[str], obj
         with completed_folder(out / "scene") as partial:
             shutil.copytree(root / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
             shutil.copytree(root / "sparse", partial / "sparse")
-    square = [[x * half_m, y * half_m] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
-    write_json(out / "area.json", {"type": "Polygon", "coordinates": [square]})
-    if not (out / "map" / MAP_FILE).exists():
-        say(f"map without {name}")
-        options = Map(out / "scene", out / "map", ZeroShot(zero_shot=True), area=out / "area.json", allow_missing=True)
-        map_(options, Console(quiet=True))
+    say(f"map without {name}")
+    made_map(out / "scene", out / "map", area=write_square(out, half_m), allow_missing=True)
     with rasterio.open(out / "map" / DSM) as dataset:
         height = dataset.read(1, masked=True).filled(np.nan)
         transform = dataset.transform

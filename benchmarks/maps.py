@@ -46,15 +46,10 @@ def measure_maps(
         half_m: half the side of the square that is mapped.
         say: reports progress.
     """
-    from rich.console import Console
-
-    from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
     from tidefield.synthetic import make_survey, write_survey
 
     record = read_json(runs / MAPS_FILE) or {"figures": {}}
-    square = [[x * half_m, y * half_m] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
-    write_json(runs / "area.json", {"type": "Polygon", "coordinates": [square]})
+    area = write_square(runs, half_m)
     for category in categories:
         name = f"{category}, {width} px, {views} photographs"
         if name in record["figures"]:
@@ -64,16 +59,39 @@ def measure_maps(
             say(f"{name}: photographs")
             with completed_folder(folder / "scene") as partial:
                 write_survey(make_survey(category, seed=SEED, views=views, width=width), partial)
-        made = read_json(folder / "map" / MAP_FILE) or {}
-        if not made.get("complete"):
-            say(f"{name}: map")
-            options = Map(folder / "scene", folder / "map", ZeroShot(zero_shot=True), area=runs / "area.json")
-            made = map_(options, Console(quiet=True))
+        say(f"{name}: map")
+        made = made_map(folder / "scene", folder / "map", area=area)
         say(f"{name}: floors")
         record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
         command = f"python -m benchmarks maps --width {width} --views {views} --half {half_m:g}"
         write_json(runs / MAPS_FILE, {**record, **describe(), "command": command})
     return record
+
+
+def write_square(folder: Path, half_m: float) -> Path:
+    """Write area.json into a folder: a square around the origin, for `--area`."""
+    square = [[x * half_m, y * half_m] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    write_json(folder / "area.json", {"type": "Polygon", "coordinates": [square]})
+    return folder / "area.json"
+
+
+def made_map(scene: Path, out: Path, **options: Any) -> dict[str, Any]:
+    """What `tidefield map --zero-shot` records of a map; it is made unless it is there.
+
+    Args:
+        scene: the scene's folder.
+        out: the map's folder.
+        options: further ones of the command.
+    """
+    from rich.console import Console
+
+    from tidefield.commands.common import ZeroShot
+    from tidefield.commands.map_ import Map, map_
+
+    made = read_json(out / MAP_FILE) or {}
+    if made.get("complete"):
+        return made
+    return map_(Map(scene, out, ZeroShot(zero_shot=True), **options), Console(quiet=True))
 
 
 def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
