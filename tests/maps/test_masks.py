@@ -15,6 +15,7 @@ from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.masks import (
     _grown,
+    _Signs,
     excess_green,
     find_water,
     level_water,
@@ -88,18 +89,21 @@ def test_small_lower_places_that_water_surrounds_are_water_and_large_ones_are_no
 def test_a_body_is_found_whole_however_far_it_reaches_from_where_it_was_seen():
     lake = np.zeros((500, 600), bool)
     lake[20:420, 100:] = True
-    tried = []
-
-    def body_in(window: tuple[slice, slice]) -> np.ndarray:
-        tried.append(window)
-        return lake[window]
-
-    window, body = _grown((slice(200, 210), slice(300, 305)), lake.shape, 7, body_in)
-    assert len(tried) > 1
-    assert body.sum() == lake.sum()
+    lake[450:460, 300:310] = True
+    level, seeds = np.zeros(lake.shape, np.float32), np.zeros(lake.shape, np.int32)
+    seeds[200:210, 300:305] = 1
+    seeds[450:460, 300:310] = 2
+    agreement = np.where(lake, 0.2, 0.9).astype(np.float32)
+    signs = _Signs(level, level, agreement, np.ones_like(lake), seeds, 0.05)
+    assert signs.reach == 7
+    near = slice(172, 238), slice(272, 333)
+    assert signs.body(near, 1, 0.0, 0.1).all()
+    window, body = _grown(signs, (slice(200, 210), slice(300, 305)), 1, 0.0, 0.1)
+    rounded = 2 * 3  # cells at the lake's western corners, which the opening takes off
+    assert lake[:430].sum() - body.sum() == rounded
     assert window[1].stop == 600  # it goes on to the edge of the map
-    small, _ = _grown((slice(450, 460), slice(300, 305)), lake.shape, 7, lambda window: lake[window] & False)
-    assert small == (slice(422, 488), slice(272, 333))
+    small, _ = _grown(signs, (slice(450, 460), slice(300, 310)), 2, 0.0, 0.1)
+    assert small == (slice(422, 488), slice(272, 338))
 
 
 def test_plants_are_green_and_black_is_not():

@@ -12,7 +12,7 @@ water on both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,70 +104,109 @@ def find_water(
     if not known.any():
         return labels, bodies
     base = float(np.median(height[known]))
-    above = (np.where(known, height - base, 0) / up).astype(np.float32)
-    mean = _smooth(above, known, LEVEL_M / cell)
-    rough = np.sqrt(np.maximum(_smooth(above**2, known, LEVEL_M / cell) - mean**2, 0))
-    south, east = np.gradient(mean, cell)
-    agree = _smooth(np.nan_to_num(agreement), known, AGREEMENT_M / cell)
-    seed = known & (agree < LEAST_AGREEMENT) & (np.hypot(south, east) < SLOPE) & (rough < ROUGHNESS_M)
-    count, seeds = _components(_closed(seed))
-    areas = np.bincount(seeds.ravel(), minlength=count) * cell**2
-    places = ndimage.find_objects(seeds)
-    reach = 2 * math.ceil(LEVEL_M / cell) + 1
-    for k in sorted(range(1, count), key=lambda k: -areas[k]):
+    signs = _signs((np.where(known, height - base, 0) / up).astype(np.float32), known, agreement, cell)
+    areas = np.bincount(signs.seeds.ravel()) * cell**2
+    places = ndimage.find_objects(signs.seeds)
+    for k in sorted(range(1, len(areas)), key=lambda k: -areas[k]):
+        place = places[k - 1]
         if areas[k] < SMALLEST_M2:
             break
-        inside = seeds[places[k - 1]] == k
-        if (labels[places[k - 1]][inside] > 0).mean() > 0.5:
+        inside = signs.seeds[place] == k
+        if (labels[place][inside] > 0).mean() > 0.5:
             continue
-        heights = above[places[k - 1]][inside & known[places[k - 1]]]
+        heights = signs.height[place][inside & known[place]]
         level = float(np.median(heights))
         tolerance = max(TOLERANCE_M, 2 * _spread(heights - level))
-
-        def body_in(window: tuple[slice, slice], k: int = k, level: float = level, most: float = tolerance):
-            mine = known[window] & (np.abs(mean[window] - level) <= most) & (agree[window] < SHORE_AGREEMENT)
-            mine &= np.abs(above[window] - level) <= OUTLIERS * most
-            seed = seeds[window] == k
-            parts = _components(mine | seed)[1]
-            body = _opened(_closed(np.isin(parts, np.unique(parts[seed]))))
-            # Small places that water surrounds are not lower: those are blotches of the matching.
-            _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean[window] < level))
-            body |= (holes > 0) & (np.bincount(holes.ravel())[holes] * cell**2 < SMALLEST_M2)
-            return body & (labels[window] == 0)
-
-        window, body = _grown(places[k - 1], labels.shape, reach, body_in)
+        window, body = _grown(signs, place, k, level, tolerance)
+        body &= labels[window] == 0
+        if not signs.is_water(window, body, level):
+            continue
         wet = body & known[window]
-        shore = cv2.dilate(body.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-        shore &= known[window] & ~body
-        if not wet.any() or _spread(mean[window][wet] - level) > max(SPREAD_M, SPREAD_CELLS * cell):
-            continue
-        ring = 2 * math.sqrt(math.pi * wet.sum()) * LEVEL_M / cell  # around a disc of the same area, cells
-        lower = mean[window][shore] < level - LOWER_M
-        if shore.sum() > LEAST_SHORE * ring and lower.mean() > LOWER_SHARE:
-            continue
-        error = _level_error(above[window], wet, level, max(1, round(BLOCK_M / cell)))
+        error = _level_error(signs.height[window], wet, level, max(1, round(BLOCK_M / cell)))
         labels[window][body] = len(bodies) + 1
         bodies.append(Body(base + level * up, error * up, tolerance * up, float(body.sum()) * grid.cell**2))
     return labels, bodies
 
 
+Window = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class _Signs:
+    """What tells a map's water from its ground, in its cells.
+
+    Attributes:
+        height: metres above some base.
+        mean: of the heights in Gaussian windows of `LEVEL_M`.
+        agreement: mean correlation of the photographs, in windows of `AGREEMENT_M`.
+        known: cells with a height and without plants.
+        seeds: the place where a body may begin that a cell is of, from 1, 0 for none.
+        cell: its side, metres.
+    """
+
+    height: Float32[np.ndarray, "h w"]
+    mean: Float32[np.ndarray, "h w"]
+    agreement: Float32[np.ndarray, "h w"]
+    known: Bool[np.ndarray, "h w"]
+    seeds: Int[np.ndarray, "h w"]
+    cell: float
+
+    @property
+    def reach(self) -> int:
+        """Side of the square within which a shore lies around a body, cells."""
+        return 2 * math.ceil(LEVEL_M / self.cell) + 1
+
+    def body(self, window: Window, seed: int, level: float, tolerance: float) -> Bool[np.ndarray, "h w"]:
+        """The cells of a window to which water reaches from a seed, level as they are."""
+        mean = self.mean[window]
+        mine = self.known[window] & (np.abs(mean - level) <= tolerance) & (self.agreement[window] < SHORE_AGREEMENT)
+        mine &= np.abs(self.height[window] - level) <= OUTLIERS * tolerance
+        start = self.seeds[window] == seed
+        parts = _components(mine | start)[1]
+        body = _opened(_closed(np.isin(parts, np.unique(parts[start]))))
+        # Small places that water surrounds are not lower: those are blotches of the matching.
+        _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean < level))
+        return body | ((holes > 0) & (np.bincount(holes.ravel())[holes] * self.cell**2 < SMALLEST_M2))
+
+    def is_water(self, window: Window, body: Bool[np.ndarray, "h w"], level: float) -> bool:
+        """Whether the heights of a body are level, and hardly any lower ground is at its shore."""
+        known, mean = self.known[window], self.mean[window]
+        wet = body & known
+        if not wet.any() or _spread(mean[wet] - level) > max(SPREAD_M, SPREAD_CELLS * self.cell):
+            return False
+        shore = cv2.dilate(body.astype(np.uint8), np.ones((self.reach, self.reach), np.uint8)) > 0
+        shore &= known & ~body
+        ring = 2 * math.sqrt(math.pi * wet.sum()) * LEVEL_M / self.cell  # around a disc of the same area, cells
+        if shore.sum() <= LEAST_SHORE * ring:
+            return True
+        return float((mean[shore] < level - LOWER_M).mean()) <= LOWER_SHARE
+
+
+def _signs(
+    height: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], agreement: np.ndarray, cell: float
+) -> _Signs:
+    mean = _smooth(height, known, LEVEL_M / cell)
+    rough = np.sqrt(np.maximum(_smooth(height**2, known, LEVEL_M / cell) - mean**2, 0))
+    south, east = np.gradient(mean, cell)
+    agree = _smooth(np.nan_to_num(agreement), known, AGREEMENT_M / cell)
+    seed = known & (agree < LEAST_AGREEMENT) & (np.hypot(south, east) < SLOPE) & (rough < ROUGHNESS_M)
+    return _Signs(height, mean, agree, known, _components(_closed(seed))[1], cell)
+
+
 def _grown(
-    window: tuple[slice, slice],
-    shape: tuple[int, ...],
-    reach: int,
-    body_in: Callable[[tuple[slice, slice]], Bool[np.ndarray, "h w"]],
-) -> tuple[tuple[slice, slice], Bool[np.ndarray, "h w"]]:
+    signs: _Signs, place: Window, seed: int, level: float, tolerance: float
+) -> tuple[Window, Bool[np.ndarray, "h w"]]:
     """Find a body in windows that grow until it keeps away from their edges, but for those of the map.
 
     A large map has hundreds of ponds: to look for each on all of it would take hours.
     """
+    shape, reach = signs.seeds.shape, signs.reach
     pad = 4 * reach
     while True:
         rows, columns = (
-            slice(max(0, side.start - pad), min(most, side.stop + pad))
-            for side, most in zip(window, shape, strict=True)
+            slice(max(0, side.start - pad), min(most, side.stop + pad)) for side, most in zip(place, shape, strict=True)
         )
-        body = body_in((rows, columns))
+        body = signs.body((rows, columns), seed, level, tolerance)
         beyond = (rows.start > 0 and body[:reach].any()) or (rows.stop < shape[0] and body[-reach:].any())
         beyond |= (columns.start > 0 and body[:, :reach].any()) or (columns.stop < shape[1] and body[:, -reach:].any())
         if not beyond:
