@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -17,6 +18,7 @@ from PIL import Image
 from tidefield import cli, synthetic
 from tidefield import progress as meter
 from tidefield.commands import demo
+from tidefield.data.load import load_scene
 from tidefield.synthetic import make_survey, write_survey
 
 
@@ -69,6 +71,23 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     video = tmp_path / "flight.mp4"
     call("render", run, video, "--path", "strip", "--frames", 2, "--width", 32, "-q")
     assert video.stat().st_size > 0
+
+
+def test_a_path_of_a_file_has_its_own_size_unless_another_in_its_proportion_is_given(
+    scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pose = load_scene(scene).cameras.T_world_camera[0].numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+    frame = {"camera_to_world": [*pose.flatten().tolist(), 0.0, 0.0, 0.0, 1.0], "fov": 50.0, "aspect": 4 / 3}
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps({"render_width": 48, "render_height": 36, "fps": 24, "camera_path": [frame, frame]}))
+    for name, options, size in (("own", [], (48, 36)), ("small", ["--width", 32], (32, 24))):
+        video = tmp_path / f"{name}.mp4"
+        call("render", run, video, "--path", path, *options, "--device", "cpu", "-q")
+        capture = cv2.VideoCapture(str(video))
+        assert tuple(int(capture.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)) == size
+        assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
+    stretched = ["--path", path, "--width", 32, "--height", 32]
+    assert "the same proportion" in fails(capsys, "render", run, tmp_path / "a.mp4", *stretched)
 
 
 def test_a_run_is_evaluated_at_another_width_than_its_own_and_with_several_rays(

@@ -50,9 +50,9 @@ class Render:
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     footprint: OmitArgPrefixes[Footprint] = Footprint()
     frames: int = 240
-    """Frames of the video, 24 a second."""
+    """Frames of the video, 24 a second; a JSON has its own."""
     width: int | None = None
-    """Width of the picture in pixels; that of the run's photographs if not given."""
+    """Width of the picture in pixels; that of the JSON or of the run's photographs if not given."""
     height: int | None = None
     """Height of the picture in pixels; in proportion to the width if not given."""
     device: Device = "auto"
@@ -94,6 +94,8 @@ def render(options: Render, console: Console) -> None:
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = trajectory.cameras
+        if Path(options.path).suffix.lower() == ".json":
+            cameras = _resized(cameras, options.width, options.height)
         from tidefield.model.renderer import in_turn
         from tidefield.render.video import write_video
 
@@ -113,6 +115,17 @@ def render(options: Render, console: Console) -> None:
                 progress=lambda done: bar(done, len(cameras)),
             )
     console.print(f"{out}: {len(cameras)} frames", highlight=False, soft_wrap=True)
+
+
+def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras:
+    """Cameras of a file, in a size in their own proportion if one is given."""
+    own, size = cameras[0], _size(cameras[0], width, height)
+    if abs(size[0] * own.height - size[1] * own.width) > max(own.width, own.height):
+        raise RunError(
+            f"--width {width} --height {height} was given for a path of {own.width} x {own.height} pixels: expected "
+            "the same proportion; leave one of them out"
+        )
+    return cameras.resized(*size)
 
 
 def _size(camera: Cameras, width: int | None, height: int | None) -> tuple[int, int]:
