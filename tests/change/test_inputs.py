@@ -97,6 +97,18 @@ def test_maps_in_a_known_system_bring_it_and_their_clouds(tmp_path: Path):
     assert found.clouds[0].sigma.max() == pytest.approx(SIGMA_M)
 
 
+def test_surveys_that_are_called_the_same_are_told_apart_by_their_folders(tmp_path: Path):
+    earlier, later, _ = surfaces(tmp_path)
+    one, two = (write_map(tmp_path / name / "out" / "map", earlier, True) for name in ("spring", "autumn"))
+    found = open_pair(one, two, tmp_path)
+    assert (found.earlier.name, found.later.name) == ("spring/out/map", "autumn/out/map")
+    dated = open_pair(one, two, tmp_path, ("2024-01-01", "2024-02-01"))
+    assert (dated.earlier.name, dated.later.name) == ("2024-01-01", "2024-02-01")
+    other = write_map(tmp_path / "autumn" / "out" / "later", later, True)
+    assert open_pair(two, other, tmp_path).later.name == "later"
+    assert open_pair(one, one, tmp_path).later.name == "map"
+
+
 def test_a_map_finds_its_files_and_states_its_frame(tmp_path: Path):
     heights = surfaces(tmp_path)[0]
     found = open_survey(write_map(tmp_path / "map", heights, False))

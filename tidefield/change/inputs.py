@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def open_pair(
             if paths[0] is None or paths[1] is None:
                 raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
             clouds = _both(paths[0], paths[1])
-        return Pair(surveys[0], surveys[1], clouds)
+        return Pair(*_told_apart(surveys, (earlier, later)), clouds)
     clouds = _both(earlier, later)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
     surfaces = []
@@ -105,7 +106,19 @@ def open_pair(
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
         surfaces.append(replace(opened, source=cloud.path.name, remarks=[]))
-    return Pair(surfaces[0], surfaces[1], clouds)
+    return Pair(*_told_apart(surfaces, (earlier, later)), clouds)
+
+
+def _told_apart(surveys: Sequence[Surface], paths: Sequence[Path]) -> Sequence[Surface]:
+    """Two surveys; if files are called the same, with as many of the folders above in their names as differ."""
+    if surveys[0].name != surveys[1].name or surveys[0].date:
+        return surveys
+    parts = [path.resolve().parts for path in paths]
+    depth = next((k for k in range(1, 1 + min(map(len, parts))) if parts[0][-k] != parts[1][-k]), 1)
+    return [
+        replace(survey, source="/".join((*own[-depth:-1], survey.name)))
+        for survey, own in zip(surveys, parts, strict=True)
+    ]
 
 
 def _both(earlier: Path, later: Path) -> tuple[Cloud, Cloud]:
