@@ -61,7 +61,9 @@ def _description(folder: Path) -> None:
     """A scene without the exposures of its photographs, which take most of the time of reading it."""
     import torch
 
-    with patch("tidefield.data.load.estimate_gains", lambda photographs, *_: torch.ones(len(photographs), 3)):
+    with patch(
+        "tidefield.data.load.estimate_gains", lambda seen, cameras, *_: (torch.ones(len(cameras), 3), np.zeros((2, 3)))
+    ):
         _scene(folder)
 
 

@@ -9,9 +9,9 @@ import torch
 from captures import survey
 from torch import Tensor
 
-from tidefield.data.exposure import Seen
+from tidefield.data.exposure import Seen, across_views
 from tidefield.data.scene import SparsePoints
-from tidefield.data.shading import estimate_shading
+from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.geometry.cameras import Cameras, concatenate, pixel_grid
 
 COUNT, NOISE = 39, 0.01
@@ -49,7 +49,11 @@ def light(cameras: Cameras, points: SparsePoints, shading: Tensor | None) -> Ten
 def seen_in(which: tuple[int, ...], value: Tensor, points: SparsePoints) -> Seen:
     row = torch.isin(points.camera_index, torch.tensor(which)).nonzero()[:, 0].numpy()
     all_seen = Seen(
-        value.double().numpy(), points.point_index.numpy(), points.camera_index.numpy(), np.arange(len(value))
+        value.double().numpy(),
+        points.point_index.numpy(),
+        points.camera_index.numpy(),
+        np.arange(len(value)),
+        np.zeros((len(value), 2)),
     )
     return all_seen.part(np.isin(np.arange(len(value)), row))
 
@@ -138,3 +142,16 @@ def test_cameras_with_and_without_shading_are_joined_and_selected():
     assert torch.equal(both.shading[:3], planted()[:3])
     assert not both.shading[3:].any()
     assert torch.equal(with_light[7].shading[0], planted()[7])
+
+
+def test_what_depends_on_the_direction_is_a_polynomial_over_each_frame():
+    scene = survey()
+    points = scene.points
+    assert points is not None
+    by_direction = np.array([[0.3, 0.2, 0.1], [-0.1, 0.0, 0.2]])
+    shading = directional_shading(scene.cameras, TRAIN, by_direction)
+    found = light(scene.cameras, points, shading) - light(scene.cameras, points, None)
+    ray = points.xyz_world[points.point_index] - scene.cameras.position_world[points.camera_index]
+    direction = torch.nn.functional.normalize(ray, dim=1).double().numpy() @ across_views(scene.cameras, TRAIN)
+    assert np.ptp(direction @ by_direction) > 0.1
+    np.testing.assert_allclose(found.numpy(), direction @ by_direction, atol=3e-3)

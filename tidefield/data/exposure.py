@@ -1,15 +1,22 @@
 """Exposure gains: one factor per photograph and colour channel that relates it to the scene's common exposure.
 
-docs/method.md, section 12. The model is multiplicative on display-referred values, log I_ip = g_i + a_p: photograph i
-shows sparse point p in the point's own colour times the photograph's gain. Three sources enter one sparse least-squares
-problem:
+docs/method.md, section 12. The model is multiplicative on display-referred values,
+
+    log I_ip = g_i + a_p + b d_ip:
+
+photograph i shows sparse point p in the point's own colour times the photograph's gain, and times a factor that depends
+on the direction of view d_ip, for the ground is brighter towards the sun or away from it. Over flat ground all of
+b d_ip is the same as gains and colours that change with the place, exponentially: what photographs share cannot tell
+one from the other. Flights can: they go to and fro, and light changes seldom. Three sources enter one sparse
+least-squares problem:
 
 - training photographs that see the same points (robustly: water moves, and so do reflections);
-- consecutive photographs, whose gains differ little beyond the difference of their EXIF exposures;
+- consecutive photographs, whose gains differ little beyond the difference of their EXIF exposures (robustly: of some,
+  they differ much);
 - photographs taken close to each other, likewise.
 
-The weights of the last two are estimated from the training photographs. Held-out photographs enter through these two
-only: their gains come from their metadata and their neighbours, never from their pixels.
+Held-out photographs enter through the last two only: their gains come from their metadata and their neighbours, never
+from their pixels.
 
 Alphabet: V photographs, O observations of sparse points, N pairs of photographs, C values per observation.
 """
@@ -47,12 +54,15 @@ LEAST_NOISE = 0.01
 """Least standard deviation of a log window mean: rounding to 8 bits and resampling; weights need a positive scale."""
 LOOSE = 1e-6
 """Weight of a photograph's prior gain. It determines the overall level, and photographs without any connection."""
-HOLD, HELD_TO = 0.01, 0.1
-"""Weight of a photograph's prior gain relative to that of its observations, and the difference of log gains beyond
-which it counts as an outlier (Huber's loss). As if a gain had a standard deviation of 10%, and what observations say of
-it together, however many they are, an error of 1%, because surfaces look different from different directions. Without
-it such errors add up from photograph to photograph, and a large survey gets ever brighter to one side. Brown and Lowe
-(Automatic panoramic image stitching using invariant features, 2007) hold gains near 1 by 10%, too."""
+INDEPENDENT = 50
+"""Independent observations that those of a photograph count for where directions are estimated, however many they are:
+surfaces and lenses have other errors, which neighbouring observations share."""
+FIRST_STEP, LEAST_STEP = 0.05, 0.005
+"""Standard deviation of most differences of consecutive photographs' log gains: at first, and at least."""
+SUN = 0.1
+"""Standard deviation, among surveys, of how log colours change with a component of the direction."""
+RIDGE = 1e-6
+"""On coefficients of further terms: what no observation tells apart stays at zero."""
 MOST_SHARED = 64
 """Photographs per observed point, in the mean over observations, above which the normal matrix is not formed: it has
 this many entries per observation. Here both ways take equally long, on a strip of 2,000 photographs."""
@@ -66,8 +76,11 @@ def estimate_gains(
     train: Sequence[int],
     metadata: Exposures | None = None,
     divided_by: Float64[np.ndarray, "V 3"] | None = None,
-) -> Float[Tensor, "V 3"]:
+) -> tuple[Float[Tensor, "V 3"], Float64[np.ndarray, "2 3"]]:
     """Estimate the gain of every photograph and channel, with geometric mean 1 over the training photographs.
+
+    Returns:
+        The gains; and how log colours change with the two components of `Seen.direction`.
 
     Args:
         seen: what the training photographs show of the sparse points (`observe`); without, the gains follow from the
@@ -83,11 +96,11 @@ def estimate_gains(
     applied = np.zeros((count, 3)) if divided_by is None else np.log(divided_by)
     if seen is not None and len(seen.value):
         seen = replace(seen, value=seen.value + applied[seen.photograph])
-        gains = _solve(seen, exposure, clock, cameras.position_world.double().cpu().numpy(), learned)
+        gains, by_direction = _solve(seen, exposure, clock, cameras.position_world.double().cpu().numpy(), learned)
     else:
-        gains = DISPLAY_SLOPE * exposure[:, None] * np.ones(3)
+        gains, by_direction = DISPLAY_SLOPE * exposure[:, None] * np.ones(3), np.zeros((2, 3))
     gains = gains - applied
-    return torch.as_tensor(np.exp(gains - gains[learned].mean(0)), dtype=torch.float32)
+    return torch.as_tensor(np.exp(gains - gains[learned].mean(0)), dtype=torch.float32), by_direction
 
 
 @dataclass(frozen=True)
@@ -99,17 +112,19 @@ class Seen:
         point: the point.
         photograph: the photograph.
         row: the index among the sparse points' observations.
+        direction: of the view, the components along `across_views` of the unit vector from photograph to point.
     """
 
     value: Float64[np.ndarray, "O 3"]
     point: Int64[np.ndarray, " O"]
     photograph: Int64[np.ndarray, " O"]
     row: Int64[np.ndarray, " O"]
+    direction: Float64[np.ndarray, "O 2"]
 
     def part(self, chosen: Bool[np.ndarray, " O"]) -> Seen:
         """Select observations; points are numbered anew."""
         point = np.unique(self.point[chosen], return_inverse=True)[1]
-        return Seen(self.value[chosen], point, self.photograph[chosen], self.row[chosen])
+        return Seen(self.value[chosen], point, self.photograph[chosen], self.row[chosen], self.direction[chosen])
 
     def centred(
         self, value: Float64[np.ndarray, "O C"], weight: Float64[np.ndarray, " O"] | None = None
@@ -137,13 +152,19 @@ _NO_INDEX = np.zeros(0, dtype=np.int64)
 _NO_PAIRS = Pairs(_NO_INDEX, _NO_INDEX, np.zeros(0))
 
 
-def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]) -> Seen:
+def across_views(cameras: Cameras, which: Sequence[int]) -> Float64[np.ndarray, "3 2"]:
+    """Two unit vectors across the mean optical axis of some cameras, in world coordinates."""
+    mean = cameras.T_world_camera[list(which), :, 2].double().mean(0).cpu().numpy()
+    return np.linalg.svd(mean[None])[2][1:].T
+
+
+def observe(photographs: Photographs, cameras: Cameras, points: SparsePoints, which: Sequence[int]) -> Seen:
     """Measure the mean log colour of a small window around every observation in the given photographs.
 
     The memory of each photograph is given back once it was looked at.
 
     Args:
-        photographs, points: of a scene.
+        photographs, cameras, points: of a scene.
         which: indices of the photographs.
     """
     camera, uv = points.camera_index.cpu().numpy(), points.uv_px.double().cpu().numpy()
@@ -158,7 +179,11 @@ def observe(photographs: Photographs, points: SparsePoints, which: Sequence[int]
     row = np.concatenate(rows)
     point = points.point_index.cpu().numpy()[row].astype(np.int64)
     shared = np.bincount(point, minlength=1)[point] > 1
-    return Seen(np.concatenate(values)[shared], point[shared], camera[row][shared].astype(np.int64), row[shared])
+    point, photograph, row = point[shared], camera[row][shared].astype(np.int64), row[shared]
+    # Through the pixels: positions are relative to an origin that held-out photographs take part in.
+    ray = cameras[torch.from_numpy(photograph)].directions_world(points.uv_px[torch.from_numpy(row), None])[:, 0]
+    direction = torch.nn.functional.normalize(ray.double(), dim=1).cpu().numpy() @ across_views(cameras, which)
+    return Seen(np.concatenate(values)[shared], point, photograph, row, direction)
 
 
 def _window_means(
@@ -182,18 +207,26 @@ def _solve(
     clock: Float64[np.ndarray, " V"],
     position: Float64[np.ndarray, "V 3"],
     train: Int64[np.ndarray, " T"],
-) -> Float64[np.ndarray, "V 3"]:
-    """Log gains from the observations alone, then again with pairs, weighted by how similar their gains were."""
+) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "2 3"]]:
+    """Log gains, and how log colours change with the direction."""
     count = len(exposure)
-    first, noise = robust_gains(seen, np.zeros(count))
     supported = train[np.bincount(seen.photograph, minlength=count)[train] >= SUPPORT]
     sequence = in_sequence(clock, supported)
-    # Log gain per log exposure, from consecutive photographs: over a longer time automatic exposure follows the
-    # daylight, and both cancel.
-    change = sequence.difference(exposure)
-    total = (change**2 / sequence.distance).sum() + SLOPE_WEIGHT
-    follows = (sequence.difference(first).mean(1) * change / sequence.distance).sum() + SLOPE_WEIGHT * DISPLAY_SLOPE
-    prior = float(np.clip(follows / total, 0.0, 1.0)) * exposure
+    change, nothing = sequence.difference(exposure), np.zeros(count)
+
+    def slope(gains: Float64[np.ndarray, "V 3"]) -> float:
+        """Log gain per log exposure, from consecutive photographs: over a longer time automatic exposure follows the
+        daylight, and both cancel."""
+        total = (change**2 / sequence.distance).sum() + SLOPE_WEIGHT
+        follows = (sequence.difference(gains).mean(1) * change / sequence.distance).sum()
+        return float(np.clip((follows + SLOPE_WEIGHT * DISPLAY_SLOPE) / total, 0.0, 1.0))
+
+    even, by_direction = _without_directions(seen, nothing, sequence)
+    if change.any():
+        expected = slope(robust_gains(even, nothing)[0]) * exposure
+        even, by_direction = _without_directions(seen, expected, sequence)
+    first, noise = robust_gains(even, nothing)
+    prior = slope(first) * exposure
     pairs, weights = [], []
     for supporting, everyone in (
         (sequence, in_sequence(clock, np.arange(count))),
@@ -205,20 +238,76 @@ def _solve(
         pairs.append(everyone)
         weights.append(noise**2 / (variance * everyone.distance))
     both = Pairs(*(np.concatenate([getattr(p, name) for p in pairs]) for name in ("a", "b", "distance")))
-    gains, _ = robust_gains(seen, prior, both, np.concatenate(weights), hold=True)
-    return gains
+    return robust_gains(even, prior, both, np.concatenate(weights))[0], by_direction
 
 
-def held(seen: Seen, count: int, away: Float64[np.ndarray, "V 3"] | None = None) -> Float64[np.ndarray, " V"]:
-    """Weights with which the prior gains of photographs hold theirs (`HOLD`).
+def _without_directions(
+    seen: Seen, prior: Float64[np.ndarray, " V"], sequence: Pairs
+) -> tuple[Seen, Float64[np.ndarray, "2 3"]]:
+    """What is seen, without what depends on the direction of view, and how it does."""
+    by_direction, _ = directional_terms(seen, prior, sequence)
+    return replace(seen, value=seen.value - seen.direction @ by_direction), by_direction
+
+
+def directional_terms(
+    seen: Seen,
+    prior: Float64[np.ndarray, " V"],
+    sequence: Pairs,
+    terms: Float64[np.ndarray, "O K"] | None = None,
+) -> tuple[Float64[np.ndarray, "2 3"], Float64[np.ndarray, " K"]]:
+    """Estimate how log colours change with the direction of view, by iteratively reweighted least squares.
+
+    Minimises sum_o w_o |y_o - g - a - b d_o - c t_o|^2 + sum_pairs w |(g_b - g_a) - (prior_b - prior_a)|^2, with
+    Huber's weights over observations and pairs, and a normal distribution of b around 0 (`SUN`). The points' colours a
+    and the gains g are eliminated first (Frisch and Waugh, 1933): residuals of the colours are regressed on those of
+    directions and terms.
 
     Args:
-        away: log gains less the prior ones; beyond HELD_TO they are held less (Huber's loss).
+        prior: log gains that are expected.
+        sequence: consecutive photographs, most of whose gains change as is expected.
+        terms: further ones, whose coefficients are the same in all channels.
+
+    Returns:
+        Changes of log colours with the two components of `Seen.direction`, and the coefficients of the terms.
     """
-    weight = LOOSE + HOLD * np.bincount(seen.photograph, minlength=count)
-    if away is None:
-        return weight
-    return weight * np.minimum(1.0, HELD_TO / np.maximum(np.sqrt((away**2).mean(1)), 1e-12))
+    count = len(prior)
+    terms = np.zeros((len(seen.value), 0)) if terms is None else terms
+    values = np.concatenate([seen.value, seen.direction, terms], axis=1)
+    steps, loose, root = _incidence(sequence, count), LOOSE * sparse.eye_array(count), np.sqrt(sequence.distance)
+    least = min(1.0, INDEPENDENT * len(np.unique(seen.photograph)) / max(1, len(seen.value)))
+    weight, noise, spread = np.full(len(seen.value), least), LEAST_NOISE, FIRST_STEP
+    coefficients, fitted = np.zeros((values.shape[1] - 3, 3)), np.zeros((count, values.shape[1]))
+    away = np.zeros((count, 3))
+    for _ in range(ITERATIONS):
+        step = np.sqrt(((steps @ away) ** 2).mean(1)) / root
+        if step.any():
+            spread = max(float(1.4826 * np.median(step)), LEAST_STEP)
+        of_steps = (noise / (spread * root)) ** 2 * np.minimum(1.0, HUBER * spread / np.maximum(step, 1e-12))
+        held = loose + steps.T @ sparse.diags_array(of_steps) @ steps
+        pull = np.zeros_like(fitted)
+        pull[:, :3] = (held @ prior)[:, None]
+        fitted = weighted_gains(seen, values, weight, held, pull, fitted)
+        rest = seen.centred(values - fitted[seen.photograph], weight)
+        x, own = rest[:, 3:], fitted[:, 3:]
+        normal = (weight[:, None] * x).T @ x + own.T @ (held @ own)
+        normal += np.diag([*[(noise / SUN) ** 2] * 2, *[RIDGE] * terms.shape[1]])
+        right = (weight[:, None] * x).T @ rest[:, :3] + own.T @ (held @ (fitted[:, :3] - prior[:, None]))
+        coefficients = np.linalg.solve(normal, right)
+        # The same in all channels: the mean of the channels' own, around which the directions' are found again.
+        coefficients[2:] = coefficients[2:].mean(1, keepdims=True)
+        coefficients[:2] = np.linalg.solve(normal[:2, :2], right[:2] - normal[:2, 2:] @ coefficients[2:])
+        away = fitted[:, :3] - own @ coefficients - prior[:, None]
+        weight, noise = huber_weights(rest[:, :3] - x @ coefficients)
+        weight *= least
+    return coefficients[:2], coefficients[2:, 0]
+
+
+def _incidence(pairs: Pairs, count: int) -> sparse.csr_array:
+    """The matrix that takes values of photographs to the pairs' differences."""
+    rows = np.arange(len(pairs.a))
+    minus_plus = np.concatenate([-np.ones(len(rows)), np.ones(len(rows))])
+    where = (np.concatenate([rows, rows]), np.concatenate([pairs.a, pairs.b]))
+    return sparse.csr_array((minus_plus, where), shape=(len(rows), count))
 
 
 def robust_gains(
@@ -226,34 +315,26 @@ def robust_gains(
     prior: Float64[np.ndarray, " V"],
     pairs: Pairs = _NO_PAIRS,
     pair_weight: Float64[np.ndarray, " N"] | None = None,
-    hold: bool = False,
 ) -> tuple[Float64[np.ndarray, "V 3"], float]:
     """Estimate log gains by iteratively reweighted least squares, and the residuals' standard deviation.
 
     Minimises sum_o w_o |y_o - g - a|^2 + sum_pairs w |(g_b - g_a) - (prior_b - prior_a)|^2
-    + sum_photographs w |g - prior|^2, with Huber's weights w_o over observations. The points' colours a are eliminated
-    in closed form.
+    + sum_photographs LOOSE |g - prior|^2, with Huber's weights w_o over observations. The points' colours a are
+    eliminated in closed form.
 
     Args:
         prior: log gains that are expected.
         pairs: of photographs with similar gains.
         pair_weight: of the pairs.
-        hold: weight the expected gains by `held` instead of by LOOSE.
     """
-    count, rows = len(prior), np.arange(len(pairs.a))
-    pair_weight = np.zeros(0) if pair_weight is None else pair_weight
-    minus_plus = np.concatenate([-np.ones(len(rows)), np.ones(len(rows))])
-    where = (np.concatenate([rows, rows]), np.concatenate([pairs.a, pairs.b]))
-    incidence = sparse.csr_array((minus_plus, where), shape=(len(rows), count))
-    between = incidence.T @ sparse.diags_array(pair_weight) @ incidence
-    weight, own = np.ones(len(seen.value)), held(seen, count) if hold else np.full(count, LOOSE)
-    gains, noise = np.zeros((count, 3)), 0.0
+    count, between = len(prior), _incidence(pairs, len(prior))
+    fixed = between.T @ sparse.diags_array(np.zeros(0) if pair_weight is None else pair_weight) @ between
+    fixed = fixed + LOOSE * sparse.eye_array(count)
+    pull = np.repeat((fixed @ prior)[:, None], 3, 1)
+    weight, gains, noise = np.ones(len(seen.value)), np.zeros((count, 3)), 0.0
     for _ in range(ITERATIONS):
-        fixed = between + sparse.diags_array(own)
-        gains = weighted_gains(seen, seen.value, weight, fixed, fixed @ prior, gains)
+        gains = weighted_gains(seen, seen.value, weight, fixed, pull, gains)
         weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
-        if hold:
-            own = held(seen, count, gains - prior[:, None])
     return gains, noise
 
 
@@ -262,7 +343,7 @@ def weighted_gains(
     value: Float64[np.ndarray, "O C"],
     weight: Float64[np.ndarray, " O"],
     fixed: sparse.sparray,
-    pull: Float64[np.ndarray, " V"],
+    pull: Float64[np.ndarray, "V C"],
     start: Float64[np.ndarray, "V C"] | None = None,
 ) -> Float64[np.ndarray, "V C"]:
     """Solve for the least-squares gains of values, with the quadratic form `fixed` and its right side `pull` added.
@@ -276,7 +357,7 @@ def weighted_gains(
     to_mean = sparse.diags_array(1 / np.maximum(of_point, 1e-12))
     right = weight[:, None] * seen.centred(value, weight)
     right = np.stack([np.bincount(seen.photograph, c, count) for c in right.T], 1)
-    right += pull[:, None]
+    right += pull
     own = sparse.diags_array(of_photograph) + fixed
     if np.bincount(seen.point)[seen.point].sum() > MOST_SHARED * len(seen.point):
         # Conjugate gradients: the more photographs share points, the fewer steps they take.

@@ -27,7 +27,7 @@ from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
-from tidefield.data.shading import estimate_shading
+from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
@@ -210,12 +210,16 @@ def _estimate(
     )
     if calibrate and sparse is not None:
         cameras, sparse = calibrate_lenses(cameras, sparse, posed.lenses, train)
-    seen = None if sparse is None else observe(photographs, sparse, train)
+    seen = None if sparse is None else observe(photographs, cameras, sparse, train)
     exposures = read_exposures(posed.paths)
-    cameras = replace(cameras, gain=estimate_gains(seen, cameras, train, exposures, posed.divided_by))
+    gain, by_direction = estimate_gains(seen, cameras, train, exposures, posed.divided_by)
+    cameras = replace(cameras, gain=gain)
+    if by_direction.any():
+        cameras = replace(cameras, shading=directional_shading(cameras, train, by_direction))
     if calibrate and seen is not None and sparse is not None:
-        shading = estimate_shading(seen, cameras, sparse, posed.lenses, train, exposures)
-        cameras = replace(cameras, shading=shading)
+        own = estimate_shading(seen, cameras, sparse, posed.lenses, train, exposures)
+        if own is not None:
+            cameras = replace(cameras, shading=own if cameras.shading is None else cameras.shading + own)
     return cameras, sparse
 
 

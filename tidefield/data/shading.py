@@ -29,7 +29,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from tidefield.data.exif import Exposures
-from tidefield.data.exposure import HUBER, Pairs, Seen, exposure_and_clock, huber_weights, in_sequence
+from tidefield.data.exposure import HUBER, Pairs, Seen, across_views, exposure_and_clock, huber_weights, in_sequence
 from tidefield.data.scene import SparsePoints
 from tidefield.geometry.cameras import SHADING_DEGREE, Cameras, monomials
 
@@ -52,6 +52,8 @@ FOLDS = 4
 LEAST_GAIN = 0.01
 """By which the cost of left-out photographs has to fall in every fold."""
 MOST_OBSERVATIONS = 40_000
+FRAME_SIDE = 15
+"""Places along each side of a frame to which the polynomial of what the direction brings is fitted."""
 ROUNDS = 3
 """Of robust weights."""
 MOST_DENSE = 500
@@ -75,7 +77,7 @@ def estimate_shading(
 
     Args:
         seen: observations of the points in the training photographs (`exposure.observe`).
-        cameras: with the photographs' gains.
+        cameras: with the photographs' gains, and the shading that is known already, to which this comes.
         points: that are observed.
         lenses: of each photograph; equal ones are one physical camera.
         train: the training photographs.
@@ -113,6 +115,32 @@ def estimate_shading(
         weight, noise = huber_weights(seen.centred(model.value - model.design @ found, weight))
         found = model.solve(SPREADS[best], noise, model.equations(weight), found)
     return model.polynomials(found)
+
+
+def directional_shading(
+    cameras: Cameras, train: Sequence[int], by_direction: Float64[np.ndarray, "2 3"]
+) -> Float[Tensor, "V K 3"]:
+    """The shading (`Cameras.shading`) of what depends on the direction of view alone: a polynomial over each frame.
+
+    Args:
+        cameras: of the photographs.
+        train: the training photographs.
+        by_direction: of `exposure.estimate_gains`.
+    """
+    to_world = cameras.T_world_camera[:, :, :3].double().numpy()
+    across = to_world.transpose(0, 2, 1) @ across_views(cameras, train)  # in the cameras' axes
+    side = torch.linspace(0, 1, FRAME_SIDE, dtype=torch.float64)
+    share = torch.cartesian_prod(side, side)
+    found = np.zeros((len(cameras), len(monomials(share[:1], SHADING_DEGREE)[0]), 3))
+    frames = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], 1).double()
+    for frame in frames.unique(dim=0):
+        size, focal, principal = frame.split(2)
+        xy = (share * size - principal) / focal
+        ray = torch.nn.functional.normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], 1), dim=1).numpy()
+        to_polynomial = np.linalg.pinv(monomials(xy, SHADING_DEGREE).numpy()) @ ray
+        same = (frames == frame).all(1).numpy()
+        found[same] = to_polynomial @ across[same] @ by_direction
+    return torch.from_numpy(found).float()
 
 
 @dataclass(frozen=True)
@@ -153,10 +181,12 @@ class _Model:
         chain = _chain(cameras, in_sequence(exposure_and_clock(metadata, count)[1], np.arange(count)))
         degree = np.repeat(np.arange(OWN_DEGREE + 1), np.arange(OWN_DEGREE + 1) + 1)
         precision = np.maximum(degree, 1.0) ** 2
-        gain = cameras.gain.double().numpy()
+        known = cameras.gain.double().log()[which]
+        if cameras.shading is not None:
+            known += (monomials(xy, SHADING_DEGREE)[:, None] @ cameras.shading[which])[:, 0]
         return _Model(
             seen=seen,
-            value=seen.value - np.log(gain)[photograph],
+            value=seen.value - known.numpy(),
             design=sparse.csr_array(design),
             prior=sparse.csr_array(sparse.kron(chain, sparse.diags_array(precision))),
             to_monomials=to_monomials,

@@ -1,9 +1,9 @@
 """Estimate and remove exposure differences and lens falloff (docs/method.md, section 12).
 
 In display values, photograph i shows the sparse point p with the point's own colour times the photograph's gain times
-the lens falloff towards the corners: log I_ip = g_i + f(r_ip) + a_p, with r the tangent of the angle to the optical
-axis and f(r) = k1 r^2 + k2 r^4 + k3 r^6. Whether gains and falloff help is decided on points that took no part in
-their estimate.
+the lens falloff towards the corners: log I_ip = g_i + f(r_ip) + a_p + b d_ip, with r the tangent of the angle to the
+optical axis and f(r) = k1 r^2 + k2 r^4 + k3 r^6; for b d_ip see `data.exposure`. Whether gains and falloff help is
+decided on points that took no part in their estimate. What the direction brings stays as it is: it belongs to the view.
 """
 
 from __future__ import annotations
@@ -14,15 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64, UInt8
-from scipy import sparse
 
-from tidefield.data.exposure import ITERATIONS, Seen, held, huber_weights, observe, robust_gains, weighted_gains
+from tidefield.data.exposure import Seen, directional_terms, in_sequence, observe, robust_gains
 from tidefield.data.scene import Scene
 
 HELPS = 0.97
 """Gains are applied if they reduce the photographs' disagreement to this share, ..."""
 FALLOFF_HELPS = 0.99
 """... and the falloff if it reduces the rest to this share."""
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Log gains of the photographs, k1, k2, k3 of the lenses, and `exposure.directional_terms`."""
+
+    gains: Float64[np.ndarray, "V 3"]
+    falloff: Float64[np.ndarray, "L 3"]
+    by_direction: Float64[np.ndarray, "2 3"]
 
 
 @dataclass(frozen=True)
@@ -59,9 +67,9 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
         lenses: a number for each photograph's lens.
         always: apply gains even if they do not help.
     """
-    count, nothing = len(scene.cameras), np.zeros((len(scene.cameras), 3))
+    nothing = np.zeros((len(scene.cameras), 3))
     points = scene.points
-    seen = None if points is None else observe(scene.photographs, points, scene.train)
+    seen = None if points is None else observe(scene.photographs, scene.cameras, points, scene.train)
     if points is None or seen is None or not len(seen.value):
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
@@ -74,21 +82,21 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
     scores = np.zeros((2, 3))
     for k, (own, other) in enumerate((halves, halves[::-1])):
-        gains = robust_gains(own[0], np.zeros(count), hold=True)[0]
-        both = _gains_and_falloff(*own, lens, count)
-        scores[k] = [_spread(*other, g, f, lens) for g, f in ((nothing, nothing), (gains, nothing), both)]
+        gains, both = _fitted(own[0], None, lens), _fitted(*own, lens)
+        none = replace(gains, gains=nothing)
+        scores[k] = [_spread(*other, fit, lens) for fit in (none, gains, both)]
     before, alone, after = scores.mean(0)
     helps = always or bool(min(alone, after) < HELPS * before)
-    gains, falloff = _gains_and_falloff(seen, power, lens, count)
+    fit = _fitted(seen, power, lens)
     # With real lenses, the corners are darker than the centre.
     corner = tangent >= np.quantile(tangent, 0.95)
-    darkens = (falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
+    darkens = (fit.falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
     sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
     if not sees:
-        gains, falloff = robust_gains(seen, np.zeros(count), hold=True)[0], np.zeros_like(falloff)
-    gain = np.exp(gains - gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
+        fit = _fitted(seen, None, lens)
+    gain = np.exp(fit.gains - fit.gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
     gain[list(scene.test)] = 1.0
-    return ExposureCorrection(gain, falloff[lens], float(before), float(alone), float(after), helps, sees)
+    return ExposureCorrection(gain, fit.falloff[lens], float(before), float(alone), float(after), helps, sees)
 
 
 def to_common_exposure(
@@ -115,46 +123,33 @@ def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
 
 def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
     """Select some of the observations."""
-    return replace(seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row")})
+    return replace(
+        seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row", "direction")}
+    )
 
 
-def _gains_and_falloff(
-    seen: Seen, power: Float64[np.ndarray, "O 3"], lens: Int64[np.ndarray, " V"], count: int
-) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "L 3"]]:
-    """Estimate log gains, and the falloff common to all channels, by iteratively reweighted least squares.
-
-    Gains and points are eliminated first (Frisch and Waugh, 1933): the residuals of the colours after fitting gains are
-    regressed on the residuals of the falloff's terms.
-    """
+def _fitted(seen: Seen, power: Float64[np.ndarray, "O 3"] | None, lens: Int64[np.ndarray, " V"]) -> _Fit:
+    """Gains of the photographs, and the falloff of each lens if the powers of `_polynomial` are given."""
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
-    terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)
-    nothing = np.zeros(count)
-    weight = np.ones(len(seen.value))
-    gains, falloff = np.zeros((count, 3)), np.zeros(3 * lenses)
-    for _ in range(ITERATIONS):
-        values = np.concatenate([seen.value, terms], axis=1)
-        as_taken = sparse.diags_array(held(seen, count, gains))
-        fitted = weighted_gains(seen, values, weight, as_taken, nothing)
-        rest = seen.centred(values - fitted[seen.photograph], weight)
-        root = np.sqrt(weight)[:, None]
-        x, y = root * rest[:, 3:], root[:, 0] * rest[:, :3].mean(1)
-        # The small ridge keeps an unobserved falloff at zero.
-        falloff = np.linalg.solve(x.T @ x + 1e-6 * np.eye(3 * lenses), x.T @ y)
-        gains = fitted[:, :3] - (fitted[:, 3:] @ falloff)[:, None]
-        weight, _ = huber_weights(rest[:, :3] - (rest[:, 3:] @ falloff)[:, None])
-    return gains, falloff.reshape(lenses, 3)
+    terms = None
+    if power is not None:
+        terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)
+    prior = np.zeros(len(lens))
+    order = in_sequence(np.arange(len(lens), dtype=np.float64), np.unique(seen.photograph))
+    by_direction, found = directional_terms(seen, prior, order, terms)
+    known = seen.direction @ by_direction + (0.0 if terms is None else (terms @ found)[:, None])
+    gains, _ = robust_gains(replace(seen, value=seen.value - known), prior)
+    return _Fit(gains, np.zeros((lenses, 3)) if terms is None else found.reshape(lenses, 3), by_direction)
 
 
 def _spread(
     seen: Seen,
     power: Float64[np.ndarray, "O 3"],
-    gains: Float64[np.ndarray, "V 3"],
-    falloff: Float64[np.ndarray, "L 3"],
+    fit: _Fit,
     lens: Int64[np.ndarray, " V"],
 ) -> float:
-    """Estimate the standard deviation of the log colours of each point, after gains and falloff (robust: MAD)."""
-    own = lens[seen.photograph]
-    shade = (power * falloff[own]).sum(1)[:, None] if falloff.any() else 0.0
-    residual = seen.centred(seen.value - gains[seen.photograph] - shade)
+    """Estimate the standard deviation of the log colours of each point, after a fit (robust: MAD)."""
+    known = (power * fit.falloff[lens[seen.photograph]]).sum(1)[:, None] + seen.direction @ fit.by_direction
+    residual = seen.centred(seen.value - fit.gains[seen.photograph] - known)
     sharing = np.bincount(seen.point)[seen.point]
     return float(1.4826 * np.median(np.abs(residual * np.sqrt(sharing / (sharing - 1))[:, None])))
