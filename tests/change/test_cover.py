@@ -64,6 +64,20 @@ def test_the_same_ground_in_another_light_gains_nothing():
     assert found["gained"].value_m2 + found["lost"].value_m2 < 0.02 * found["earlier"].value_m2
 
 
+def test_a_meadow_without_bare_ground_is_covered_at_both_dates():
+    rng = np.random.default_rng(4)
+    every = np.ones((300, 400), bool)
+    lush = np.array([0.9, 1.1, 0.8])[None, None] ** disc(20, 15, 8)[..., None]
+    one, two = (
+        (picture(rng, every, light) * lush).clip(0, 255).astype(np.uint8) for light in ((1, 1, 1), (0.8, 0.75, 0.9))
+    )
+    found = compare_cover(one, two, every, GRID)
+    areas = found.areas["all"]
+    assert areas["earlier"].value_m2 == areas["later"].value_m2 == pytest.approx(1200)
+    assert areas["gained"].high_m2 == areas["lost"].high_m2 == 0
+    assert found.gains == pytest.approx((1 / 0.8, 1 / 0.75, 1 / 0.9), rel=0.02)
+
+
 def test_ground_that_only_one_picture_shows_is_unknown():
     rng = np.random.default_rng(3)
     known = np.ones((300, 400), bool)

@@ -1,9 +1,9 @@
 """Plants gained and lost, from the orthophotos of both surveys after evening their light.
 
 A place is covered where its mean colour over half a metre is greener than bare ground's by a margin. Bare ground is
-the lowest of the common values of greenness. Areas come with the range that they have when the margin is moved by what
-greenness scatters from date to date over ground that is bare at both; what changed by less than that did
-not change.
+the lowest of the common values of greenness, unless that is a plant's, as in a meadow. Areas come with the range that
+they have when the margin is moved by what greenness scatters from date to date over ground that is bare at both; what
+changed by less than that did not change.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ _BIN = 0.004
 """Of the histogram of greenness."""
 _COMMON = 0.4
 """A peak of the histogram as high as this share of the highest is common."""
+_GREENEST = 0.05
+"""Greenness that bare ground has at most: grey has -0.13, and 0.06 in a picture with 20% more green."""
+_LEAST_BARE = 0.01
+"""With a smaller share of the ground bare at both dates, light and scatter are those of all ground."""
 _UNKNOWN = np.int8(-128)
 
 
@@ -122,11 +126,11 @@ def compare_cover(
     second = greenness(smoothed(later, known, sigma))
     # Each date has its own white balance at first, so its own bare ground.
     bare_ground = known & (first < _bare(first[known]) + MARGIN) & (second < _bare(second[known]) + MARGIN)
-    gains = light_gains(earlier, later, bare_ground if bare_ground.any() else known)
+    gains = light_gains(earlier, later, _enough(bare_ground, known))
     second = greenness(smoothed(with_light(later, gains), known, sigma))
     bare = _bare(np.concatenate([first[known], second[known]]))
     bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
-    difference = (second - first)[bare_ground]
+    difference = (second - first)[_enough(bare_ground, known)]
     scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
@@ -178,7 +182,12 @@ def _bare(values: Float32[np.ndarray, " N"]) -> float:
     counts = np.convolve(np.histogram(values, edges)[0], np.ones(5), "same")
     peak = (counts[1:-1] >= counts[:-2]) & (counts[1:-1] >= counts[2:]) & (counts[1:-1] >= _COMMON * counts.max())
     at = int(np.argmax(peak)) + 1
-    return float(edges[at] + edges[at + 1]) / 2
+    return min(_GREENEST, float(edges[at] + edges[at + 1]) / 2)
+
+
+def _enough(bare: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"]) -> np.ndarray:
+    """Ground that is bare at both dates, or all ground if there is hardly any."""
+    return bare if bare.sum() > _LEAST_BARE * known.sum() else known
 
 
 def _resampled(cells: Bool[np.ndarray, "rows columns"], grid: Grid, to: Grid) -> Bool[np.ndarray, "rows columns"]:
