@@ -61,6 +61,10 @@ FIRST_STEP, LEAST_STEP = 0.05, 0.005
 """Standard deviation of most differences of consecutive photographs' log gains: at first, and at least."""
 SUN = 0.1
 """Standard deviation, among surveys, of how log colours change with a component of the direction."""
+ENOUGH, ENOUGH_OF_EACH = 40_000, 200
+"""Observations from which directions are estimated, and for each photograph of large surveys: more change nothing."""
+SETTLED = 1e-4
+"""Change of all log gains, and of all coefficients, from which reweighting ends."""
 RIDGE = 1e-6
 """On coefficients of further terms: what no observation tells apart stays at zero."""
 MOST_SHARED = 64
@@ -272,6 +276,8 @@ def directional_terms(
     """
     count = len(prior)
     terms = np.zeros((len(seen.value), 0)) if terms is None else terms
+    chosen = seen.point % -(-len(seen.value) // max(ENOUGH, ENOUGH_OF_EACH * count)) == 0
+    seen, terms = seen.part(chosen), terms[chosen]
     values = np.concatenate([seen.value, seen.direction, terms], axis=1)
     steps, loose, root = _incidence(sequence, count), LOOSE * sparse.eye_array(count), np.sqrt(sequence.distance)
     least = min(1.0, INDEPENDENT * len(np.unique(seen.photograph)) / max(1, len(seen.value)))
@@ -292,13 +298,15 @@ def directional_terms(
         normal = (weight[:, None] * x).T @ x + own.T @ (held @ own)
         normal += np.diag([*[(noise / SUN) ** 2] * 2, *[RIDGE] * terms.shape[1]])
         right = (weight[:, None] * x).T @ rest[:, :3] + own.T @ (held @ (fitted[:, :3] - prior[:, None]))
-        coefficients = np.linalg.solve(normal, right)
+        before, coefficients = coefficients, np.linalg.solve(normal, right)
         # The same in all channels: the mean of the channels' own, around which the directions' are found again.
         coefficients[2:] = coefficients[2:].mean(1, keepdims=True)
         coefficients[:2] = np.linalg.solve(normal[:2, :2], right[:2] - normal[:2, 2:] @ coefficients[2:])
         away = fitted[:, :3] - own @ coefficients - prior[:, None]
         weight, noise = huber_weights(rest[:, :3] - x @ coefficients)
         weight *= least
+        if np.abs(coefficients - before).max() < SETTLED:
+            break
     return coefficients[:2], coefficients[2:, 0]
 
 
@@ -333,8 +341,10 @@ def robust_gains(
     pull = np.repeat((fixed @ prior)[:, None], 3, 1)
     weight, gains, noise = np.ones(len(seen.value)), np.zeros((count, 3)), 0.0
     for _ in range(ITERATIONS):
-        gains = weighted_gains(seen, seen.value, weight, fixed, pull, gains)
+        before, gains = gains, weighted_gains(seen, seen.value, weight, fixed, pull, gains)
         weight, noise = huber_weights(seen.centred(seen.value - gains[seen.photograph], weight))
+        if np.abs(gains - before).max() < SETTLED:
+            break
     return gains, noise
 
 
