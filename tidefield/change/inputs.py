@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -97,7 +96,7 @@ def open_pair(
             if paths[0] is None or paths[1] is None:
                 raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
             clouds = _both(paths[0], paths[1])
-        return Pair(*_told_apart(surveys, (earlier, later)), clouds)
+        return Pair(*_told_apart(surveys[0], surveys[1], earlier, later), clouds)
     clouds = _both(earlier, later)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
     surfaces = []
@@ -106,19 +105,19 @@ def open_pair(
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
         surfaces.append(replace(opened, source=cloud.path.name, remarks=[]))
-    return Pair(*_told_apart(surfaces, (earlier, later)), clouds)
+    return Pair(*_told_apart(surfaces[0], surfaces[1], earlier, later), clouds)
 
 
-def _told_apart(surveys: Sequence[Surface], paths: Sequence[Path]) -> Sequence[Surface]:
-    """Two surveys; if files are called the same, with as many of the folders above in their names as differ."""
-    if surveys[0].name != surveys[1].name or surveys[0].date:
-        return surveys
-    parts = [path.resolve().parts for path in paths]
-    depth = next((k for k in range(1, 1 + min(map(len, parts))) if parts[0][-k] != parts[1][-k]), 1)
-    return [
-        replace(survey, source="/".join((*own[-depth:-1], survey.name)))
-        for survey, own in zip(surveys, parts, strict=True)
-    ]
+def _told_apart(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tuple[Surface, Surface]:
+    """Two surveys; if their files are called the same, with as many of the folders above in their names as differ."""
+    if one.name != two.name or one.date:
+        return one, two
+    first, second = of_one.resolve().parts, of_two.resolve().parts
+    depth = next((k for k in range(1, 1 + min(len(first), len(second))) if first[-k] != second[-k]), 1)
+    return (
+        replace(one, source="/".join((*first[-depth:-1], one.name))),
+        replace(two, source="/".join((*second[-depth:-1], two.name))),
+    )
 
 
 def _both(earlier: Path, later: Path) -> tuple[Cloud, Cloud]:
