@@ -25,6 +25,14 @@ def workers(parent: int) -> list[int]:
     return found
 
 
+def started(worker: int) -> bool:
+    """Whether a process has loaded numpy: before, Python itself reads what to do, and complains if nobody tells it."""
+    try:
+        return "numpy" in Path(f"/proc/{worker}/maps").read_text()
+    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        return True
+
+
 def wait_for(condition, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
@@ -38,6 +46,7 @@ def test_workers_end_with_prepare(number: signal.Signals, tmp_path: Path):
     command = [sys.executable, "-m", "tidefield.cli", "prepare", str(tmp_path / "card"), str(tmp_path / "scene")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         wait_for(lambda: workers(process.pid) or process.poll() is not None)
+        wait_for(lambda: all(map(started, workers(process.pid))))
         spawned = workers(process.pid)
         assert spawned
         process.send_signal(number)

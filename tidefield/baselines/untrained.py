@@ -109,12 +109,18 @@ def sparse_depth(scene: Scene, doubled: Scene | None = None) -> Render:
 def sparse_depth_as_given(scene: Scene, doubled: Scene | None = None) -> Render:
     """Blend like `sparse_depth`, without the lens residual and the shading that are estimated when a scene is opened.
 
-    It tells what these two bring, which every other method shares (docs/method.md, sections 12 and 14).
+    It tells what these two bring, which every other method shares (docs/method.md, sections 12 and 14). What depends on
+    the direction of view alone stays: gains are estimated with it.
     """
     width = int(scene.cameras.size_px[:, 0].max())
     given = load_scene(scene.root, width=width, allow_missing=True, hold_out=bool(scene.test), calibrate=False)
-    render = sparse_depth(given, doubled)
-    return lambda camera: render(replace(camera, residual=None, shading=None))
+    blend = sparse_depth(given, doubled)
+
+    def render(camera: Cameras) -> Rendering:
+        shading = given.cameras[given.index(camera.names[0])].shading if camera.names else None
+        return blend(replace(camera, residual=None, shading=shading))
+
+    return render
 
 
 def plane_sweep(
