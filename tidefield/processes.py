@@ -122,7 +122,7 @@ def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterato
         yield pool
     except BaseException:
         for process in multiprocessing.active_children():
-            process.terminate()
+            process.kill()  # SIGTERM would print the stack of one that is importing pycolmap
         raise
     finally:
         pool.shutdown(cancel_futures=True)
