@@ -132,7 +132,28 @@ def flight(strips: int, each: int, seed: int) -> tuple[exposure.Seen, np.ndarray
 SUN = np.array([0.3, -0.1])
 
 
-def test_ways_of_looking_do_not_add_up_from_photograph_to_photograph():
+def test_ways_of_looking_do_not_add_up_along_a_strip():
+    """The side towards the sun is brighter in every photograph of a long strip, and light changes now and then."""
+    count, each, random = 400, 60, np.random.default_rng(7)
+    photograph = np.repeat(np.arange(count), each)
+    point = (photograph * 20 + random.integers(0, 100, count * each)).astype(np.int64)
+    ahead = point / 20 - photograph - 2.5  # of -2.5 to 2.5 photographs
+    truth = 0.2 * np.sin(np.arange(count))
+    albedo = random.normal(0, 0.3, point.max() + 1)
+    value = (albedo[point] + truth[photograph] + 0.01 * ahead + random.normal(0, 0.01, len(point)))[:, None]
+    direction = np.stack([0.25 * ahead, np.zeros(len(ahead))], 1)
+    seen = exposure.Seen(np.repeat(value, 3, 1), point, photograph, np.arange(len(point)), direction)
+    position = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float64)
+    order = np.arange(count)
+    error = exposure._solve(seen, np.zeros(count), order.astype(np.float64), position, order)[0][:, 0] - truth
+    slope = np.polyfit(order, error, 1)[0]
+    assert abs(slope) < 0.01 / 20
+    assert np.sqrt((np.diff(error) ** 2).mean()) < 0.01
+    alone = exposure.robust_gains(seen, np.zeros(count))[0][:, 0] - truth
+    assert abs(np.polyfit(order, alone, 1)[0]) > 0.01 / 2  # what the overlaps say
+
+
+def test_ways_of_looking_do_not_add_up_in_flights_to_and_fro():
     seen, position, truth = flight(8, 25, 7)
     order = np.arange(len(truth))
     found, sun = exposure._solve(seen, np.zeros(len(truth)), order.astype(np.float64), position, order)
