@@ -96,7 +96,7 @@ def open_pair(
             if paths[0] is None or paths[1] is None:
                 raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
             clouds = _both(paths[0], paths[1])
-        return Pair(*_told_apart(surveys[0], surveys[1], earlier, later), clouds)
+        return Pair(*_distinguished(surveys[0], surveys[1], earlier, later), clouds)
     clouds = _both(earlier, later)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
     surfaces = []
@@ -105,10 +105,10 @@ def open_pair(
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
         surfaces.append(replace(opened, source=cloud.path.name, remarks=[]))
-    return Pair(*_told_apart(surfaces[0], surfaces[1], earlier, later), clouds)
+    return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
 
 
-def _told_apart(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tuple[Surface, Surface]:
+def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tuple[Surface, Surface]:
     """Two surveys; if their files are called the same, with as many of the folders above in their names as differ."""
     if one.name != two.name or one.date:
         return one, two

@@ -93,9 +93,7 @@ def render(options: Render, console: Console) -> None:
             return
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
-        cameras = trajectory.cameras
-        if Path(options.path).suffix.lower() == ".json":
-            cameras = _resized(cameras, options.width, options.height)
+        cameras = _resized(trajectory.cameras, options.width, options.height)
         from tidefield.model.renderer import in_turn
         from tidefield.render.video import write_video
 
@@ -118,7 +116,7 @@ def render(options: Render, console: Console) -> None:
 
 
 def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras:
-    """Cameras of a file, in a size in their own proportion if one is given."""
+    """Cameras of a path in a size in their own proportion, if one is given: those of a file have their own."""
     own, size = cameras[0], _size(cameras[0], width, height)
     if abs(size[0] * own.height - size[1] * own.width) > max(own.width, own.height):
         raise RunError(

@@ -162,10 +162,10 @@ class _Signs:
         mine = self.known[window] & (np.abs(mean - level) <= tolerance) & (self.agreement[window] < SHORE_AGREEMENT)
         mine &= np.abs(self.height[window] - level) <= OUTLIERS * tolerance
         start = self.seeds[window] == seed
-        parts = _components(mine | start)[1]
+        parts = _components(mine | start)
         body = _opened(_closed(np.isin(parts, np.unique(parts[start]))))
         # Small places that water surrounds are not lower: those are blotches of the matching.
-        _, holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean < level))
+        holes = _components(ndimage.binary_fill_holes(body) & ~body & (mean < level))
         return body | ((holes > 0) & (np.bincount(holes.ravel())[holes] * self.cell**2 < SMALLEST_M2))
 
     def is_water(self, window: Window, body: Bool[np.ndarray, "h w"], level: float) -> bool:
@@ -190,7 +190,7 @@ def _signs(
     south, east = np.gradient(mean, cell)
     agree = _smooth(np.nan_to_num(agreement), known, AGREEMENT_M / cell)
     seed = known & (agree < LEAST_AGREEMENT) & (np.hypot(south, east) < SLOPE) & (rough < ROUGHNESS_M)
-    return _Signs(height, mean, agree, known, _components(_closed(seed))[1], cell)
+    return _Signs(height, mean, agree, known, _components(_closed(seed)), cell)
 
 
 def _grown(
@@ -231,10 +231,9 @@ def _opened(mask: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, cross, iterations=2) > 0
 
 
-def _components(mask: np.ndarray) -> tuple[int, np.ndarray]:
-    """Number of connected parts, the background included, and the part of each cell."""
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    return count, np.asarray(labels)
+def _components(mask: np.ndarray) -> np.ndarray:
+    """The connected part that each cell is of, from 1, 0 for none."""
+    return np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1])
 
 
 def _spread(values: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from jaxtyping import Float, Float64, Int64, UInt8
 
 from tidefield.data.exposure import Seen, directional_terms, in_sequence, observe, robust_gains
 from tidefield.data.scene import Scene
@@ -79,7 +79,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     power = _polynomial(tangent)
     # Points are divided, not observations: a point in both halves would be estimated and tested at once.
     odd = np.random.default_rng(0).permutation(int(seen.point.max()) + 1)[seen.point] % 2 == 1
-    halves = [(_part(seen, odd), power[odd]), (_part(seen, ~odd), power[~odd])]
+    halves = [(seen.part(odd), power[odd]), (seen.part(~odd), power[~odd])]
     scores = np.zeros((2, 3))
     for k, (own, other) in enumerate((halves, halves[::-1])):
         gains, both = _fitted(own[0], None, lens), _fitted(*own, lens)
@@ -119,13 +119,6 @@ def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
     """Compute r^2, r^4, r^6."""
     square = np.square(tangent)
     return np.stack([square, square**2, square**3], axis=-1)
-
-
-def _part(seen: Seen, chosen: Bool[np.ndarray, " O"]) -> Seen:
-    """Select some of the observations."""
-    return replace(
-        seen, **{name: getattr(seen, name)[chosen] for name in ("value", "point", "photograph", "row", "direction")}
-    )
 
 
 def _fitted(seen: Seen, power: Float64[np.ndarray, "O 3"] | None, lens: Int64[np.ndarray, " V"]) -> _Fit:
