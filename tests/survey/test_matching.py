@@ -1,15 +1,24 @@
 """Pairs are chosen by positions, times and their largest features; they are matched and verified once."""
 
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
+import pytest
 import torch
 from located_surveys import unlocated_photograph
 from torch import Tensor
 
+from tidefield.errors import RunError
+from tidefield.survey.sfm import matching
 from tidefield.survey.sfm.matching import match
 from tidefield.survey.sfm.pairs import (
     EXHAUSTIVE,
@@ -154,9 +163,9 @@ def test_zeros_match_nothing():
     assert (match_descriptors(torch.zeros(4, 128), unit(6, 0)) == -1).all()
 
 
-def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
-    """Features whose descriptors are their points' own: all matches are right, so the geometry must agree."""
-    path, rng = tmp_path / "database.db", np.random.default_rng(0)
+def write_database(path: Path) -> list[str]:
+    """A database of photographs whose features have their points' own descriptors: all matches are right."""
+    rng = np.random.default_rng(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4, num_points3D=200
     )
@@ -173,7 +182,12 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
             )
             described = pycolmap.FeatureDescriptors(data=table, type=pycolmap.FeatureExtractorType.SIFT)
             db.write_descriptors(image.image_id, described)
-        names = sorted(image.name for image in db.read_all_images())
+        return sorted(image.name for image in db.read_all_images())
+
+
+def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
+    path = tmp_path / "database.db"
+    names = write_database(path)
     pairs, calls = [(names[0], names[1]), (names[1], names[2])], []
     agree, inliers = match(path, pairs, pycolmap.Device.cpu, lambda done, whole: calls.append((done, whole)))
     assert agree == 2
@@ -186,3 +200,43 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
     assert calls[-1] == (3, 3)
     with pycolmap.Database.open(path) as db:
         assert len(db.read_all_matches()[0]) == 3
+
+
+def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    names = write_database(tmp_path / "one.db")
+    shutil.copy(tmp_path / "one.db", tmp_path / "many.db")
+    found, calls = [], []
+    for name, workers, batch in (("one.db", 1, 256), ("many.db", 2, 2)):
+        monkeypatch.setattr(matching, "cores", lambda workers=workers: workers)
+        monkeypatch.setattr(matching, "BATCH", batch)
+        match(tmp_path / name, list(combinations(names, 2)), pycolmap.Device.cpu, lambda *done: calls.append(done))
+        with pycolmap.Database.open(tmp_path / name) as db:
+            numbers, matches = db.read_all_matches()
+            geometries = [geometry.inlier_matches.tolist() for geometry in db.read_two_view_geometries()[1]]
+            found.append((numbers, [np.asarray(own).tolist() for own in matches], geometries))
+    assert found[0] == found[1]
+    assert len(found[0][0]) == 6
+    assert calls == [(6, 6), (2, 6), (4, 6), (6, 6)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["many.db", "one.db"]
+
+
+def test_processes_match_on_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Clusters of descriptors differ between runs on several threads, rarely: pycolmap's results cannot show it."""
+    names, used = write_database(tmp_path / "database.db"), []
+    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, options, *__: used.append(options.num_threads))
+    match(tmp_path / "database.db", [(names[0], names[1])], pycolmap.Device.cpu, lambda done, whole: None)
+    assert used == [1]
+
+
+def test_a_killed_process_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    names = write_database(tmp_path / "database.db")
+
+    @contextmanager
+    def killed(*_: object) -> Iterator[Mock]:
+        yield Mock(submit=Mock(side_effect=BrokenProcessPool("terminated")))
+
+    monkeypatch.setattr(matching, "worker_processes", killed)
+    with pytest.raises(RunError, match=r"that matches photographs was killed, .*: expected memory for .*; give fewer"):
+        match(tmp_path / "database.db", [(names[0], names[1])], pycolmap.Device.cpu, lambda done, whole: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["database.db"]

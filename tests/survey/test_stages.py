@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tidefield.errors import RunError
-from tidefield.survey.sfm.matching import interruptible
+from tidefield.survey.sfm.mapping import interruptible
 from tidefield.survey.stages import Facts, Stages
 
 

@@ -26,7 +26,7 @@ from tidefield.geometry.halves import halves
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, carry_over, thinned
-from tidefield.survey.sfm.features import decode_name, set_up_pycolmap
+from tidefield.survey.sfm.features import copy_photographs, decode_name, set_up_pycolmap
 from tidefield.survey.sfm.mapping import Mapper, find_models
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
 from tidefield.survey.survey import Photograph, Progress
@@ -143,7 +143,6 @@ def reconstruct_blocks(
     for k in missing:
         shutil.rmtree(places[k], ignore_errors=True)
         (places[k] / "work").mkdir(parents=True)
-    # COLMAP locks a database while it opens it, and a second process that opens it then fails.
     _split(database, {places[k] / "work" / "database.db": blocks[k].names for k in missing})
     try:
         with worker_processes(workers, set_up_pycolmap) as pool:
@@ -166,22 +165,12 @@ def reconstruct_blocks(
 def _split(database: Path, parts: Mapping[Path, Collection[str]]) -> None:
     """Write what mapping reads of some photographs to databases of their own, with the numbers of the common one."""
     with pycolmap.Database.open(database) as db:
-        cameras, rigs = db.read_all_cameras(), db.read_all_rigs()
-        frames = {frame.frame_id: frame for frame in db.read_all_frames()}
-        images = {decode_name(image.name): image for image in db.read_all_images()}
+        number_of = {decode_name(image.name): image.image_id for image in db.read_all_images()}
         pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in db.read_two_view_geometry_num_inliers()[0]]
         for path, names in parts.items():
-            members = [images[name] for name in names]
-            numbers = {image.image_id for image in members}
+            numbers = {number_of[name] for name in names}
             with pycolmap.Database.open(path) as part, pycolmap.DatabaseTransaction(part):
-                for camera in cameras:
-                    part.write_camera(camera, use_camera_id=True)
-                for rig in rigs:
-                    part.write_rig(rig, use_rig_id=True)
-                for image in members:
-                    part.write_frame(frames[image.frame_id], use_frame_id=True)
-                    part.write_image(image, use_image_id=True)
-                    part.write_keypoints(image.image_id, db.read_keypoints(image.image_id))
+                copy_photographs(db, part, sorted(numbers))
                 for first, second in pairs:
                     if first in numbers and second in numbers:
                         part.write_two_view_geometry(first, second, db.read_two_view_geometry(first, second))

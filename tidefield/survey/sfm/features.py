@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
@@ -180,6 +180,22 @@ def extract(
                 "--feature-width, and continue with the same command"
             ) from error
         return db.num_keypoints()
+
+
+def copy_photographs(db: pycolmap.Database, part: pycolmap.Database, numbers: Iterable[int]) -> None:
+    """Write cameras, and some photographs with their keypoints, to a database of their own, under the same numbers.
+
+    For processes: COLMAP locks a database while it opens it, and a second process that opens it then fails.
+    """
+    for camera in db.read_all_cameras():
+        part.write_camera(camera, use_camera_id=True)
+    for rig in db.read_all_rigs():
+        part.write_rig(rig, use_rig_id=True)
+    for number in numbers:
+        image = db.read_image(number)
+        part.write_frame(db.read_frame(image.frame_id), use_frame_id=True)
+        part.write_image(image, use_image_id=True)
+        part.write_keypoints(number, db.read_keypoints(number))
 
 
 def set_up_pycolmap(verbose: bool = False) -> None:

@@ -15,10 +15,12 @@ proportional to the focal length, so the one is chosen whose flight height agree
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotReady
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import pycolmap
@@ -28,9 +30,9 @@ from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
 from tidefield.survey.sfm.features import decode_name, encode_name
-from tidefield.survey.sfm.matching import interruptible
 from tidefield.survey.survey import Photograph, Progress
 
+Result = TypeVar("Result")
 Mapper = Literal["incremental", "global"]
 """pycolmap's structure from motion: one photograph after the other, or all at once."""
 FEW_FEATURES = 500
@@ -133,6 +135,23 @@ def reconstruct(
         SurveyError: no three photographs fit together.
     """
     return large_enough(find_models(database, folder, names, progress, known, mapper), database, names)
+
+
+def interruptible(job: Callable[[pycolmap.CancellationToken], Result]) -> Result:
+    """Run a long job of pycolmap in a thread and cancel it on Ctrl-C, which it would not notice itself."""
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(job, token)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=0.2)
+                except NotReady:
+                    if future.done():  # the job itself raised it
+                        raise
+        except BaseException:
+            token.cancel()
+            raise
 
 
 def find_models(

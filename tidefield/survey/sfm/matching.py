@@ -1,42 +1,29 @@
-"""Match pairs of photographs by pycolmap.
+"""Match pairs of photographs by pycolmap, in processes.
 
 Its own `match_spatial` needs a position of every photograph, and reports no progress.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NotReady
-from functools import partial
+import shutil
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import TypeVar
 
 import pycolmap
 
-from tidefield.survey.sfm.features import encode_name
+from tidefield.errors import RunError
+from tidefield.machine import cores
+from tidefield.processes import worker_processes
+from tidefield.survey.sfm.features import copy_photographs, encode_name, set_up_pycolmap
 from tidefield.survey.survey import Progress
 
-Result = TypeVar("Result")
-BATCH = 64
-"""Pairs that are matched between two reports of progress: an interruption loses at most these."""
-
-
-def interruptible(job: Callable[[pycolmap.CancellationToken], Result]) -> Result:
-    """Run a long job of pycolmap in a thread and cancel it on Ctrl-C, which it would not notice itself."""
-    token = pycolmap.CancellationToken()
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(job, token)
-        try:
-            while True:
-                try:
-                    return future.result(timeout=0.2)
-                except NotReady:
-                    if future.done():  # the job itself raised it
-                        raise
-        except BaseException:
-            token.cancel()
-            raise
+Pair = tuple[int, int]
+"""The numbers of two photographs in a database."""
+BATCH = 256
+"""Most pairs that a process matches at a time. An interruption loses them; fewer need clusters more often."""
 
 
 def match(
@@ -46,28 +33,94 @@ def match(
 
     Returns:
         The number of pairs with a verified two-view geometry, and the total number of their inlier matches.
+
+    Raises:
+        RunError: a process was killed.
     """
-    encoded = [(encode_name(first), encode_name(second)) for first, second in pairs]
-    with pycolmap.Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        todo = [pair for pair in encoded if not db.exists_two_view_geometry(ids[pair[0]], ids[pair[1]])]
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=database.with_name("pairs.txt"))
+    folder = database.with_name("matching")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        with pycolmap.Database.open(database) as db:
+            ids = {image.name: image.image_id for image in db.read_all_images()}
+            numbers = [(ids[encode_name(first)], ids[encode_name(second)]) for first, second in pairs]
+            todo = [pair for pair in numbers if not db.exists_two_view_geometry(*pair)]
+            done = len(pairs) - len(todo)
+            for count in _match_in_processes(db, todo, folder, device):
+                done += count
+                progress(done, len(pairs))
+            _, inliers = db.read_two_view_geometry_num_inliers()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return sum(n > 0 for n in inliers), sum(inliers)
+
+
+def _match_in_processes(
+    db: pycolmap.Database, pairs: Sequence[Pair], folder: Path, device: pycolmap.Device
+) -> Iterator[int]:
+    """Match and verify pairs of a database; yields how many were written to it."""
+    # Processes, because on several threads pycolmap rarely finds other matches: it searches descriptors in clusters,
+    # and these then differ. A GPU compares all descriptors, of one pair at a time.
+    on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
+    workers = 1 if on_gpu else max(1, min(cores(), len(pairs)))
+    size = max(1, min(BATCH, -(-len(pairs) // workers)))
+    batches = [pairs[start : start + size] for start in range(0, len(pairs), size)]
+    try:
+        with worker_processes(workers, set_up_pycolmap) as pool:
+
+            def submit(k: int) -> Future[Path]:
+                part = folder / f"part_{k}.db"
+                _copy_features(db, part, batches[k])
+                return pool.submit(_match, part, batches[k], device, -1 if on_gpu else 1)
+
+            # One batch is prepared in advance for each process.
+            running = deque(submit(k) for k in range(min(2 * workers, len(batches))))
+            for k, batch in enumerate(batches):
+                part = running.popleft().result()
+                _copy_matches(part, db)
+                part.unlink()
+                if k + 2 * workers < len(batches):
+                    running.append(submit(k + 2 * workers))
+                yield len(batch)
+    except BrokenProcessPool as error:
+        raise RunError(
+            "a process that matches photographs was killed, which happens when memory runs out: expected memory "
+            f"for {workers} of them; give fewer --features, and continue with the same command"
+        ) from error
+
+
+def _copy_features(db: pycolmap.Database, part: Path, pairs: Sequence[Pair]) -> None:
+    """Write what matching reads of some photographs to a database of their own."""
+    numbers = sorted({number for pair in pairs for number in pair})
+    with pycolmap.Database.open(part) as own, pycolmap.DatabaseTransaction(own):
+        copy_photographs(db, own, numbers)
+        for number in numbers:
+            own.write_descriptors(number, db.read_descriptors(number))
+
+
+def _match(part: Path, pairs: Sequence[Pair], device: pycolmap.Device, threads: int) -> Path:
+    """Match and verify pairs of the photographs of a database, and return its path."""
+    with pycolmap.Database.open(part) as db:
+        name = {image.image_id: image.name for image in db.read_all_images()}
+    listed = part.with_suffix(".txt")
+    listed.write_text("".join(f"{name[first]} {name[second]}\n" for first, second in pairs), encoding="utf-8")
     verification = pycolmap.TwoViewGeometryOptions()
     # A fixed seed, so that the same photographs give the same poses.
     verification.ransac.random_seed = 0
-    match_listed = partial(
-        pycolmap.match_image_pairs,
-        database,
-        pairing_options=pairing,
-        verification_options=verification,
-        device=device,
+    pycolmap.match_image_pairs(
+        part,
+        pycolmap.FeatureMatchingOptions(num_threads=threads),
+        pycolmap.ImportedPairingOptions(match_list_path=listed),
+        verification,
+        device,
     )
-    for start in range(0, len(todo), BATCH):
-        batch = todo[start : start + BATCH]
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in batch), encoding="utf-8")
-        interruptible(lambda token: match_listed(cancellation_token=token))
-        progress(len(pairs) - len(todo) + start + len(batch), len(pairs))
-    pairing.match_list_path.unlink(missing_ok=True)
-    with pycolmap.Database.open(database) as db:
-        _, inliers = db.read_two_view_geometry_num_inliers()
-    return sum(n > 0 for n in inliers), sum(inliers)
+    return part
+
+
+def _copy_matches(part: Path, db: pycolmap.Database) -> None:
+    """Write all matches of a database to the common one, all or nothing."""
+    with pycolmap.Database.open(part) as own, pycolmap.DatabaseTransaction(db):
+        for number, matches in zip(*own.read_all_matches(), strict=True):
+            db.write_matches(*pycolmap.pair_id_to_image_pair(number), matches)
+        for number, geometry in zip(*own.read_two_view_geometries(), strict=True):
+            db.write_two_view_geometry(*pycolmap.pair_id_to_image_pair(number), geometry)
