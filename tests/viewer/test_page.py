@@ -4,8 +4,9 @@ import io
 import os
 import re
 import socket
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -125,13 +126,13 @@ def test_the_camera_moves_the_picture_sharpens_and_a_path_is_saved_and_read(tmp_
 
 
 def test_a_picture_that_rests_is_sharper_than_the_first_one():
-    with page_of(wall()) as page, open_browser() as browser:
-        coarse_only = {"done": False}
-        make = page.frames._render
+    with page_of(wall()) as page, ExitStack() as stack, open_browser() as browser:
+        may_render, make = threading.Event(), page.frames._render
+        stack.callback(may_render.set)  # else a test that fails before would wait for the renderer for ever
 
         def wait_then_render(camera: Cameras) -> Rendering:
-            while not coarse_only["done"]:
-                torch.ones(1).sum()
+            while not may_render.wait(0.01):
+                torch.ones(1).sum()  # where what nobody looks at any more is cancelled
             return make(camera)
 
         page.frames.replace_method(wait_then_render)
@@ -141,7 +142,7 @@ def test_a_picture_that_rests_is_sharper_than_the_first_one():
         tab.get_by_text("Photographs", exact=True).click()
         tab.wait_for_timeout(500)
         coarse = picture_of(tab, "coarse")
-        coarse_only["done"] = True
+        may_render.set()
         tab.get_by_text("sharp,").wait_for()
         tab.wait_for_timeout(500)
         sharp = picture_of(tab, "sharp")
