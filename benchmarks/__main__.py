@@ -169,6 +169,26 @@ def surveys(
     print(out)
 
 
+def mappers(
+    photographs: Path,
+    work: Path,
+    runs: Path = MEASURED,
+    names: tuple[str, ...] = ("brighton_beach", "turin_lot", "swindale"),
+) -> None:
+    """Prepare surveys with the incremental and with the global mapper (a quarter of an hour).
+
+    Args:
+        photographs: Folder with the surveys' folders.
+        work: Folder for the prepared scenes.
+        runs: Store the figures in this folder's mappers.json; what it holds is not measured again.
+        names: Of the surveys.
+    """
+    from benchmarks.mappers import measure_mappers, table
+    from tidefield.compare.run import run_measured
+
+    print(table(measure_mappers(photographs, work, runs, names, run_measured, partial(print, flush=True))).markdown())
+
+
 def flight(
     out: tyro.conf.Positional[Path],
     category: str = "ground_textures",
@@ -781,7 +801,7 @@ def main(words: Sequence[str] | None = None) -> None:
     mapped = (maps, map_control, map_views, map_surveys, map_memory, cluster)
     changes = (change, change_size, change_cover, change_chain, change_null)
     quality = (points, parts, depth)
-    surveyed = (surveys, flight, large, cost, areas)
+    surveyed = (surveys, mappers, flight, large, cost, areas)
     measured = (speed, frames, memory, scales, *surveyed, *mapped, *quality, *changes, view, gaussians, kills, fuzz)
     functions = (*measured, table, robustness, card)
     commands = {function.__name__: function for function in functions}
