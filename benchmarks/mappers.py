@@ -55,11 +55,7 @@ def measure_mappers(
             usage = run(tidefield("prepare", photographs / survey, scene, "--mapper", mapper), {})
             report = read_json(scene / "report.json")
             assert report is not None, "prepare writes it"
-            measured[mapper] = {
-                "seconds": usage.seconds,
-                "peak_memory_bytes": usage.peak_memory_bytes,
-                **_facts(report),
-            }
+            measured[mapper] = {**asdict(usage), **_facts(report)}
             write_json(runs / MAPPERS_FILE, {**record, **describe(), "command": "python -m benchmarks mappers"})
     return record
 
