@@ -196,8 +196,10 @@ def _window_means(
     """Mean 8-bit colours around pixels, and which of them lie inside and are neither dark nor clipped."""
     height, width = pixels.shape[:2]
     side = max(3, 2 * round(width / 160) + 1)
-    mean = cv2.blur(np.asarray(pixels, dtype=np.float32), (side, side))
-    clipped = cv2.blur(np.asarray((pixels >= CLIPPED).any(-1), dtype=np.float32), (side, side))
+    mean = cv2.boxFilter(pixels, cv2.CV_32F, (side, side))
+    red, green, blue = cv2.split(pixels)
+    brightest = np.asarray(cv2.max(cv2.max(red, green), blue))
+    clipped = cv2.boxFilter((brightest >= CLIPPED).astype(np.uint8), cv2.CV_32F, (side, side))
     column, row = np.floor(uv_px).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
