@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -145,3 +146,16 @@ def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(tmp_path:
     middle = -scene.origin_world.float()
     assert scene.hull.contains(middle)
     assert not scene.hull.contains(middle + torch.tensor([0.0, 0.0, 1.5]))
+
+
+def test_the_hull_is_kept_for_the_next_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    cameras = around()
+    write_blender_part(tmp_path, "train", cameras, [alpha for alpha in pictures(cameras).alphas if alpha is not None])
+    first = load_scene(tmp_path, cache=tmp_path / "cache").hull
+    monkeypatch.setattr("tidefield.data.load.visual_hull", Mock(side_effect=AssertionError("carved again")))
+    second = load_scene(tmp_path, cache=tmp_path / "cache").hull
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first.filled, second.filled)
+    assert torch.equal(first.corner_world, second.corner_world)
+    assert torch.equal(first.voxel_world, second.voxel_world)

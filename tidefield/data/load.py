@@ -16,7 +16,7 @@ from tidefield.data.calibrate import calibrate_lenses
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.holdout import read_holdout
-from tidefield.data.hull import visual_hull
+from tidefield.data.hull import Hull, visual_hull
 from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, photographs_key
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.pictures import read_header
@@ -146,12 +146,14 @@ def load_scene(
     lenses = [asdict(lens) for lens in posed.lenses]
     depends_on = [code_hash(), photographs_key(files, background), lenses, hashes, train, calibrate]
 
+    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
+
     def estimated() -> Arrays:
-        return _arrays(*_estimate(posed, T_world_camera, origin, pinholes, photographs, train, calibrate))
+        cameras, sparse = _estimate(posed, T_world_camera, origin, pinholes, photographs, train, calibrate)
+        return _arrays(cameras, sparse, visual_hull(cameras, photographs, train) if transparent else None)
 
     arrays = kept_arrays(f"{key(depends_on)}{ESTIMATES_SUFFIX}", cache or cache_folder(), estimated)
-    cameras, sparse = _from_arrays(arrays)
-    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
+    cameras, sparse, hull = _from_arrays(arrays)
     return Scene(
         root=root,
         names=posed.names,
@@ -162,7 +164,7 @@ def load_scene(
         test=test,
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
-        hull=visual_hull(cameras, photographs, train) if transparent else None,
+        hull=hull,
     )
 
 
@@ -223,24 +225,28 @@ def _estimate(
     return cameras, sparse
 
 
-def _arrays(cameras: Cameras, points: SparsePoints | None) -> Arrays:
+def _arrays(cameras: Cameras, points: SparsePoints | None, hull: Hull | None) -> Arrays:
     """What was estimated, as arrays for the cache; `_from_arrays` is the inverse."""
-    named = {"cameras": cameras} | ({} if points is None else {"points": points})
     return {
         f"{name}.{field.name}": value.numpy()
-        for name, own in named.items()
+        for name, own in (("cameras", cameras), ("points", points), ("hull", hull))
+        if own is not None
         for field in fields(own)
         if isinstance(value := getattr(own, field.name), Tensor)
     }
 
 
-def _from_arrays(arrays: Arrays) -> tuple[Cameras, SparsePoints | None]:
-    parts: dict[str, dict[str, Tensor]] = {"cameras": {}, "points": {}}
+def _from_arrays(arrays: Arrays) -> tuple[Cameras, SparsePoints | None, Hull | None]:
+    parts: dict[str, dict[str, Tensor]] = {"cameras": {}, "points": {}, "hull": {}}
     for name, array in arrays.items():
         part, _, field = name.partition(".")
         parts[part][field] = torch.from_numpy(array)
-    cameras = Cameras(**parts["cameras"])  # type: ignore[arg-type]
-    return cameras, SparsePoints(**parts["points"]) if parts["points"] else None
+    cameras, points, hull = parts.values()
+    return (
+        Cameras(**cameras),  # type: ignore[arg-type]
+        SparsePoints(**points) if points else None,
+        Hull(**hull) if hull else None,
+    )
 
 
 def at_width(scene: Scene, width: int, progress: Progress | None = None, cache: Path | None = None) -> Scene:
