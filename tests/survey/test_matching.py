@@ -1,7 +1,7 @@
 """Pairs are chosen by positions, times and their largest features; they are matched and verified once."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
@@ -163,8 +163,11 @@ def test_zeros_match_nothing():
     assert (match_descriptors(torch.zeros(4, 128), unit(6, 0)) == -1).all()
 
 
-def write_database(path: Path) -> list[str]:
-    """A database of photographs whose features have their points' own descriptors: all matches are right."""
+def write_database(path: Path, wrong: Mapping[int, int] | None = None) -> list[str]:
+    """A database of photographs whose features have their points' own descriptors: all matches are right.
+
+    In the photographs in `wrong`, so many features have those of other points, and the rest are like nothing.
+    """
     rng = np.random.default_rng(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4, num_points3D=200
@@ -175,14 +178,18 @@ def write_database(path: Path) -> list[str]:
         db.clear_matches()
         db.clear_two_view_geometries()
         db.clear_descriptors()
-        for image in db.read_all_images():
+        images = sorted(db.read_all_images(), key=lambda image: image.name)
+        for number, image in enumerate(images):
             points = model.image(image.image_id).points2D
             table = np.stack([descriptors.get(p.point3D_id, rng.integers(0, 255, (128,))) for p in points]).astype(
                 np.uint8
             )
+            if wrong and number in wrong:
+                kept = wrong[number]
+                table[:kept], table[kept:] = table[:kept][::-1].copy(), rng.integers(0, 255, table[kept:].shape)
             described = pycolmap.FeatureDescriptors(data=table, type=pycolmap.FeatureExtractorType.SIFT)
             db.write_descriptors(image.image_id, described)
-        return sorted(image.name for image in db.read_all_images())
+        return [image.name for image in images]
 
 
 def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
@@ -218,6 +225,23 @@ def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkey
     assert len(found[0][0]) == 6
     assert calls == [(6, 6), (2, 6), (4, 6), (6, 6)]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["many.db", "one.db"]
+
+
+def test_pairs_without_matches_or_without_a_geometry_are_not_matched_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    names = write_database(tmp_path / "database.db", wrong={2: 0, 3: 30})
+    pairs = list(combinations(names, 2))
+    found = match(tmp_path / "database.db", pairs, pycolmap.Device.cpu, lambda done, whole: None)
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
+        number = {image.name: image.image_id for image in db.read_all_images()}
+        first, _, unlike, wrong = (number[name] for name in names)
+        assert len(db.read_matches(first, unlike)) == 0
+        assert len(db.read_matches(first, wrong)) > 0
+        assert len(db.read_two_view_geometry(first, wrong).inlier_matches) == 0
+    monkeypatch.setattr(pycolmap, "match_image_pairs", Mock(side_effect=AssertionError("matched again")))
+    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
+    assert match(tmp_path / "database.db", pairs, pycolmap.Device.cpu, lambda done, whole: None) == found
 
 
 def test_processes_match_on_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

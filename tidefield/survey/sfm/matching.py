@@ -77,7 +77,7 @@ def _match_in_processes(
             running = deque(submit(k) for k in range(min(2 * workers, len(batches))))
             for k, batch in enumerate(batches):
                 part = running.popleft().result()
-                _copy_matches(part, db)
+                _copy_matches(part, batch, db)
                 part.unlink()
                 if k + 2 * workers < len(batches):
                     running.append(submit(k + 2 * workers))
@@ -117,10 +117,9 @@ def _match(part: Path, pairs: Sequence[Pair], device: pycolmap.Device, threads: 
     return part
 
 
-def _copy_matches(part: Path, db: pycolmap.Database) -> None:
-    """Write all matches of a database to the common one, all or nothing."""
+def _copy_matches(part: Path, pairs: Sequence[Pair], db: pycolmap.Database) -> None:
+    """Write what was found of pairs to the common database, all or nothing; also that there was nothing."""
     with pycolmap.Database.open(part) as own, pycolmap.DatabaseTransaction(db):
-        for number, matches in zip(*own.read_all_matches(), strict=True):
-            db.write_matches(*pycolmap.pair_id_to_image_pair(number), matches)
-        for number, geometry in zip(*own.read_two_view_geometries(), strict=True):
-            db.write_two_view_geometry(*pycolmap.pair_id_to_image_pair(number), geometry)
+        for pair in pairs:
+            db.write_matches(*pair, own.read_matches(*pair))
+            db.write_two_view_geometry(*pair, own.read_two_view_geometry(*pair))
