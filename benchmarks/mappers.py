@@ -11,9 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
+from benchmarks.surveys import photographs_of
 from tidefield.compare.run import Runner, tidefield
 from tidefield.compare.tables import NOTHING, Table
-from tidefield.errors import SurveyError
 from tidefield.files import read_json, write_json
 from tidefield.machine import describe
 from tidefield.survey.sfm.mapping import Mapper
@@ -42,17 +42,14 @@ def measure_mappers(
     """
     record = read_json(runs / MAPPERS_FILE) or {"surveys": {}}
     for survey in surveys:
-        if not (photographs / survey).is_dir():
-            raise SurveyError(
-                f"{photographs / survey} is missing: expected a folder of photographs; name others with --names"
-            )
+        source = photographs_of(survey, photographs)
         for mapper in get_args(Mapper):
             measured = record["surveys"].setdefault(survey, {})
             if mapper in measured:
                 continue
             say(f"{survey}: {mapper}")
             scene = work / f"{survey}_{mapper}"
-            usage = run(tidefield("prepare", photographs / survey, scene, "--mapper", mapper), {})
+            usage = run(tidefield("prepare", source, scene, "--mapper", mapper), {})
             report = read_json(scene / "report.json")
             assert report is not None, "prepare writes it"
             measured[mapper] = {**asdict(usage), **_facts(report)}

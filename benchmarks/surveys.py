@@ -41,9 +41,7 @@ def measure_surveys(
         RunError: a command failed.
     """
     for survey in surveys:
-        source, folder = photographs / survey, runs / survey
-        if not source.is_dir():
-            raise SurveyError(f"{source} is missing: expected a folder of photographs; name others with --names")
+        source, folder = photographs_of(survey, photographs), runs / survey
         if read_json(folder / "prepare.json") is None:
             say(f"{survey}: prepare")
             usage = run(tidefield("prepare", source, folder / "scene"), {})
@@ -51,6 +49,18 @@ def measure_surveys(
         if read_json(folder / "exhaustive" / "exhaustive.json") is None:
             say(f"{survey}: exhaustive")
             run([sys.executable, "-m", "benchmarks.surveys", str(source), str(folder / "exhaustive")], {})
+
+
+def photographs_of(survey: str, photographs: Path) -> Path:
+    """The folder of a survey among those of several.
+
+    Raises:
+        SurveyError: it is missing.
+    """
+    folder = photographs / survey
+    if not folder.is_dir():
+        raise SurveyError(f"{folder} is missing: expected a folder of photographs; name others with --names")
+    return folder
 
 
 def reconstruct_exhaustively(photographs: Path, out: Path) -> None:

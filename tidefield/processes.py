@@ -8,12 +8,15 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """The signals, other than Ctrl-C's SIGINT, that ask a process to end; Windows has no SIGHUP."""
 _SET_PARENT_DEATH_SIGNAL = 1
@@ -109,6 +112,25 @@ class _Pool(ProcessPoolExecutor):
     def submit(self, *task: Any, **keywords: Any) -> Future[Any]:
         with delayed_signals():
             return super().submit(*task, **keywords)
+
+
+def in_order(
+    submit: Callable[[Item], Future[Result]], items: Sequence[Item], ahead: int
+) -> Iterator[tuple[Item, Result]]:
+    """Yield each item with its result, in the items' order.
+
+    Args:
+        submit: has an item worked on.
+        items: what there is to do.
+        ahead: items that are submitted before the first result is awaited, so that memory and files of what waits do
+            not grow with the number of items.
+    """
+    waiting = deque(submit(item) for item in items[:ahead])
+    for number, item in enumerate(items, start=ahead):
+        result = waiting.popleft().result()
+        if number < len(items):
+            waiting.append(submit(items[number]))
+        yield item, result
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from located_surveys import unlocated_photograph
 from torch import Tensor
 
 from tidefield.errors import RunError
-from tidefield.survey.sfm import matching
+from tidefield.survey.sfm import features, matching
 from tidefield.survey.sfm.matching import match
 from tidefield.survey.sfm.pairs import (
     EXHAUSTIVE,
@@ -214,7 +214,7 @@ def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkey
     shutil.copy(tmp_path / "one.db", tmp_path / "many.db")
     found, calls = [], []
     for name, workers, batch in (("one.db", 1, 256), ("many.db", 2, 2)):
-        monkeypatch.setattr(matching, "cores", lambda workers=workers: workers)
+        monkeypatch.setattr(features, "cores", lambda workers=workers: workers)
         monkeypatch.setattr(matching, "BATCH", batch)
         match(tmp_path / name, list(combinations(names, 2)), pycolmap.Device.cpu, lambda *done: calls.append(done))
         with pycolmap.Database.open(tmp_path / name) as db:

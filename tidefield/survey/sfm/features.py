@@ -7,7 +7,6 @@ make matching slower) and reports no progress.
 from __future__ import annotations
 
 import sqlite3
-from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -25,7 +24,7 @@ from tidefield.data.pictures import read_mask
 from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
-from tidefield.processes import worker_processes
+from tidefield.processes import in_order, worker_processes
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.survey import Photograph, Progress
 
@@ -78,6 +77,16 @@ def choose_device(name: str) -> pycolmap.Device:
             "pycolmap-cuda12 instead of pycolmap"
         )
     return getattr(pycolmap.Device, kind)
+
+
+def is_gpu(device: pycolmap.Device) -> bool:
+    """Decide whether pycolmap computes on a GPU, of `choose_device`."""
+    return pycolmap.has_cuda and device != pycolmap.Device.cpu
+
+
+def workers_on(device: pycolmap.Device, count: int) -> int:
+    """Processes for `count` pieces of work: one on each core; a GPU works on one piece at a time."""
+    return 1 if is_gpu(device) else max(1, min(cores(), count))
 
 
 def encode_name(name: str) -> str:
@@ -158,21 +167,15 @@ def extract(
             image = db.read_image_with_name(encode_name(photograph.name))
             if image is None or not db.exists_descriptors(image.image_id):
                 todo.append((photograph, camera_id))
-        # Processes, because pycolmap holds the interpreter's lock during extraction. A GPU works on one photograph at a
-        # time.
-        on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
-        workers = 1 if on_gpu else max(1, min(cores(), len(todo)))
-        # Only a few photographs are submitted in advance, so that memory use does not grow with their number.
-        ahead = 2 * cores() + 1
+        # Processes, because pycolmap holds the interpreter's lock during extraction.
+        workers, done = workers_on(device, len(todo)), len(photographs) - len(todo)
         try:
             with worker_processes(workers, set_up_pycolmap) as pool:
-                running = deque(pool.submit(_features, photograph, options, device) for photograph, _ in todo[:ahead])
-                for k, (photograph, camera_id) in enumerate(todo):
-                    keypoints, descriptors = running.popleft().result()
-                    if k + ahead < len(todo):
-                        running.append(pool.submit(_features, todo[k + ahead][0], options, device))
-                    _write_features(db, photograph, camera_id, keypoints, descriptors)
-                    progress(len(photographs) - len(todo) + k + 1, len(photographs))
+                found = in_order(lambda one: pool.submit(_features, one[0], options, device), todo, 2 * cores() + 1)
+                for (photograph, camera_id), features in found:
+                    _write_features(db, photograph, camera_id, *features)
+                    done += 1
+                    progress(done, len(photographs))
         except BrokenProcessPool as error:
             raise RunError(
                 "a process that finds features was killed, which happens when memory runs out: "

@@ -6,7 +6,6 @@ Its own `match_spatial` needs a position of every photograph, and reports no pro
 from __future__ import annotations
 
 import shutil
-from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -15,9 +14,8 @@ from pathlib import Path
 import pycolmap
 
 from tidefield.errors import RunError
-from tidefield.machine import cores
-from tidefield.processes import worker_processes
-from tidefield.survey.sfm.features import copy_photographs, encode_name, set_up_pycolmap
+from tidefield.processes import in_order, worker_processes
+from tidefield.survey.sfm.features import copy_photographs, encode_name, is_gpu, set_up_pycolmap, workers_on
 from tidefield.survey.survey import Progress
 
 Pair = tuple[int, int]
@@ -60,27 +58,21 @@ def _match_in_processes(
 ) -> Iterator[int]:
     """Match and verify pairs of a database; yields how many were written to it."""
     # Processes, because on several threads pycolmap rarely finds other matches: it searches descriptors in clusters,
-    # and these then differ. A GPU compares all descriptors, of one pair at a time.
-    on_gpu = pycolmap.has_cuda and device != pycolmap.Device.cpu
-    workers = 1 if on_gpu else max(1, min(cores(), len(pairs)))
+    # and these then differ. A GPU compares all descriptors.
+    workers, threads = workers_on(device, len(pairs)), -1 if is_gpu(device) else 1
     size = max(1, min(BATCH, -(-len(pairs) // workers)))
     batches = [pairs[start : start + size] for start in range(0, len(pairs), size)]
     try:
         with worker_processes(workers, set_up_pycolmap) as pool:
 
-            def submit(k: int) -> Future[Path]:
-                part = folder / f"part_{k}.db"
-                _copy_features(db, part, batches[k])
-                return pool.submit(_match, part, batches[k], device, -1 if on_gpu else 1)
+            def submit(batch: Sequence[Pair]) -> Future[Path]:
+                part = folder / f"{batch[0][0]}_{batch[0][1]}.db"
+                _copy_features(db, part, batch)
+                return pool.submit(_match, part, batch, device, threads)
 
-            # One batch is prepared in advance for each process.
-            running = deque(submit(k) for k in range(min(2 * workers, len(batches))))
-            for k, batch in enumerate(batches):
-                part = running.popleft().result()
+            for batch, part in in_order(submit, batches, 2 * workers):
                 _copy_matches(part, batch, db)
                 part.unlink()
-                if k + 2 * workers < len(batches):
-                    running.append(submit(k + 2 * workers))
                 yield len(batch)
     except BrokenProcessPool as error:
         raise RunError(
