@@ -68,7 +68,6 @@ def render(options: Render, console: Console) -> None:
     from tidefield.cluster import connected
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
-    from tidefield.render.camera_paths import make_trajectory
     from tidefield.render.stills import describe_view, still_files, title, write_still
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
@@ -92,10 +91,12 @@ def render(options: Render, console: Console) -> None:
                 console.print(str(file), highlight=False, soft_wrap=True)
             return
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
+        from tidefield.model.renderer import in_turn
+        from tidefield.render.camera_paths import make_trajectory
+        from tidefield.render.video import write_video
+
         trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
         cameras = _resized(trajectory.cameras, options.width, options.height)
-        from tidefield.model.renderer import in_turn
-        from tidefield.render.video import write_video
 
         with ExitStack() as stack:
             bar = stack.enter_context(ProgressBar(console, "Rendering"))
