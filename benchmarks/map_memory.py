@@ -21,7 +21,7 @@ from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
 from tidefield.maps.grid import Grid, make_grid, map_frame
-from tidefield.maps.make import DSM, TILES, Job, TileMaker, _file, finish_map, make_missing
+from tidefield.maps.make import DSM, TILES, Job, TileMaker, finish_map, make_missing, tile_file
 
 SQUARE = "square"
 """Folder of the map."""
@@ -71,11 +71,11 @@ def measure_memory(
     large = replace(job, grid=Grid(grid.frame, 0.0, metres, cell, count, count, grid.height))
     say(f"{len(large.tiles())} tiles, {count} x {count} cells")
     (out / TILES).mkdir(parents=True)
-    four = [_file(few / TILES, tile) for tile in middle.tiles()]
+    four = [tile_file(few, tile) for tile in middle.tiles()]
     across = -(-count // side)
     for number, tile in enumerate(large.tiles()):
         row, column = divmod(number, across)
-        os.link(four[2 * (row % 2) + column % 2], _file(out / TILES, tile))
+        os.link(four[2 * (row % 2) + column % 2], tile_file(out, tile))
 
     def bar(name: str) -> Any:
         say(name)

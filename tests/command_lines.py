@@ -3,10 +3,11 @@
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import pytest
 
-from tidefield import cli
+from tidefield import addresses, cli
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -19,6 +20,7 @@ def read_by_command(words: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> in
     module, _, function = cli.COMMANDS[words[1]]
     monkeypatch.setattr(module, function, lambda options, console: called.append(options))
     monkeypatch.setattr(cli, "_set_up", lambda verbosity: None)
+    monkeypatch.setattr(addresses, "up_to_date", lambda paths, console: nullcontext())
     monkeypatch.setattr(sys, "argv", list(words))
     cli.main()
     return len(called)

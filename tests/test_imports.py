@@ -11,6 +11,7 @@ RANK = {
     "geometry": 0,
     "data": 1,
     "synthetic": 2,
+    "addresses": 2,
     "survey": 2,
     "model": 2,
     "evaluation": 3,

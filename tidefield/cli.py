@@ -12,7 +12,9 @@ import shlex
 import signal
 import sys
 import traceback
+from contextlib import ExitStack
 from io import TextIOWrapper
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import tyro
@@ -123,6 +125,7 @@ def _run(words: list[str]) -> None:
         print(f"tidefield {__version__}")
         return
     _require_command(words)
+    words, copies = _with_copies(words)
     options = tyro.extras.subcommand_cli_from_dict(
         {name: options for name, (_, options, _) in COMMANDS.items()},
         prog="tidefield",
@@ -132,7 +135,23 @@ def _run(words: list[str]) -> None:
         sort_subcommands=False,
     )
     module, function = next((m, f) for m, kind, f in COMMANDS.values() if kind is type(options))
-    getattr(module, function)(options, _set_up(options.verbosity))
+    console = _set_up(options.verbosity)
+    with ExitStack() as stack:
+        if copies:
+            from tidefield.addresses import up_to_date
+
+            stack.enter_context(up_to_date(copies, console))
+        getattr(module, function)(options, console)
+
+
+def _with_copies(words: list[str]) -> tuple[list[str], list[Path]]:
+    """The words with local paths in place of addresses such as s3://bucket/scene, and these paths."""
+    if not any("://" in word for word in words):
+        return words, []
+    from tidefield.addresses import local_word
+
+    found = [local_word(word) for word in words]
+    return [word for word, _ in found], list(dict.fromkeys(path for _, path in found if path is not None))
 
 
 def _require_command(words: list[str]) -> None:

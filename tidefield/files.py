@@ -12,11 +12,12 @@ import secrets
 import shutil
 import stat
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from tidefield.errors import RunError
 
@@ -173,31 +174,28 @@ def is_empty(folder: Path) -> bool:
 
 
 @contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
+def only_writer(folder: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """Lock a folder, which is made, against other processes that write to it; one that still holds nothing is removed.
 
     The system releases the lock when the process dies, however it dies.
+
+    Args:
+        wait_seconds: for another process to end.
 
     Raises:
         RunError: another process has the lock, or the folder cannot be written to.
     """
     made = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
-    path = folder / LOCK_FILE
-    with writing_to(path):
-        folder.mkdir(parents=True, exist_ok=True)
-        file = path.open("ab")
+    path, end = folder / LOCK_FILE, time.monotonic() + wait_seconds
     try:
-        with file:
-            # The other process may have ended, and removed its lock, after we opened it.
-            if not (
-                _lock(file.fileno(), folder)
-                and path.exists()
-                and os.path.samestat(os.stat(path), os.stat(file.fileno()))
-            ):
+        while (file := _locked(path)) is None:
+            if time.monotonic() >= end:
                 raise RunError(
                     f"another process is writing to {folder}: expected one at a time; wait until it ends, or choose "
                     "another folder"
                 )
+            time.sleep(min(0.2, wait_seconds))
+        with file:
             try:
                 yield
             finally:
@@ -207,6 +205,23 @@ def only_writer(folder: Path) -> Iterator[None]:
         for one in made:
             with suppress(OSError):  # something is in it
                 one.rmdir()
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """Open a lock file, in a folder that is made, and lock it; None where another process has it."""
+    with writing_to(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    try:
+        # The other process may have ended, and removed its lock, after we opened it.
+        mine = _lock(file.fileno(), path.parent) and path.exists()
+        if mine and os.path.samestat(os.stat(path), os.stat(file.fileno())):
+            return file
+    except BaseException:
+        file.close()
+        raise
+    file.close()
+    return None
 
 
 def _lock(descriptor: int, folder: Path) -> bool:

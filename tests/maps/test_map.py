@@ -293,7 +293,7 @@ def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
         odd = number % 2
         every = np.ones(shape, bool)
         np.savez(
-            make._file(tmp_path / make.TILES, tile),
+            make.tile_file(tmp_path, tile),
             height=np.full(shape, 5.0 + 0.1 * odd, np.float32),
             sigma=np.full(shape, 0.01, np.float32),
             score=np.ones(shape, np.float16),

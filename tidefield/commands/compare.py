@@ -141,9 +141,11 @@ def run_all(
         variables: additional ones of the environment of all processes.
         elsewhere: works on the scenes, if not this machine.
     """
+    from tidefield.addresses import pull
     from tidefield.compare.results import read_results
     from tidefield.compare.run import (
         PROCESS_FILE,
+        RUNS,
         check_scene,
         compare,
         require_same_settings,
@@ -168,6 +170,7 @@ def run_all(
         found = {name: scene.resolve() for name, scene in scenes.items()}
         opened = partial(scene_runner, found, methods, settings, out.resolve(), variables)
         for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
+            pull(out / RUNS / name)
             print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
     return read_results(out, list(scenes), methods)
 

@@ -88,7 +88,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             ray = opened.enter_context(connected(options.cluster))
             open_maker = partial(_tile_maker, absolute(options), job.key)
             share = share_of(ray, options.device, "core")
-            makes = partial(_in_blocks, ray, job, open_maker, share)
+            makes = partial(_in_blocks, ray, job, options.out, open_maker, share)
         make_tiles(job, options.out, options.overwrite, partial(ProgressBar, console), makes)
         del render, makes
         opened.close()
@@ -105,11 +105,19 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     return result
 
 
-def _in_blocks(ray: Any, job: Job, opened: Callable[..., Any], share: Share, numbers: list[int]) -> Iterator[int]:
+def _in_blocks(
+    ray: Any, job: Job, out: Path, opened: Callable[..., Any], share: Share, numbers: list[int]
+) -> Iterator[int]:
     """Make tiles on a cluster, some neighbours in a task; yields their numbers."""
+    from tidefield.addresses import pull, push
     from tidefield.cluster import cores_of, each_on_cluster
+    from tidefield.maps.make import tile_file
 
-    yield from each_on_cluster(ray, job.key, opened, job.blocks(numbers, cores_of(ray)), share)
+    push(out)  # otherwise machines with a copy of their own would take tiles of an earlier map for those of this one
+    tiles = job.tiles()
+    for number in each_on_cluster(ray, job.key, opened, job.blocks(numbers, cores_of(ray)), share):
+        pull(tile_file(out, tiles[number]))
+        yield number
 
 
 @contextmanager
@@ -149,14 +157,23 @@ def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], It
     """Open a map in a worker of a cluster."""
     import torch
 
+    from tidefield.addresses import pull_all, push
     from tidefield.cluster import require_same
-    from tidefield.maps.make import TileMaker
+    from tidefield.maps.make import TileMaker, tile_file
     from tidefield.progress import make_console
 
     torch.set_num_threads(1)  # a task has one core
+    pull_all(options)
     with _open(options, make_console(quiet=True)) as (job, render, _):
         require_same(options.source, key, job.key)
-        yield TileMaker(job, render, options.out).block
+        maker, tiles = TileMaker(job, render, options.out), job.tiles()
+
+        def made(numbers: Sequence[int]) -> Iterator[int]:
+            for number in maker.block(numbers):
+                push(tile_file(options.out, tiles[number]))
+                yield number
+
+        yield made
 
 
 def _describe(found: dict[str, Any], unit: str) -> str:

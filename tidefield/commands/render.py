@@ -157,12 +157,14 @@ def _frame_maker(options: Render, cameras: Cameras, key: str) -> Iterator[Callab
     import numpy as np
     import torch
 
+    from tidefield.addresses import pull_all
     from tidefield.cluster import require_same
     from tidefield.device import choose_device
     from tidefield.progress import make_console
     from tidefield.render.stills import colour_picture
 
     torch.set_num_threads(1)  # a task has one core
+    pull_all(options)
     device, console = choose_device(options.device), make_console(quiet=True)
     opened = open_source(
         options.source, options.zero, device, options.allow_missing, console, options.footprint.sampling

@@ -287,6 +287,7 @@ def scene_runner(
         scenes, methods, settings, out: as for `compare`; the paths are absolute.
         environment: additional variables of all processes.
     """
+    from tidefield.addresses import pull, push
 
     def run(command: Sequence[str], own: Mapping[str, str]) -> Usage:
         with tempfile.TemporaryFile() as output:
@@ -301,23 +302,14 @@ def scene_runner(
 
     def work(name: str) -> None:
         for folder, *_ in _jobs({name: scenes[name]}, methods, out):
-            _wait_for_writer(folder)
+            with only_writer(folder, WRITER_SECONDS):
+                pass  # the child of a worker that died has saved and ended, too
+        for path in (scenes[name], out / RUNS / name):
+            pull(path)
         compare({name: scenes[name]}, methods, settings, out, run, lambda _: None)
+        push(out / RUNS / name)
 
     yield work
-
-
-def _wait_for_writer(folder: Path) -> None:
-    """Wait until the child of a worker that died has saved and ended, too."""
-    end = time.monotonic() + WRITER_SECONDS
-    while True:
-        try:
-            with only_writer(folder):
-                return
-        except RunError:
-            if time.monotonic() > end:
-                raise
-            time.sleep(1)
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:

@@ -135,16 +135,15 @@ MakesTiles = Callable[[list[int]], Iterator[int]]
 
 def make_missing(job: Job, out: Path, progress: Callable[[int, int], None], makes: MakesTiles) -> None:
     """Measure and render all tiles that are not on disk yet."""
-    folder = out / TILES
     all_tiles = job.tiles()
     wanted = [number for number, tile in enumerate(all_tiles) if touches(job.area, tile)]
-    missing = [number for number in wanted if not _file(folder, all_tiles[number]).exists()]
+    missing = [number for number in wanted if not tile_file(out, all_tiles[number]).exists()]
     done = len(wanted) - len(missing)
     if done:
         log.info(f"{done} of {len(wanted)} tiles are there already")
     if not missing:
         return
-    delete_partials(*(_file(folder, all_tiles[number]) for number in missing))
+    delete_partials(*(tile_file(out, all_tiles[number]) for number in missing))
     for _ in makes(missing):
         done += 1
         progress(done, len(wanted))
@@ -160,7 +159,7 @@ class TileMaker:
     """
 
     def __init__(self, job: Job, render: Render, out: Path) -> None:
-        self._job, self._render, self._folder, self._tiles = job, render, out / TILES, job.tiles()
+        self._job, self._render, self._out, self._tiles = job, render, out, job.tiles()
         self._start = sparse_surface(job.scene, job.grid.coarser(COARSEST))
         self._grey = GreyPhotographs(job.scene)
         self._gsd = ground_sampling_distance(job.scene) * job.grid.frame.metre
@@ -173,7 +172,7 @@ class TileMaker:
     def block(self, numbers: Sequence[int]) -> Iterator[int]:
         """Make tiles one by one; yields their numbers. Those that a worker has made before it died are there."""
         for number in numbers:
-            if not _file(self._folder, self._tiles[number]).exists():
+            if not tile_file(self._out, self._tiles[number]).exists():
                 self(number)
             yield number
 
@@ -210,12 +209,16 @@ class TileMaker:
                     "shown": shown,
                     "colour": colour,
                 }
-        with completed_file(_file(self._folder, tile), overwrite=True) as partial_file, partial_file.open("wb") as file:
+        with (
+            completed_file(tile_file(self._out, tile), overwrite=True) as partial_file,
+            partial_file.open("wb") as file,
+        ):
             np.savez(file, allow_pickle=False, **values)
 
 
-def _file(folder: Path, tile: Tile) -> Path:
-    return folder / f"{tile.name}.npz"
+def tile_file(out: Path, tile: Tile) -> Path:
+    """Where a tile is kept until the map is finished."""
+    return out / TILES / f"{tile.name}.npz"
 
 
 @dataclass(frozen=True)
@@ -255,7 +258,7 @@ def strips(job: Job, out: Path) -> Iterator[Strip]:
     single = np.zeros((4, high, grid.columns), np.uint16)
     for row in rows:
         for tile in (t for t in tiles if t.row == row):
-            path = _file(out / TILES, tile)
+            path = tile_file(out, tile)
             if not path.exists():
                 continue  # outside of the area
             with np.load(path, allow_pickle=False) as values:

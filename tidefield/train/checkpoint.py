@@ -25,6 +25,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tidefield import __version__
+from tidefield.addresses import address_of, path_of
 from tidefield.config import AnyConfig, Config, Range, Seed, config_from_json, config_to_json, from_json
 from tidefield.errors import RunError
 from tidefield.files import completed_file, file_sha256, read_json, reading_from, write_json
@@ -86,8 +87,8 @@ class TrainingProgress:
 
 def write_run(folder: Path, run: Run) -> None:
     """Write RUN/run.json."""
-    data = {name: getattr(run, name) for name in _RUN}
-    write_json(folder / RUN_FILE, {**data, "scene": str(run.scene), "config": config_to_json(run.config)})
+    data = {name: getattr(run, name) for name in _RUN} | {"scene": address_of(run.scene) or str(run.scene)}
+    write_json(folder / RUN_FILE, {**data, "config": config_to_json(run.config)})
 
 
 def read_run(folder: Path) -> Run:
@@ -107,7 +108,7 @@ def read_run(folder: Path) -> Run:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
-    return Run(**{**values, "scene": Path(values["scene"])}, config=config)
+    return Run(**{**values, "scene": path_of(values["scene"])}, config=config)
 
 
 def _run_id(folder: Path) -> str | None:
