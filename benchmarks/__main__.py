@@ -384,6 +384,7 @@ def scales(
     width: int = 400,
     device: str = "auto",
     out: Path = Path("docs/scales.md"),
+    pictures: Path | None = None,
 ) -> None:
     """Quality and time at several widths: read at points, by cones, and with several rays (hours); write the page.
 
@@ -394,6 +395,8 @@ def scales(
         width: That scenes are opened at; a run has its own.
         device: auto, cpu, cuda, cuda:N or mps.
         out: The Markdown file to write; replaced if it is there.
+        pictures: Folder for a detail of each source's first held-out photograph at the largest width, beside renderings
+            by points and by cones; the page shows those that lie beside it.
     """
     from benchmarks.scales import measure_scales, write_page
     from tidefield.compare.run import run_measured, tidefield
@@ -401,7 +404,7 @@ def scales(
     def run(words: list[str]) -> None:
         run_measured(tidefield(*words), {})
 
-    measure_scales(sources, runs, widths, width, device, run, partial(print, flush=True))
+    measure_scales(sources, runs, widths, width, device, run, partial(print, flush=True), pictures)
     write_page(runs, out)
     print(out)
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
+
 from benchmarks.table import circumstances
 from tidefield.compare.tables import Table
+from tidefield.data.load import load_scene
+from tidefield.data.pictures import decode
 from tidefield.errors import RunError
-from tidefield.files import read_json, write_json, write_text
+from tidefield.evaluation.metrics import Image8
+from tidefield.evaluation.panels import Panel, side_by_side
+from tidefield.files import completed_file, read_json, write_json, write_text
 from tidefield.machine import describe
+from tidefield.train.checkpoint import RUN_FILE, read_run
 
 SCALES_FILE = "scales.json"
 WAYS = {
@@ -23,11 +30,20 @@ WAYS = {
 }
 """Options of `tidefield evaluate`, by the name of what they do."""
 METRICS = ("psnr_seen", "psnr_seen_cc", "ssim_seen", "flip_seen")
+SHOWN = {"points": "photographs read at one width", "cones": "photographs read by cones"}
+"""What a picture shows beside the photograph, with its labels."""
 Run = Callable[[list[str]], None]
 
 
 def measure_scales(
-    sources: Sequence[Path], runs: Path, widths: Iterable[int], width: int, device: str, run: Run, say: Callable
+    sources: Sequence[Path],
+    runs: Path,
+    widths: Sequence[int],
+    width: int,
+    device: str,
+    run: Run,
+    say: Callable,
+    pictures: Path | None = None,
 ) -> dict[str, Any]:
     """Evaluate runs, or scenes with the trained weights, at several widths in every way; what was measured is kept.
 
@@ -38,6 +54,7 @@ def measure_scales(
         width: that scenes are opened at; runs have their own.
         run: runs a command of Tidefield's, given without "tidefield".
         say: reports progress.
+        pictures: folder for a detail of the first held-out photograph, at the largest width, beside how it is rendered.
 
     Raises:
         RunError: two sources have one name.
@@ -47,17 +64,21 @@ def measure_scales(
         raise RunError(f"two of {', '.join(map(str, sources))} have one name: expected different ones; rename a folder")
     record = read_json(runs / SCALES_FILE) or {"figures": {}}
     for name, source in named.items():
+        shown: dict[str, Image8] = {}
         for picture in widths:
             for way, options in WAYS.items():
                 place = record["figures"].setdefault(name, {}).setdefault(str(picture), {})
-                if way in place:
+                if way in place and (pictures is None or picture < max(widths) or way not in SHOWN):
                     continue
                 say(f"{name}, {picture} px, {way}")
                 with TemporaryDirectory() as folder:
                     out = Path(folder) / "out"
-                    of = [] if (source / "run.json").exists() else ["--zero-shot", "--opened-width", str(width)]
+                    of = [] if (source / RUN_FILE).exists() else ["--zero-shot", "--opened-width", str(width)]
                     run(["evaluate", str(source), str(out), *of, "--width", str(picture), *options, "--device", device])
                     found = read_json(out / "evaluation.json")
+                    if pictures is not None and picture == max(widths) and way in SHOWN:
+                        file = min((out / "renderings").rglob("*.png"))
+                        shown[SHOWN[way]] = torch.from_numpy(decode(file).copy())
                 trained = found["configuration"].get("trained")
                 record.setdefault("opened", {})[name] = (
                     f"Opened at {width} px, with trained weights as they are."
@@ -69,7 +90,21 @@ def measure_scales(
                 place[way] |= {"seconds": found["seconds_per_frame"], "protocol": found["protocol"]}
                 command = "python -m benchmarks scales RUN|SCENE..."
                 write_json(runs / SCALES_FILE, {**record, **describe(), "command": command})
+        if pictures is not None:
+            _write_detail(source, shown, pictures / f"scales-{name}.png")
     return record["figures"]
+
+
+def _write_detail(source: Path, renderings: Mapping[str, Image8], picture: Path) -> None:
+    """Write the middle of the first held-out photograph beside how it is rendered in each way."""
+    scene = load_scene(read_run(source).scene if (source / RUN_FILE).exists() else source)
+    photograph = scene.photographs[scene.test[0]]
+    panels = []
+    for title, image in {"held out": photograph, **renderings}.items():
+        rows, columns, _ = image.shape
+        panels.append(Panel(title, image[3 * rows // 8 : 5 * rows // 8, 3 * columns // 8 : 5 * columns // 8]))
+    with completed_file(picture, overwrite=True) as partial:
+        side_by_side(panels).save(partial)
 
 
 def write_page(runs: Path, out: Path) -> None:
@@ -97,5 +132,9 @@ def write_page(runs: Path, out: Path) -> None:
             for way, cell in ways.items()
         ]
         parts += [f"## {name}", record["opened"][name], Table(name, columns, rows).markdown()]
+        picture = f"scales-{name}.png"
+        if (out.parent / picture).is_file():
+            about = "The middle of a held-out photograph, and of how it is rendered"
+            parts.append(f"![{about}]({picture})")
     parts += ["## How this was measured", "\n".join(f"- {line}" for line in circumstances([("scales", record)]))]
     write_text(out, "\n\n".join(parts) + "\n")

@@ -1,9 +1,14 @@
-"""The page of scales: every way at every width, once."""
+"""The page of scales: every way at every width, once; and a detail of what it shows."""
 
 from pathlib import Path
 
-from benchmarks.scales import METRICS, WAYS, measure_scales, write_page
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.scales import METRICS, SHOWN, WAYS, measure_scales, write_page
 from tidefield.files import write_json
+from tidefield.synthetic import make_survey, write_survey
 
 
 def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
@@ -33,3 +38,28 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
     assert "Opened at 400 px, with trained weights as they are." in lines
     assert "| 100 | points | 1.00 | 1.00 | 1.0000 | 1.0000 | 0.5 |" in lines
     assert "| | as usual | 20.00 | 20.00 | 20.0000 | 20.0000 | 0.5 |" in [line.replace("|  |", "| |") for line in lines]
+
+
+def test_a_detail_shows_the_photograph_beside_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_survey(make_survey("vegetation", seed=1, views=9, width=64, supersample=1), tmp_path / "flat")
+    shades, ways = {"points": 100, "cones": 200}, list(WAYS)
+
+    def run(words: list[str]) -> None:
+        (Path(words[2]) / "renderings").mkdir(parents=True)
+        way = next(name for name in ways if all(option in words for option in WAYS[name]))
+        grey = np.full((48, 64, 3), shades.get(way, 0), np.uint8)
+        Image.fromarray(grey).save(Path(words[2]) / "renderings" / "vegetation_0001.png")
+        found = {"mean": dict.fromkeys(METRICS, 1.0), "seconds_per_frame": 0.5, "protocol": "strict"}
+        write_json(Path(words[2]) / "evaluation.json", {**found, "configuration": {}})
+
+    asked = [tmp_path / "flat"], tmp_path, (32, 64), 32, "cpu", run, lambda _: None
+    measure_scales(*asked)
+    assert not (tmp_path / "scales-flat.png").exists()
+    measure_scales(*asked, pictures=tmp_path)
+    sheet = np.asarray(Image.open(tmp_path / "scales-flat.png"))
+    thirds = np.array_split(sheet[-12:], len(SHOWN) + 1, axis=1)
+    assert [int(np.median(third)) for third in thirds[1:]] == [100, 200]
+    assert thirds[0].std() > 1
+    write_page(tmp_path, tmp_path / "page.md")
+    assert "(scales-flat.png)" in (tmp_path / "page.md").read_text()
