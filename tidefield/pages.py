@@ -1,6 +1,11 @@
-"""Templates of the reports: pages for a browser that need no other file."""
+"""The reports: pages for a browser that need no other file."""
 
 from __future__ import annotations
+
+import os
+import shlex
+import sys
+from pathlib import Path
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
@@ -15,3 +20,13 @@ def template_environment(*packages: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def command_line() -> str:
+    """The command as it was given, with the names of files and folders alone: a report is sent on."""
+
+    def named(word: str) -> str:
+        option, sign, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        return option + sign + (Path(value).name if "/" in value or os.sep in value else value)
+
+    return shlex.join(["tidefield", *map(named, sys.argv[1:])])

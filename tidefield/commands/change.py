@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import shlex
-import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,6 +120,7 @@ def _compare(options: Change, console: Console, work: Path) -> None:
 def _series(options: Change, console: Console, work: Path) -> None:
     """Compare surveys step by step and each with the first."""
     from tidefield.change.series import entries_of, in_order, write_series
+    from tidefield.pages import command_line
 
     paths = (options.earlier, options.later, *options.series)
     dates = _dates(options, len(paths))
@@ -149,7 +147,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
                     _write(found, options, folder / f"step_{end}", console)
                     console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
                     _say(found, console)
-        write_series(entries, _distinct(names), folder, _command())
+        write_series(entries, _distinct(names), folder, command_line())
     console.print(str(options.out), soft_wrap=True)
 
 
@@ -216,10 +214,11 @@ def _write(found: Found, options: Change, folder: Path, console: Console) -> Non
     from tidefield.change.clouds import compare_clouds, write_distances
     from tidefield.change.page import write_page
     from tidefield.change.write import write_all
+    from tidefield.pages import command_line
     from tidefield.progress import ProgressBar
 
     change, cover, water, clouds = found.change, found.cover, found.water, found.pair.clouds
-    numbers = write_all(change, folder, _command(), cover, water)
+    numbers = write_all(change, folder, command_line(), cover, water)
     views = [] if options.scenes is None else _views(options, change, cover, folder, console)
     write_page(change, numbers, folder / "change.html", cover, water, views)
     if clouds is not None:
@@ -279,12 +278,6 @@ def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, 
                 made.append(view)
                 bar(k + 1, len(names))
     return made
-
-
-def _command() -> str:
-    """The command as it was given, with the names of files and folders alone: a report is sent on."""
-    words = [Path(word).name if "/" in word or os.sep in word else word for word in sys.argv[1:]]
-    return shlex.join(["tidefield", *words])
 
 
 def _check(options: Change) -> None:

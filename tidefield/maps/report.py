@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from tidefield import __version__
 from tidefield.files import write_text
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.rasters import need
-from tidefield.pages import template_environment
+from tidefield.pages import command_line, template_environment
 
 WIDEST = 900
 """Of a picture, pixels."""
@@ -46,9 +44,8 @@ def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fil
         ("Classes", _uri(_classes(_read(out / rasters["classes"])[0])), "Ground brown, vegetation green, water blue."),
     ]
     environment = template_environment("tidefield.maps")
-    command = shlex.join(["tidefield", *sys.argv[1:]])
     page = environment.get_template("map.html").render(
-        m=result, pictures=pictures, version=__version__, command=command, fill=fill
+        m=result, pictures=pictures, version=__version__, command=command_line(), fill=fill
     )
     path = out / "odm_report" / "report.html"
     write_text(path, page)
