@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -81,6 +82,7 @@ def test_a_copy_is_made_once_and_follows_its_address(bucket: Path):
     assert pull(path) == 6
     assert files(path) == {"a.txt": "one", "images/b.txt": "two"}
     before = (path / "images" / "b.txt").stat()
+    assert before.st_mtime == pytest.approx((bucket / "scene" / "images" / "b.txt").stat().st_mtime, abs=1e-3)
     write(bucket, **{"scene/a.txt": "changed", "scene/c.txt": "new"})
     touch_later(bucket / "scene" / "a.txt")
     assert pull(path) == 10
@@ -91,6 +93,15 @@ def test_a_copy_is_made_once_and_follows_its_address(bucket: Path):
     assert pull(path) == 7, "what was deleted here is copied again"
     assert files(path) == {"a.txt": "changed", "images/b.txt": "two"}
     assert push(path) == 0
+
+
+@pytest.mark.parametrize("time", [1e9, 1_000_000_000, datetime.fromtimestamp(1e9, UTC), "2001-09-09T01:46:40+00:00"])
+def test_times_of_files_are_understood_in_every_form(time: object):
+    assert addresses._seconds({"mtime": time}) == 1e9
+
+
+def test_times_in_other_forms_are_left_out():
+    assert addresses._seconds({"updated": "yesterday"}) is None
 
 
 def test_results_are_sent_and_deleted_at_their_address(bucket: Path):

@@ -19,6 +19,7 @@ import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
+from datetime import datetime
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,20 +42,19 @@ _NO_NAMES = re.compile(r"|\.\.?|.*[\0\\\\].*" + (r'|.*[:*?"<>|].*' if os.name ==
 _AT_ONCE = 64
 """Files that fsspec transfers at a time, as far as it can."""
 _WAIT_SECONDS = 24 * 3600.0
-_VERSIONS = (
-    *("ETag", "etag", "md5Hash", "sha"),
-    *("mtime", "LastModified", "last_modified", "updated", "modified", "created"),
-)
+_TIMES = ("mtime", "LastModified", "last_modified", "updated", "modified", "created")
+_VERSIONS = ("ETag", "etag", "md5Hash", "sha", *_TIMES)
 """What the file systems of fsspec call what changes with a file."""
 
 
 @dataclass(frozen=True)
 class _There:
-    """A file at an address: its name in fsspec's file system, its size, and what changes with it."""
+    """A file at an address: its name in fsspec's file system, its size, what changes with it, and when it did."""
 
     name: str
     bytes: int
     version: str
+    seconds: float | None
 
 
 @dataclass(frozen=True)
@@ -329,6 +329,15 @@ def _version_there(info: Mapping[str, Any], address: str) -> str:
     return f"{info.get('size')} {found[0]}"
 
 
+def _seconds(info: Mapping[str, Any]) -> float | None:
+    """When a file was changed, in seconds since 1970, as far as its file system tells it in a known form."""
+    time = next((info[name] for name in _TIMES if info.get(name) is not None), None)
+    if isinstance(time, str):
+        with suppress(ValueError):
+            time = datetime.fromisoformat(time)
+    return time.timestamp() if isinstance(time, datetime) else float(time) if isinstance(time, int | float) else None
+
+
 def _own_files(path: Path) -> Iterator[str]:
     """The files of a copy by their names in it, `""` for that of a single file; no locks, links or unfinished ones."""
     if path.is_file():
@@ -360,7 +369,7 @@ def _listing(system: Any, root: str, address: str) -> dict[str, _There]:
         if info["type"] == "file" and not name.endswith("/"):  # S3's folders are empty files
             if part:
                 _parts(part, address)
-            files[part] = _There(name, info.get("size") or 0, _version_there(info, address))
+            files[part] = _There(name, info.get("size") or 0, _version_there(info, address), _seconds(info))
     return files
 
 
@@ -376,6 +385,8 @@ def _fetch(system: Any, there: Mapping[str, _There], path: Path, address: str, r
             partials[part] = stack.enter_context(_replacing(own, changed, _joined(address, part)))
         system.get([file.name for file in there.values()], [str(partial) for partial in partials.values()])
     for part, file in there.items():
+        if file.seconds is not None:  # the same on every machine: `prepare` knows unchanged photographs by it
+            os.utime(_file(path, part), (file.seconds, file.seconds))
         here = _version_here(_file(path, part))
         assert here is not None, "it has just been copied"
         records.keep(address, part, _Record(file.version, here))
