@@ -202,7 +202,7 @@ def only_writer(folder: Path, wait_seconds: float = 0.0) -> Iterator[None]:
                 with suppress(OSError):  # Windows does not remove what is open; a lock that nobody holds does no harm
                     path.unlink()
     finally:
-        for one in made:
+        for one in filter(os.path.lexists, made):
             with suppress(OSError):  # something is in it
                 one.rmdir()
 

@@ -36,8 +36,8 @@ def test_every_tile_is_in_one_block_of_neighbours(workers: int) -> None:
 def test_a_worker_makes_what_another_has_not_finished(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = job(3 * 64, 64)
     made: list[int] = []
-    monkeypatch.setattr(make, "_file", lambda folder, tile: folder / f"{tile.column}.npz")
-    maker = SimpleNamespace(_folder=tmp_path, _tiles=own.tiles())
+    monkeypatch.setattr(make, "tile_file", lambda out, tile: out / f"{tile.column}.npz")
+    maker = SimpleNamespace(_out=tmp_path, _tiles=own.tiles())
     (tmp_path / f"{own.tiles()[1].column}.npz").touch()
     monkeypatch.setattr(TileMaker, "__call__", lambda self, number: made.append(number))
 
