@@ -68,7 +68,8 @@ def measure_scales(
         for picture in widths:
             for way, options in WAYS.items():
                 place = record["figures"].setdefault(name, {}).setdefault(str(picture), {})
-                if way in place and (pictures is None or picture < max(widths) or way not in SHOWN):
+                detail = pictures is not None and picture == max(widths) and way in SHOWN
+                if way in place and not detail:
                     continue
                 say(f"{name}, {picture} px, {way}")
                 with TemporaryDirectory() as folder:
@@ -76,7 +77,7 @@ def measure_scales(
                     of = [] if (source / RUN_FILE).exists() else ["--zero-shot", "--opened-width", str(width)]
                     run(["evaluate", str(source), str(out), *of, "--width", str(picture), *options, "--device", device])
                     found = read_json(out / "evaluation.json")
-                    if pictures is not None and picture == max(widths) and way in SHOWN:
+                    if detail:
                         file = min((out / "renderings").rglob("*.png"))
                         shown[SHOWN[way]] = torch.from_numpy(decode(file).copy())
                 trained = found["configuration"].get("trained")

@@ -108,6 +108,7 @@ def test_results_are_sent_and_deleted_at_their_address(bucket: Path):
     path = copy(bucket, "map")
     assert pull(path) == 0
     write(path, **{"map.json": "{}", "tiles/1.npz": "tile", LOCK_FILE: "", ".map-12345678.partial.json": "half"})
+    write(path, **{".tiles-12345678.partial/1.npz": "half"})
     (path / "link").symlink_to(bucket)
     assert push(path) == 2
     assert files(bucket / "map") == {"map.json": "{}", "tiles/1.npz": "tile"}

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from tidefield.data.cache import cache_folder, key, open_folder
 from tidefield.errors import RunError, TidefieldError
-from tidefield.files import LOCK_FILE, completed_file, only_writer
+from tidefield.files import LOCK_FILE, completed_file, is_partial, only_writer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -194,7 +194,7 @@ def pull(path: Path, progress: Progress | None = None) -> int:
             records.forget(address, part)
         for first in range(0, len(parts), _AT_ONCE):
             some = parts[first : first + _AT_ONCE]
-            _fetch(system, {part: there[part] for part in some}, path, address, records)
+            _fetch(system, {part: there[part] for part in some}, known, path, address, records)
             if progress:
                 progress(first + len(some), len(parts))
     return size
@@ -342,10 +342,10 @@ def _own_files(path: Path) -> Iterator[str]:
     """The files of a copy by their names in it, `""` for that of a single file; no locks, links or unfinished ones."""
     if path.is_file():
         yield ""
-    for folder, _, names in os.walk(path):
+    for folder, folders, names in os.walk(path):
+        folders[:] = [name for name in folders if not is_partial(Path(name))]
         for own in (Path(folder, name) for name in names):
-            unfinished = own.name.startswith(".") and ".partial" in own.name
-            if not unfinished and own.name != LOCK_FILE and not own.is_symlink():
+            if not is_partial(own) and own.name != LOCK_FILE and not own.is_symlink():
                 yield own.relative_to(path).as_posix()
 
 
@@ -373,15 +373,22 @@ def _listing(system: Any, root: str, address: str) -> dict[str, _There]:
     return files
 
 
-def _fetch(system: Any, there: Mapping[str, _There], path: Path, address: str, records: _Records) -> None:
-    """Copy files, and note how they are; one that is there already has to be the same if it was changed here."""
+def _fetch(
+    system: Any,
+    there: Mapping[str, _There],
+    known: Mapping[str, _Record],
+    path: Path,
+    address: str,
+    records: _Records,
+) -> None:
+    """Copy files, and note how they are; one that is here already has to be the same if it was changed here."""
     with ExitStack() as stack:
         partials = {}
         for part in there:
             own = _file(path, part)
             own.parent.mkdir(parents=True, exist_ok=True)
-            here, record = _version_here(own), records.of(address, part)
-            changed = here is not None and (record is None or record.here != here)
+            here = _version_here(own)
+            changed = here is not None and (part not in known or known[part].here != here)
             partials[part] = stack.enter_context(_replacing(own, changed, _joined(address, part)))
         system.get([file.name for file in there.values()], [str(partial) for partial in partials.values()])
     for part, file in there.items():
@@ -448,12 +455,6 @@ class _Records:
     def __init__(self, database: sqlite3.Connection) -> None:
         self._database = database
         database.execute("CREATE TABLE IF NOT EXISTS files (name TEXT PRIMARY KEY, there TEXT, here TEXT)")
-
-    def of(self, address: str, part: str) -> _Record | None:
-        found = self._database.execute(
-            "SELECT there, here FROM files WHERE name = ?", (_joined(address, part),)
-        ).fetchone()
-        return None if found is None else _Record(*found)
 
     def under(self, address: str) -> dict[str, _Record]:
         """Of what is at an address, by names in it."""

@@ -72,7 +72,7 @@ def writing_to(path: Path) -> Iterator[None]:
             raise
         reason = error.strerror or str(error)
         name = Path(error.filename) if isinstance(error.filename, str) else path
-        if name.parent != path.parent and ".partial" not in name.suffixes:  # not the temporary name
+        if name.parent != path.parent and not is_partial(name):
             reason += f": {name}"
         raise RunError(
             f"{path} cannot be written ({reason}): expected a folder of yours with free space; make room, or choose "
@@ -145,6 +145,11 @@ def completed_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 def _partial_name(path: Path) -> Path:
     """A temporary name next to `path`; the suffix stays, because writers choose their format by it."""
     return path.with_name(f".{path.stem}-{secrets.token_hex(4)}.partial{path.suffix}")
+
+
+def is_partial(path: Path) -> bool:
+    """Whether a name is a temporary one, of a file or folder that is not complete."""
+    return path.name.startswith(".") and ".partial" in path.suffixes
 
 
 def delete_partials(*paths: Path) -> None:
