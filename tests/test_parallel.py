@@ -1,5 +1,7 @@
 """Parts of a batch on cores of their own: the same results and gradients as all at once."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +14,7 @@ from tidefield.config import SWIFT
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.model.network import make_network
-from tidefield.parallel import differentiable_parts, in_parallel
+from tidefield.parallel import SharedValues, differentiable_parts, in_parallel
 from tidefield.train.losses import BatchLoss, Inputs
 
 CPU = torch.device("cpu")
@@ -73,6 +75,52 @@ def test_an_error_in_a_part_is_raised() -> None:
 
     with pytest.raises(ValueError, match="no"):
         differentiable_parts([failing], [], CPU)
+
+
+def test_threads_make_each_shared_value_once_and_share_the_work() -> None:
+    values: SharedValues[int, list[int]] = SharedValues(1000, len)
+    made: list[tuple[int, int]] = []
+    together = threading.Barrier(2, timeout=20)
+
+    def make(key: int) -> list[int]:
+        made.append((key, threading.get_ident()))
+        together.wait()  # only passed if two threads make two values at the same time
+        return [key]
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda _: values.get_all([1, 2, 3, 4], make), range(2)))
+    assert found == [[[1], [2], [3], [4]]] * 2
+    assert sorted(key for key, _ in made) == [1, 2, 3, 4]
+    assert len({thread for _, thread in made}) == 2
+    assert found[0][0] is found[1][0]
+
+
+def test_shared_values_that_were_not_asked_for_for_the_longest_time_go_first() -> None:
+    values: SharedValues[str, str] = SharedValues(10, len)
+    made = []
+
+    def make(key: str) -> str:
+        made.append(key)
+        return key
+
+    for key in ("aaaa", "bbbb", "aaaa", "cc", "dd", "aaaa", "cc", "bbbb"):
+        assert values.get(key, make) == key
+    assert made == ["aaaa", "bbbb", "cc", "dd", "bbbb"]
+    large = "e" * 20
+    assert values.get(large, make) is values.get(large, make), "one value is kept, whatever its size"
+    assert values.get("cc", make) == "cc"
+    assert made[5:] == [large, "cc"]
+
+
+def test_a_shared_value_that_could_not_be_made_is_tried_again() -> None:
+    values: SharedValues[str, str] = SharedValues(10, len)
+
+    def fail(key: str) -> str:
+        raise ValueError(key)
+
+    with pytest.raises(ValueError, match="no"):
+        values.get("no", fail)
+    assert values.get("no", str.upper) == "NO"
 
 
 def batch_of(count: int, crop_px: int | None = 48):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 Part = Callable[[], tuple[Tensor, ...]]
 _SEQUENTIAL = ContextVar("sequential", default=False)
 _CHECK: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None)
@@ -71,6 +74,51 @@ def sequential() -> Iterator[None]:
         yield
     finally:
         _SEQUENTIAL.reset(token)
+
+
+class SharedValues(Generic[K, T]):
+    """Values that threads share: each is made once, and kept as long as there is room for it.
+
+    Args:
+        most_bytes: of all values; those that were not asked for for the longest time go first.
+        count_bytes: of a value.
+    """
+
+    def __init__(self, most_bytes: int, count_bytes: Callable[[T], int]) -> None:
+        self.most_bytes, self._count_bytes = most_bytes, count_bytes
+        self._values: OrderedDict[K, Future[T]] = OrderedDict()
+        self._bytes: dict[K, int] = {}
+        self._changing = threading.Lock()
+
+    def get(self, key: K, make: Callable[[K], T]) -> T:
+        """Return the value of a key, which is made if there is none; threads that ask for it meanwhile wait."""
+        return self.get_all([key], make)[0]
+
+    def get_all(self, keys: Sequence[K], make: Callable[[K], T]) -> list[T]:
+        """Return the values of keys. While other threads make some of them, this one makes others."""
+        return [value.result() for value in [self._begin(key, make) for key in keys]]
+
+    def _begin(self, key: K, make: Callable[[K], T]) -> Future[T]:
+        """Make a value, unless it is there or another thread makes it."""
+        with self._changing:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+            future = self._values[key] = Future()
+        try:
+            value = make(key)
+        except BaseException as error:
+            with self._changing:
+                del self._values[key]
+            future.set_exception(error)
+            return future
+        future.set_result(value)
+        with self._changing:
+            self._bytes[key] = self._count_bytes(value)
+            while len(self._bytes) > 1 and sum(self._bytes.values()) > self.most_bytes:
+                oldest = next(other for other in self._values if other in self._bytes)
+                del self._values[oldest], self._bytes[oldest]
+        return future
 
 
 def differentiable_parts(

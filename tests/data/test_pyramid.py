@@ -110,3 +110,23 @@ def test_a_scene_at_another_width_is_as_if_opened_at_it(tmp_path: Path):
     torch.testing.assert_close(found.points.uv_px, expected.points.uv_px, atol=1e-3, rtol=0)
     for i in range(9):
         assert torch.equal(found.photographs[i], expected.photographs[i])
+
+
+def test_a_level_an_octave_above_another_is_that_one_doubled(tmp_path: Path):
+    disk.write_colmap(tmp_path, disk.survey(disk.BARREL.resized(256, 192)))
+    pyramid = Pyramid(load_scene(tmp_path, width=33))  # odd, so that half octaves are rounded
+    for level in (0, 1, 2):
+        doubled = pyramid.read_doubled(4, level)
+        assert doubled is not None
+        assert doubled is pyramid.read(4, level + PER_OCTAVE)[0], "it is decoded once"
+        above, own = (pyramid.camera(4, k).size_px for k in (level + PER_OCTAVE, level))
+        assert torch.equal(above, 2 * own)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.5, True), (2.0, True), (2.8, True), (3.2, False), (4.0, False)])
+def test_files_show_as_much_as_they_have(tmp_path: Path, share: float, expected: bool):
+    disk.write_colmap(tmp_path, disk.survey(disk.BARREL.resized(128, 96)))
+    scene = load_scene(tmp_path, width=64)  # half of what the files have
+    pyramid = Pyramid(scene)
+    for camera in scene.cameras[[0]], scene.cameras[[4]]:
+        assert pyramid.files_show(camera.resized(round(64 * share), round(48 * share))) == expected

@@ -211,6 +211,12 @@ def read_at_size(
     return one[0], one.masks[0] if one.masks else None
 
 
+def decoded_at_once(files: Sequence[PhotographFile]) -> int:
+    """How many photographs to decode at the same time: it takes some 12 bytes per pixel, a gigabyte for all of them."""
+    largest = max(file.lens.width * file.lens.height for file in files)
+    return max(1, min(cores(), 8, 1_000_000_000 // (12 * largest)))
+
+
 def _views(
     store: UInt8[np.ndarray, " bytes"], files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]
 ) -> Photographs:
@@ -233,9 +239,7 @@ def _decoded(
     files: Sequence[PhotographFile], background_rgb: tuple[float, float, float], progress: Progress | None
 ) -> Iterator[UInt8[np.ndarray, " bytes"]]:
     """The bytes of each photograph in turn, decoded a few at a time: colours, then alpha and mask if there are any."""
-    largest = max(file.lens.width * file.lens.height for file in files)
-    # Decoding takes some 12 bytes per pixel; all workers together stay around a gigabyte.
-    workers = max(1, min(cores(), 8, 1_000_000_000 // (12 * largest)))
+    workers = decoded_at_once(files)
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[np.ndarray]] = deque()
         try:

@@ -11,18 +11,17 @@ Alphabet: V photographs, L levels, T tiles, N views.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Callable
-from functools import partial
+import threading
 
 import cv2
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from tidefield.data.images import read_at_size
+from tidefield.data.images import decoded_at_once, read_at_size
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, concatenate
+from tidefield.parallel import SharedValues
 
 PER_OCTAVE = 2
 """Levels per factor of 2 in size."""
@@ -53,13 +52,18 @@ class Pyramid:
         self._range = torch.stack([coarsest, finest.clamp(min=0)]).long()
         self.first, last = int(self._range[0].min()), int(self._range[1].max())
         self.cameras = concatenate([self._cameras(level) for level in range(self.first, last + 1)])
-        self._kept: OrderedDict[tuple[int, ...], Read] = OrderedDict()
+        files = scene.photographs.files
+        self._decoding = threading.Semaphore(decoded_at_once(files) if files else 1)
+        self._kept: SharedValues[tuple[int, int, int], Read] = SharedValues(KEPT_BYTES, lambda read: read[0].nbytes)
 
     def _cameras(self, level: int) -> Cameras:
         """The cameras of all photographs at a level, or at the nearest one that they have."""
         cameras = self.scene.cameras
         own = torch.full((len(cameras),), level).clamp(self._range[0], self._range[1])
-        size = (cameras.size_px * 2.0 ** (own[:, None] / PER_OCTAVE)).round().long().clamp(min=1)
+        # An octave above another level has exactly twice its size, so that both are read from one decoded picture.
+        above = own.div(PER_OCTAVE, rounding_mode="floor").clamp(min=0)
+        part = own - PER_OCTAVE * above
+        size = (cameras.size_px * 2.0 ** (part[:, None] / PER_OCTAVE)).round().long().clamp(min=1) * 2 ** above[:, None]
         return cameras.resized_each(torch.where(own[:, None] == 0, cameras.size_px, size))
 
     def row(self, photographs: Int[Tensor, "*B"], levels: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
@@ -80,7 +84,16 @@ class Pyramid:
         return torch.minimum(torch.maximum(level, lowest), highest)
 
     def is_much_coarser(self, camera: Cameras) -> bool:
-        """Whether most of a camera's pixels are more than `FINER` larger than those of the training photographs.
+        """Whether a camera's pixels are more than `FINER` times as large as those of most training photographs."""
+        return self._octaves_above(camera) > math.log2(FINER)
+
+    def files_show(self, camera: Cameras) -> bool:
+        """Whether the files of most training photographs have pixels at most `FINER` times as large as a camera's."""
+        finest = self._range[1, list(self.scene.train)].float().median() / PER_OCTAVE
+        return self._octaves_above(camera) + float(finest) > -math.log2(FINER) - 1e-3
+
+    def _octaves_above(self, camera: Cameras) -> float:
+        """How much larger a camera's pixels are on the ground than those of most training photographs, in powers of 2.
 
         The ground is taken to be halfway between near and far, in inverse depth.
         """
@@ -89,7 +102,7 @@ class Pyramid:
         def pixels_per_unit(cameras: Cameras) -> Tensor:
             return cameras.focal_px.log2().mean(1) + (1 / cameras.near_far).mean(1).log2()
 
-        return bool(pixels_per_unit(camera)[0] < pixels_per_unit(views).median() - math.log2(FINER))
+        return float(pixels_per_unit(views).median() - pixels_per_unit(camera)[0])
 
     def _octaves_finer(
         self, camera: Cameras, photographs: Int[Tensor, "T N"], points_world: Float[Tensor, "T 3"]
@@ -109,42 +122,34 @@ class Pyramid:
         own = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
         if level == 0:
             return own
-        size = self.camera(photograph, level).size_px[0].tolist()
-
-        def make() -> Read:
-            # One decoding serves this size and twice it.
-            finer = own if level < 0 else self._doubled(photograph, level)
-            return read_at_size(photographs, photograph, *size) if finer is None else _reduced(finer, size)
-
-        return self._keep(photograph, size, make)
+        camera = self.camera(photograph, level)
+        if level > 0:
+            return self._read(photograph, camera.width, camera.height)
+        key = photograph, camera.width, camera.height
+        return self._kept.get(key, lambda _: _reduced(own, [camera.width, camera.height]))
 
     def read_doubled(self, photograph: int, level: int) -> UInt8[Tensor, "_ _ 3"] | None:
         """Read a photograph at twice the size of a level.
 
         None where its file has less, and at levels below the scene's own size, whose pixels are finer anyway.
         """
-        doubled = None if level < 0 else self._doubled(photograph, level)
-        return None if doubled is None else doubled[0]
+        camera = self.camera(photograph, level)
+        if level < 0 or not self.scene.photographs.reaches(photograph, 2 * camera.width):
+            return None
+        return self._read(photograph, 2 * camera.width, 2 * camera.height)[0]
 
     def camera(self, photograph: int, level: int) -> Cameras:
         """The camera of a photograph at a level."""
         return self.cameras[int(self.row(torch.tensor(photograph), torch.tensor(level)))]
 
-    def _doubled(self, photograph: int, level: int) -> Read | None:
-        photographs, size = self.scene.photographs, (2 * self.camera(photograph, level).size_px[0]).tolist()
-        if not photographs.reaches(photograph, size[0]):
-            return None
-        return self._keep(photograph, size, partial(read_at_size, photographs, photograph, *size))
+    def _read(self, photograph: int, width: int, height: int) -> Read:
+        """Read a photograph's file at a size."""
 
-    def _keep(self, photograph: int, size: list[int], make: Callable[[], Read]) -> Read:
-        """What was made for a photograph and a size, as long as there is room for it."""
-        key = photograph, *size
-        if key not in self._kept:
-            self._kept[key] = make()
-            while len(self._kept) > 1 and sum(one.nbytes for one, _ in self._kept.values()) > KEPT_BYTES:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        def decode(key: tuple[int, int, int]) -> Read:
+            with self._decoding:
+                return read_at_size(self.scene.photographs, *key)
+
+        return self._kept.get((photograph, width, height), decode)
 
 
 def _reduced(photograph: Read, size: list[int]) -> Read:

@@ -7,7 +7,6 @@ Alphabet: T tiles, N views.
 from __future__ import annotations
 
 import math
-import threading
 from collections import OrderedDict
 from functools import partial
 from typing import NamedTuple
@@ -86,7 +85,6 @@ class FeatureCache:
         self.budget_bytes = memory_for_features(device) if budget_bytes is None else budget_bytes
         self.pyramid = Pyramid(scene)
         self._cones = cones
-        self._reading = threading.Lock()
         self._cameras = self.pyramid.cameras.to(device)
         patch = torch.zeros(1, 3, 32, 32, device=device)
         with torch.no_grad():
@@ -171,11 +169,10 @@ class FeatureCache:
                 self._free += [slot for block, slot in zip(some, slots, strict=True) if block not in self._slots]
 
     def _encode(self, block: Block, slot: int) -> None:
-        with self._reading:
-            colours, mask = self.pyramid.read(block.photograph, block.level)
-            doubled = None
-            if self._cones and self.network.reads_doubled:
-                doubled = self.pyramid.read_doubled(block.photograph, block.level)
+        colours, mask = self.pyramid.read(block.photograph, block.level)
+        doubled = None
+        if self._cones and self.network.reads_doubled:
+            doubled = self.pyramid.read_doubled(block.photograph, block.level)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
         last = (_block_counts(size, self._block_px) - 1).clamp(min=1)
         corner = ((size - self._block_px).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
