@@ -1,6 +1,8 @@
 """Matching finds the textured wall from a wrong start, leaves what it cannot see, and says how far to search."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -83,10 +85,10 @@ def test_the_interval_is_wider_where_the_depths_of_neighbouring_pixels_differ(mo
     cells = surface_prior(camera, at.points, at.cameras)
     level = Matcher._level
 
-    def torn(self: Matcher, *arguments: Any) -> tuple[Tensor, Tensor, float]:
-        found, known, step = level(self, *arguments)
+    def torn(self: Matcher, *arguments: Any) -> tuple[Tensor, Any]:
+        found, fit = level(self, *arguments)
         half = found.shape[1] // 2
-        return torch.cat([found[:, :half], 1.1 * found[:, half:]], dim=1), known, step
+        return torch.cat([found[:, :half], 1.1 * found[:, half:]], dim=1), fit
 
     whole = Matcher(at)(camera, cells).cells
     monkeypatch.setattr(Matcher, "_level", torn)
@@ -150,18 +152,60 @@ def test_a_large_picture_is_matched_at_half_its_size_where_that_is_asked_for(mon
     at = scene()
     camera = at.cameras[TARGET]
     cells = 1.1 * surface_prior(camera, at.points, at.cameras)
-    sizes, match = [], Matcher._match
-
-    def noted(self: Matcher, camera: Cameras, start: Tensor, reach: float) -> Any:
-        sizes.append((camera.width, camera.height))
-        return match(self, camera, start, reach)
-
-    monkeypatch.setattr(Matcher, "_match", noted)
+    sizes = matched_sizes(monkeypatch)
     found = inverse_depth(Matcher(at, most_px=100)(camera, cells), camera)
     assert sizes == [(64, 48)]
     assert parallax_px(at, found)[12:-12, 16:-16].median() < 0.1
     Matcher(at, most_px=128)(camera, cells)
     assert sizes[1:] == [(128, 96)]
+
+
+def test_pictures_are_matched_at_twice_their_size_as_far_as_files_go(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    whole, half = at.cameras[TARGET], at.cameras[TARGET].resized(64, 48)
+    sizes = matched_sizes(monkeypatch)
+    for camera, most_px in ((half, None), (half, 128), (half, 127), (whole, None), (half, 32)):
+        cells = surface_prior(camera, at.points, at.cameras)
+        prior = Matcher(at, most_px=most_px, finer=True)(camera, cells)
+        assert prior.detail is not None
+        assert prior.detail.shape == (camera.height, camera.width)
+    assert sizes == [(128, 96), (128, 96), (64, 48), (128, 96), (32, 24)]
+
+
+def test_finer_matches_count_where_photographs_agree(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(wall, "texture", partial(speckles, wall.texture))
+    at = scene()
+    camera = at.cameras[TARGET].resized(64, 48)
+    cells = 1.03 * surface_prior(camera, at.points, at.cameras)
+
+    def found(finer: bool) -> Float[Tensor, "h w"]:
+        return inverse_depth(Matcher(at, finer=finer)(camera, cells), camera)[4:-4, 8:-8]
+
+    def error(inverse: Float[Tensor, "h w"]) -> Tensor:
+        return ((inverse - 1 / wall.true_depth(camera)[4:-4, 8:-8]).abs() * STEP * camera.focal_px[0, 0]).mean()
+
+    coarse, fine = found(False), found(True)
+    assert error(fine) < 0.7 * error(coarse)
+    # Now every cost is far above what counts as agreement.
+    monkeypatch.setattr(matching, "AGREEMENT", 1e-6)
+    assert (found(True) - coarse).abs().mean() < 0.1 * (fine - coarse).abs().mean()
+
+
+def speckles(texture: Callable[[Tensor], Tensor], xy: Tensor) -> Tensor:
+    """The wall's texture, most of it half as large: finer would be aliased in photographs, which do not average."""
+    return 0.3 * texture(xy) + 0.7 * texture(2 * xy)
+
+
+def matched_sizes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """The sizes of the pictures that are matched from now on."""
+    sizes, match = [], Matcher._match
+
+    def noted(self: Matcher, camera: Cameras, *others: Any) -> Any:
+        sizes.append((camera.width, camera.height))
+        return match(self, camera, *others)
+
+    monkeypatch.setattr(Matcher, "_match", noted)
+    return sizes
 
 
 def test_the_depth_priors_of_training_are_matched_once():

@@ -11,9 +11,7 @@ Alphabet: V photographs, K depths that are tried, H W pixels of a camera, h w ce
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, product
 
@@ -28,10 +26,12 @@ from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
-from tidefield.parallel import in_parallel
+from tidefield.parallel import SharedValues, in_parallel
 
 LEVELS = 4
-"""Levels, each twice as fine as the one before; the last has the camera's own pixels."""
+"""Levels, each twice as fine as the one before; the last has the camera's own pixels, or one more has half of them."""
+AGREEMENT = 0.25
+"""Cost at which that one counts half: the more photographs differ, the less do their fine details belong together."""
 FIRST_STEPS, STEPS, MOST_STEPS = 4, 2, 48
 """Depths that are tried on each side, a pixel of parallax apart: at the first level, at the others, and at most at the
 first where nothing says where the surface is."""
@@ -78,6 +78,7 @@ class Matcher:
         pyramid: of the scene, where there is one already.
         most_px: pictures with a longer side are matched at half their size, or a quarter, ..., and the surface is
             interpolated.
+        finer: match at twice a picture's size as well, where files have as much detail and it is not above `most_px`.
         device: where to compute; surfaces are returned on the CPU.
     """
 
@@ -86,13 +87,13 @@ class Matcher:
         scene: Scene,
         pyramid: Pyramid | None = None,
         most_px: int | None = None,
+        finer: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.scene, self.pyramid, self.most_px = scene, pyramid or Pyramid(scene), most_px
+        self.scene, self.pyramid, self.most_px, self.finer = scene, pyramid or Pyramid(scene), most_px, finer
         self.device = torch.device(device)
         self._cameras = scene.cameras.to(self.device)
-        self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
-        self._reading = threading.Lock()
+        self._images: SharedValues[tuple[int, int], Tensor] = SharedValues(KEPT_BYTES, lambda image: image.nbytes)
 
     @torch.inference_mode()
     def __call__(self, camera: Cameras, cells: Float[Tensor, "3 h w"]) -> DepthPrior:
@@ -109,7 +110,12 @@ class Matcher:
         known = known | ~known.any()
         side = max(camera.width, camera.height)
         octaves = max(0, math.ceil(math.log2(side / self.most_px))) if self.most_px else 0
-        found, half = (_resized(image, camera) for image in self._matched(_smaller(camera, octaves), start, reach))
+        twice = camera.resized(2 * camera.width, 2 * camera.height)
+        fits = self.most_px is None or 2 * side <= self.most_px
+        finer = self.finer and fits and self.pyramid.files_show(twice.to("cpu"))
+        size = twice if finer else _smaller(camera, octaves)
+        matched = self._matched(size, start, reach, LEVELS + finer)
+        found, half = (_resized(image, camera) for image in matched)
         middle, half = (_on_cells(cells, image) for image in (found, half))
         ends = middle + half, torch.minimum(middle - half, middle)
         result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
@@ -118,7 +124,7 @@ class Matcher:
         return DepthPrior(result.cpu(), torch.where(seen, detail, 0.0).cpu())
 
     def _matched(
-        self, camera: Cameras, start: Float[Tensor, "A B"], reach: float
+        self, camera: Cameras, start: Float[Tensor, "A B"], reach: float, levels: int
     ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
         """`_match` of a camera, part by part, from inverse depths on pixels of any size."""
         start = _resized(start, camera)
@@ -131,7 +137,7 @@ class Matcher:
                 principal_px=camera.principal_px - camera.principal_px.new_tensor([left, top]),
                 size_px=camera.size_px.new_tensor([[right - left, bottom - top]]),
             )
-            surface, around = self._match(part, start[top:bottom, left:right], reach)
+            surface, around = self._match(part, start[top:bottom, left:right], reach, levels)
             (x0, y0), (x1, y1) = inner
             found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
             half[y0:y1, x0:x1] = around[y0 - top : y1 - top, x0 - left : x1 - left]
@@ -145,7 +151,7 @@ class Matcher:
         return found, half
 
     def _match(
-        self, camera: Cameras, start: Float[Tensor, "H W"], reach: float
+        self, camera: Cameras, start: Float[Tensor, "H W"], reach: float, levels: int
     ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
         """Inverse depths of the surface, and half of the interval that is left to search (0 if nothing matches).
 
@@ -154,20 +160,25 @@ class Matcher:
 
         Args:
             reach: how far around the start the first level searches, where that is more than usual.
+            levels: `LEVELS`, or one more.
         """
-        step, found, known = 0.0, start, torch.ones_like(start)
-        coarsest = _smaller(camera, LEVELS - 1)
+        found, surfaces = start, []
+        coarsest = _smaller(camera, levels - 1)
         weight, views = self._views(coarsest, _resized(start, coarsest))
         if not len(views):
             return start, torch.zeros_like(start)
-        for level in reversed(range(LEVELS)):
-            small, first = _smaller(camera, level), level == LEVELS - 1
+        for level in reversed(range(levels)):
+            small, first = _smaller(camera, level), level == levels - 1
             own = FIRST_STEPS if first else STEPS
-            found, known, step = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
-        for dilation in DILATIONS if step else ():
-            found = _smoothed_up_to_edges(found, known, EDGE * step, dilation)
-        spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
-        return found, HALF_PX * step + SPREADS * spread if step else torch.zeros_like(found)
+            found, fit = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
+            if level <= levels - LEVELS:
+                surfaces.append((*_surface(found, fit), fit))
+        (surface, half, _), (finer, finer_half, fit) = surfaces[0], surfaces[-1]
+        surface, half = _resized(surface, camera), _resized(half, camera)
+        if len(surfaces) == 1 or not fit.step:
+            return surface, half
+        share = 1 / (1 + (_box(fit.cost, SPREAD_PX) / AGREEMENT) ** 4)
+        return surface.lerp(finer, share), half.lerp(finer_half, share)
 
     def _views(
         self, camera: Cameras, inverse_depth: Float[Tensor, "H W"]
@@ -205,9 +216,8 @@ class Matcher:
         views: Int[Tensor, " V"],
         steps: int,
         reach: float,
-    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"], float]:
-        """One level: the best of 2 `steps` + 1 depths of every pixel, how well it is determined, and the step between
-        them.
+    ) -> tuple[Float[Tensor, "H W"], _Fit]:
+        """One level: the best of 2 `steps` + 1 depths of every pixel, and how it fits.
 
         Args:
             start: inverse depths to try others around.
@@ -217,7 +227,7 @@ class Matcher:
         looks = self._looks(camera, start, weight, views)
         parallax = sum(float((look.parallax_px * look.weight).sum()) for look in looks)
         if parallax <= 0:
-            return start, torch.ones_like(start), 0.0
+            return start, _Fit(torch.ones_like(start), torch.zeros_like(start), 0.0)
         step = sum(float(look.weight.sum()) for look in looks) / parallax
         steps = max(steps, min(MOST_STEPS, math.ceil(reach / step)))
         total = torch.zeros_like(start)
@@ -235,50 +245,68 @@ class Matcher:
             square[at] += part * value
         # 2 is the variance of what has nothing in common: what one photograph alone has wrong counts no more.
         cost = _windowed((square - mean.square()).clamp(0, 2)) + (0.0 if reach else HOLD) * offsets**2
-        best = cost.argmin(0, keepdim=True).clamp(1, 2 * steps - 1)
+        # `argmin` of the first dimension takes eight times as long on a CPU.
+        best = cost.min(0, keepdim=True).indices.clamp(1, 2 * steps - 1)
         before, lowest, after = (cost.gather(0, best + k)[0] for k in (-1, 0, 1))
         curvature = (before - 2 * lowest + after).clamp(min=1e-6)
         offset = best[0] - steps + ((before - after) / (2 * curvature)).clamp(-1, 1)
         known = curvature / (lowest + LEAST_COST) + 1e-4
-        return _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX), known, step
+        found = _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX)
+        return found, _Fit(known, lowest, step)
 
     def _looks(
         self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V a b"], views: Int[Tensor, " V"]
     ) -> list[_Look]:
         height, width = start.shape
-        rays = camera.directions_world(pixel_grid(width, height, self.device)[None])[0].unflatten(0, (height, width))
+        rays = camera.directions_world(pixel_grid(width, height, self.device)[None])[0].T.unflatten(1, start.shape)
+        rays = rays.contiguous()
         origin = camera.position_world[0]
         middle = origin + camera.directions_world(camera.size_px[None].to(start) / 2)[0] / start.median()
         weight = F.interpolate(weight[None], size=(height, width), mode="bilinear", align_corners=False)[0]
         levels = self.pyramid.levels(camera.to("cpu"), views[None], middle.cpu())[0]
+        extents = [(_extent((view > 0).any(1)), _extent((view > 0).any(0))) for view in weight]
+        keys = list(zip(views.tolist(), levels.tolist(), strict=True))
+        used = [k for k, (rows, _) in enumerate(extents) if rows.stop > rows.start]
         looks = []
-        for view, photograph, level in zip(weight, views.tolist(), levels.tolist(), strict=True):
-            rows, columns = (_extent((view > 0).any(dim)) for dim in (1, 0))
-            if rows.stop == rows.start:
-                continue
-            source = self.pyramid.camera(photograph, level).to(self.device)
-            image = self._image(photograph, level, source)
-            looks.append(
-                _Look(
-                    image, source, rows, columns, view[rows, columns], rays[rows, columns], origin, start[rows, columns]
-                )
-            )
+        for k, image in zip(used, self._images.get_all([keys[k] for k in used], self._image), strict=True):
+            at = (..., *extents[k])
+            source = self.pyramid.camera(*keys[k]).to(self.device)
+            looks.append(_Look(image, source, *extents[k], weight[k][at], rays[at], origin, start[at]))
         return looks
 
-    def _image(self, photograph: int, level: int, camera: Cameras) -> Float[Tensor, "1 1 H W"]:
+    def _image(self, key: tuple[int, int]) -> Float[Tensor, "1 1 H W"]:
         """A photograph at a level of the pyramid without its local means and contrasts."""
-        key = photograph, level
-        with self._reading:
-            if key not in self._kept:
-                colours, _ = self.pyramid.read(photograph, level)
-                grey = (colours.to(self.device).float() / 255 / camera.gain_of_rows()).mean(-1)
-                mean = _box(grey, CONTRAST_PX)
-                variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
-                self._kept[key] = ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
-                while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > KEPT_BYTES:
-                    self._kept.popitem(last=False)
-            self._kept.move_to_end(key)
-            return self._kept[key]
+        colours, _ = self.pyramid.read(*key)
+        camera = self.pyramid.camera(*key).to(self.device)
+        grey = (colours.to(self.device).float() / 255 / camera.gain_of_rows()).mean(-1)
+        mean = _box(grey, CONTRAST_PX)
+        variance = (_box(grey.square(), CONTRAST_PX) - mean.square()).clamp(min=0)
+        return ((grey - mean) / (variance + NOISE**2).sqrt())[None, None]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How the depths that a level found fit.
+
+    Attributes:
+        known: how well each is determined.
+        cost: how much the photographs differ there.
+        step: between the depths that were tried; 0 if nothing was.
+    """
+
+    known: Float[Tensor, "H W"]
+    cost: Float[Tensor, "H W"]
+    step: float
+
+
+def _surface(found: Float[Tensor, "H W"], fit: _Fit) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """What a level found, smoothed up to its edges, and half of the interval that is left to search."""
+    if not fit.step:
+        return found, torch.zeros_like(found)
+    for dilation in DILATIONS:
+        found = _smoothed_up_to_edges(found, fit.known, EDGE * fit.step, dilation)
+    spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
+    return found, HALF_PX * fit.step + SPREADS * spread
 
 
 class _Look:
@@ -297,39 +325,48 @@ class _Look:
         rows: slice,
         columns: slice,
         weight: Float[Tensor, "h w"],
-        rays: Float[Tensor, "h w 3"],
+        rays: Float[Tensor, "3 h w"],
         origin_world: Float[Tensor, "3"],
         start: Float[Tensor, "h w"],
     ) -> None:
         self.image, self.rows, self.columns, self.weight = image, rows, columns, weight
         matrix = source.projection[0]
         # Of origin + ray / d the homogeneous pixel is, times d: matrix ray + d matrix origin.
-        far, near = rays @ matrix[:, :3].T, matrix[:, :3] @ origin_world + matrix[:, 3]
-        uv = _over(far[..., :2] + start[..., None] * near[:2], (far[..., 2] + start * near[2])[..., None])
-        self.parallax_px = _over(near[:2] - uv * near[2], (far[..., 2] + start * near[2])[..., None]).norm(dim=-1)
+        far, near = (
+            (matrix[:, :3] @ rays.flatten(1)).unflatten(1, start.shape),
+            matrix[:, :3] @ origin_world + matrix[:, 3],
+        )
+        inverse = _positive(torch.addcmul(far[2], start, near[2])).reciprocal_()
+        uv = torch.addcmul(far[:2], start, near[:2, None, None]) * inverse
+        self.parallax_px = torch.hypot(*((near[:2, None, None] - uv * near[2]) * inverse))
         # The weights are of the coarsest level's pixels, which may lie half outside of the photograph.
-        inside = (uv > MARGIN_PX).all(-1) & (uv < source.size_px[0] - MARGIN_PX).all(-1)
+        width, height = source.size_px[0].tolist()
+        inside = ((uv > MARGIN_PX) & (uv < uv.new_tensor([width, height])[:, None, None] - MARGIN_PX)).all(0)
         self.weight = self.weight * inside
-        moved = source.displaced(uv.reshape(1, -1, 2)).reshape(uv.shape) - uv
         # From pixels to what `grid_sample` takes: -1 to 1 from border to border.
-        scale = 2 / source.size_px[0]
-        self._far = [far[..., k] * scale[k] - far[..., 2] for k in (0, 1)] + [far[..., 2]]
-        self._near = [near[k] * scale[k] - near[2] for k in (0, 1)] + [near[2]]
-        self._moved = [moved[..., k] * scale[k] for k in (0, 1)]
+        scale = (2 / uv.new_tensor([width, height]))[:, None, None]
+        pairs = _pairs(*uv)
+        self._moved = (source.displaced(pairs.reshape(1, -1, 2)).reshape(pairs.shape) - pairs).movedim(-1, 0) * scale
+        self._far = *(far[:2] * scale - far[2]), far[2]
+        self._near = *(near[:2] * scale[:, 0, 0] - near[2]), near[2]
 
     def read(self, inverse_depth: Float[Tensor, "K h w"]) -> Float[Tensor, "K h w"]:
         """What the photograph shows at inverse depths of the pixels."""
         x, y, z = (torch.addcmul(far, inverse_depth, near) for far, near in zip(self._far, self._near, strict=True))
-        inverse = z.clamp(min=1e-6).reciprocal_()
-        grid = torch.stack([torch.addcmul(m, q, inverse) for q, m in zip((x, y), self._moved, strict=True)], dim=-1)
-        grid = grid.flatten(0, 1)[None]
-        value = F.grid_sample(self.image, grid, padding_mode="border", align_corners=False)
+        inverse = _positive(z).reciprocal_()
+        grid = _pairs(*(torch.addcmul(moved, q, inverse) for q, moved in zip((x, y), self._moved, strict=True)))
+        value = F.grid_sample(self.image, grid.flatten(0, 1)[None], padding_mode="border", align_corners=False)
         return value.reshape(inverse_depth.shape)
 
 
-def _over(values: Tensor, z: Tensor) -> Tensor:
-    """Values over z, which is kept positive: what is behind a camera is out of its frame."""
-    return values / z.clamp(min=1e-6)
+def _positive(z: Tensor) -> Tensor:
+    """z-depths, kept positive: what is behind a camera is out of its frame."""
+    return z.clamp(min=1e-6)
+
+
+def _pairs(x: Float[Tensor, "*B"], y: Float[Tensor, "*B"]) -> Float[Tensor, "*B 2"]:
+    """Put values side by side; `stack` takes six times as long on a CPU."""
+    return torch.view_as_real(torch.complex(x, y))
 
 
 def _extent(used: Tensor) -> slice:

@@ -83,7 +83,9 @@ class Renderer:
     ) -> None:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.cache = FeatureCache(network, scene, device, sampling.cones)
-        self.matcher = Matcher(scene, self.cache.pyramid, device=device) if network.matches_surface else None
+        self.matcher = None
+        if network.matches_surface:
+            self.matcher = Matcher(scene, self.cache.pyramid, finer=True, device=device)
         self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)

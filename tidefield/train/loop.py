@@ -287,7 +287,7 @@ class SceneTrainer(Trainer):
             area = (Area if whole else select)(self.scene, targets, self._doubled)
             match = None
             if self.network.matches_surface:
-                match = Matcher(area.scene, most_px=MATCHED_PX, device=self.device)
+                match = Matcher(area.scene, most_px=MATCHED_PX, finer=True, device=self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match))
         return self._open
 
