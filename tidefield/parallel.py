@@ -1,4 +1,4 @@
-"""Independent pieces of tensor work on the cores of one machine, forward and backward."""
+"""Independent pieces of work on the cores of one machine, forward and backward, and values that they share."""
 
 from __future__ import annotations
 

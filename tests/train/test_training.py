@@ -159,7 +159,7 @@ loop.cut, loop.STEPS_EACH = partial(cut, whole=whole, most=16), 1
 
 
 class Match:  # quick, and as large as the real one
-    def __init__(self, scene):
+    def __init__(self, scene, **options):
         pass
 
     def __call__(self, camera, cells):

@@ -19,11 +19,9 @@ Alphabet: V photographs, K heights, H W cells of a tile.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 
 import cv2
 import numpy as np
@@ -37,6 +35,7 @@ from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import Cameras
 from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
 from tidefield.maps.stereo import Pairs, choose_pairs, fill_gaps
+from tidefield.parallel import SharedValues
 
 COARSEST = 8
 """Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
@@ -117,28 +116,19 @@ class GreyPhotographs:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._kept: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
-        self._bytes = 0
-        self._lock = Lock()
+        self._kept: SharedValues[tuple[int, int], np.ndarray] = SharedValues(KEPT_BYTES, lambda grey: grey.nbytes)
 
     def read(self, index: int, factor: int) -> UInt8[np.ndarray, "h w"]:
         """Read a photograph at a `factor`-th of its size."""
-        with self._lock:
-            return self._read((index, factor))
+        return self._kept.get((index, factor), self._reduced)
 
-    def _read(self, key: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+    def _reduced(self, key: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
         index, factor = key
-        if key not in self._kept:
-            grey = cv2.cvtColor(self.scene.photographs[index].numpy(), cv2.COLOR_RGB2GRAY)
-            if factor > 1:
-                size = max(1, round(grey.shape[1] / factor)), max(1, round(grey.shape[0] / factor))
-                grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-            self._kept[key] = grey
-            self._bytes += grey.nbytes
-            while self._bytes > KEPT_BYTES and len(self._kept) > 1:
-                self._bytes -= self._kept.popitem(last=False)[1].nbytes
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        grey = cv2.cvtColor(self.scene.photographs[index].numpy(), cv2.COLOR_RGB2GRAY)
+        if factor > 1:
+            size = max(1, round(grey.shape[1] / factor)), max(1, round(grey.shape[0] / factor))
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        return grey
 
 
 @dataclass(frozen=True)
