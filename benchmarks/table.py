@@ -311,7 +311,7 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         "included. `sparse-depth` blends the same neighbours on the surface of the sparse points and reads "
         "photographs in the same way: the floor. Our presets and the methods without training read what lies between "
         "pixels from files of twice the width, where there are such (method, section 3): on all scenes but lego at "
-        "400 px, on none at 800 and 1600 px."
+        "400 px, on all but caliterra at 800 px, on none at 1600 px."
     ]
     for width, results in sized.items():
         marks = marks_of(results, learned_from())
