@@ -115,11 +115,15 @@ def test_shared_values_that_were_not_asked_for_for_the_longest_time_go_first() -
 def test_a_shared_value_that_could_not_be_made_is_tried_again() -> None:
     values: SharedValues[str, str] = SharedValues(10, len)
 
+    tried = []
+
     def fail(key: str) -> str:
+        tried.append(key)
         raise ValueError(key)
 
     with pytest.raises(ValueError, match="no"):
-        values.get("no", fail)
+        values.get_all(["no", "yes"], fail)
+    assert tried == ["no"], "an error is raised at once"
     assert values.get("no", str.upper) == "NO"
 
 

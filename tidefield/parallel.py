@@ -111,7 +111,7 @@ class SharedValues(Generic[K, T]):
             with self._changing:
                 del self._values[key]
             future.set_exception(error)
-            return future
+            raise
         future.set_result(value)
         with self._changing:
             self._bytes[key] = self._count_bytes(value)

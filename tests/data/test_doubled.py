@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import scenes_on_disk as disk
 import textured_wall as wall
 import torch
+from matched_sizes import matched_sizes
 from networks import SMALL
 from torch.nn import functional as F
 
@@ -17,10 +17,8 @@ from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.load import at_twice_the_size, load_scene
-from tidefield.data.matching import Matcher
 from tidefield.data.pyramid import PER_OCTAVE, Pyramid
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import make_network
 from tidefield.model.renderer import Renderer
 from tidefield.synthetic import make_survey, write_survey
@@ -116,18 +114,12 @@ def test_training_reads_what_it_is_prepared_with(scene: Scene):
 
 
 def test_training_matches_at_twice_the_size_as_views_do(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    widths, match = [], Matcher._match
-
-    def noted(self: Matcher, camera: Cameras, *others: Any) -> Any:
-        widths.append(camera.width)
-        return match(self, camera, *others)
-
-    monkeypatch.setattr(Matcher, "_match", noted)
+    sizes = matched_sizes(monkeypatch)
     trainer = SceneTrainer(SMALL, scene, 0, CPU)
     assert trainer.open_area().priors[scene.train[0]].detail is not None
     torch.manual_seed(0)
     Renderer(make_network(SMALL.network).eval(), scene, SMALL, CPU)(scene.cameras[scene.train[0]])
-    assert widths == [2 * WIDTH, 2 * WIDTH]
+    assert [width for width, _ in sizes] == [2 * WIDTH, 2 * WIDTH]
 
 
 def test_a_view_comes_closer_to_the_photograph_that_was_not_used(tmp_path: Path):

@@ -9,6 +9,7 @@ import pytest
 import textured_wall as wall
 import torch
 from jaxtyping import Float
+from matched_sizes import matched_sizes
 from torch import Tensor
 
 from tidefield.data import matching
@@ -194,18 +195,6 @@ def test_finer_matches_count_where_photographs_agree(monkeypatch: pytest.MonkeyP
 def speckles(texture: Callable[[Tensor], Tensor], xy: Tensor) -> Tensor:
     """The wall's texture, most of it half as large: finer would be aliased in photographs, which do not average."""
     return 0.3 * texture(xy) + 0.7 * texture(2 * xy)
-
-
-def matched_sizes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """The sizes of the pictures that are matched from now on."""
-    sizes, match = [], Matcher._match
-
-    def noted(self: Matcher, camera: Cameras, *others: Any) -> Any:
-        sizes.append((camera.width, camera.height))
-        return match(self, camera, *others)
-
-    monkeypatch.setattr(Matcher, "_match", noted)
-    return sizes
 
 
 def test_the_depth_priors_of_training_are_matched_once():
