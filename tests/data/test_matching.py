@@ -58,6 +58,45 @@ def test_the_wall_is_found_from_a_start_that_is_off(factor: float):
         assert before.median() > 10 * inner.median(), "the start was right already"
 
 
+@pytest.mark.parametrize("size", [(400, 300), (800, 600)])
+def test_first_levels_are_small_whatever_the_size(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]):
+    at = scene(*size)
+    camera = at.cameras[TARGET]
+    widths, level = [], Matcher._level
+
+    def noted(self: Matcher, camera: Cameras, *others: Any) -> Any:
+        widths.append(camera.width)
+        return level(self, camera, *others)
+
+    monkeypatch.setattr(Matcher, "_level", noted)
+    Matcher(at)(camera, surface_prior(camera, at.points, at.cameras))
+    assert widths[:4] == [25, 50, 100, 200]
+
+
+def test_a_start_that_is_far_off_is_left():
+    at = scene(400, 300)
+    camera = at.cameras[TARGET]
+    start = 2.5 * surface_prior(camera, at.points, at.cameras)
+    error = parallax_px(at, matched(at, start))[40:-40, 60:-60]
+    assert parallax_px(at, matching._on_pixels(camera, start[0])).median() > 25
+    assert error.median() < 0.05
+    assert error.quantile(0.8) < 0.5
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_the_start_is_left_only_where_photographs_agree_better(textured: bool, monkeypatch: pytest.MonkeyPatch):
+    if not textured:
+        monkeypatch.setattr(wall, "texture", lambda xy: torch.full((*xy.shape[:-1], 3), 0.5))
+    at = scene()
+    camera, matcher = at.cameras[TARGET], Matcher(at)
+    truth = 1 / wall.true_depth(camera)
+    weight, views = matcher._views(camera, truth)
+    for found, start in ((truth, 2 * truth), (2 * truth, truth)):
+        better = matcher._found_or_start(camera, found, start, weight, views)[12:-12, 16:-16]
+        expected = (truth if textured else start)[12:-12, 16:-16]
+        assert (better / expected - 1).abs().median() < 0.01
+
+
 def test_without_any_expected_depth_all_of_the_range_is_searched():
     at = scene()
     camera = at.cameras[TARGET]

@@ -28,13 +28,19 @@ from tidefield.data.surface import in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 from tidefield.parallel import SharedValues, in_parallel
 
-LEVELS = 4
-"""Levels, each twice as fine as the one before; the last has the camera's own pixels, or one more has half of them."""
+COARSEST_PX, LEAST_LEVELS = 25, 4
+"""The first level's longer side, about, and the least number of levels, each twice as fine as the one before."""
 AGREEMENT = 0.25
-"""Cost at which that one counts half: the more photographs differ, the less do their fine details belong together."""
-FIRST_STEPS, STEPS, MOST_STEPS = 4, 2, 48
-"""Depths that are tried on each side, a pixel of parallax apart: at the first level, at the others, and at most at the
+"""Cost at which a level finer than the picture counts half: the more photographs differ, the less do their fine details
+belong together."""
+COARSE_PX = 256
+"""Levels of at most this side are coarse, except for the picture's own: they choose the photographs to compare, and
+search more depths."""
+COARSE_STEPS, STEPS, MOST_STEPS = 6, 2, 48
+"""Depths that are tried on each side, a pixel of parallax apart: at coarse levels, at the others, and at most at the
 first where nothing says where the surface is."""
+DOUBT = 0.05
+"""By how much less photographs have to differ where coarse levels came to than around the start."""
 VIEWS = 4
 """Photographs that are compared at a pixel: those from the most similar directions."""
 SOFTNESS_RAD = 0.02
@@ -46,7 +52,7 @@ NOISE = 2 / 255
 WINDOW_PX, WIDE_PX, WIDE_SHARE = 5, 15, 0.5
 """Sides of the windows that photographs are compared over, and the share of the second: it decides where the first one
 holds too little texture."""
-HOLD = 0.002
+HOLD = 0.001
 """Cost of a step away from the depth of the level before, squared: what decides where there is no texture."""
 SMOOTH_PX = 3
 """Side of the window of the smoothing."""
@@ -58,8 +64,9 @@ weight of a pixel is a quarter."""
 HALF_PX, SPREADS, SPREAD_PX = 1.0, 4.0, 9
 """Half of the interval that is left to search: pixels of parallax, and standard deviations of the matched depths in a
 window of this side."""
-FRAME_PX, OVERLAP_PX = 768, 96
-"""Side of the parts of a camera that are matched at once, and how far they overlap ..."""
+FRAME_PX, OVERLAP_PX = 768, 32
+"""Side of the parts of a level that are matched at once, and how far they overlap, which is more than what a pixel's
+windows reach; ..."""
 GPU_FACTOR = 4
 """... and how many times larger the parts are on a GPU, which small ones do not keep busy."""
 MARGIN_PX = 2.0
@@ -113,8 +120,7 @@ class Matcher:
         twice = camera.resized(2 * camera.width, 2 * camera.height)
         fits = self.most_px is None or 2 * side <= self.most_px
         finer = self.finer and fits and self.pyramid.files_show(twice.to("cpu"))
-        size = twice if finer else _smaller(camera, octaves)
-        matched = self._matched(size, start, reach, LEVELS + finer)
+        matched = self._match(twice if finer else _smaller(camera, octaves), start, reach, finer)
         found, half = (_resized(image, camera) for image in matched)
         middle, half = (_on_cells(cells, image) for image in (found, half))
         ends = middle + half, torch.minimum(middle - half, middle)
@@ -123,12 +129,71 @@ class Matcher:
         seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
         return DepthPrior(result.cpu(), torch.where(seen, detail, 0.0).cpu())
 
-    def _matched(
-        self, camera: Cameras, start: Float[Tensor, "A B"], reach: float, levels: int
+    def _match(
+        self, camera: Cameras, start: Float[Tensor, "A B"], reach: float, finer: bool
     ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-        """`_match` of a camera, part by part, from inverse depths on pixels of any size."""
-        start = _resized(start, camera)
-        found, half = torch.empty_like(start), torch.empty_like(start)
+        """Inverse depths of the surface, and half of the interval that is left to search (0 if nothing matches).
+
+        The interval is the wider the more the depths of neighbouring pixels differ: there are edges, or matches that
+        are not to be trusted.
+
+        Args:
+            camera: of the last level.
+            start: inverse depths to try others around, on pixels of any size.
+            reach: how far around the start the first level searches, where that is more than usual.
+            finer: the last level counts only where photographs agree, and the one before it elsewhere.
+        """
+        side = max(camera.width, camera.height)
+        levels = max(LEAST_LEVELS + finer, 1 + round(math.log2(side / COARSEST_PX)))
+        last_coarse = max(1 + finer, math.ceil(math.log2(side / COARSE_PX)))
+        found, weight, views, surfaces = start, start.new_zeros(0, 1, 1), torch.zeros(0, dtype=torch.long), []
+        for level in reversed(range(levels)):
+            small = _smaller(camera, level)
+            found = _resized(found, small)
+            if level >= last_coarse:
+                weight, views = self._views(small, found)
+            if not len(views):
+                return _resized(start, camera), torch.zeros_like(_resized(start, camera))
+            steps = COARSE_STEPS if level >= last_coarse else STEPS
+            around = reach if level == levels - 1 else 0.0
+            found, *surface = self._in_parts(small, found, weight, views, steps, around, smooth=level <= finer)
+            if level == last_coarse and not reach:
+                found = self._found_or_start(small, found, _resized(start, small), weight, views)
+            surfaces.append([_resized(image, camera) for image in surface])
+        (surface, half, _), (fine, fine_half, cost) = surfaces[-1 - finer], surfaces[-1]
+        if not finer:
+            return surface, half
+        share = 1 / (1 + (_box(cost, SPREAD_PX) / AGREEMENT) ** 4)
+        return surface.lerp(fine, share), half.lerp(fine_half, share)
+
+    def _found_or_start(
+        self,
+        camera: Cameras,
+        found: Float[Tensor, "H W"],
+        start: Float[Tensor, "H W"],
+        weight: Float[Tensor, "V a b"],
+        views: Int[Tensor, " V"],
+    ) -> Float[Tensor, "H W"]:
+        """What coarse levels found, where photographs agree on it better than around the start, which counts elsewhere:
+        two photographs agree on many a wrong depth, and what moves seems to lie at another."""
+        (found, *_, cost), (start, *_, before) = (
+            self._in_parts(camera, depths, weight, views, STEPS, 0.0, smooth=True) for depths in (found, start)
+        )
+        return torch.where(_box(cost, WINDOW_PX) + DOUBT < _box(before, WINDOW_PX), found, start)
+
+    def _in_parts(
+        self,
+        camera: Cameras,
+        start: Float[Tensor, "H W"],
+        weight: Float[Tensor, "V a b"],
+        views: Int[Tensor, " V"],
+        steps: int,
+        reach: float,
+        smooth: bool,
+    ) -> list[Float[Tensor, "H W"]]:
+        """`_level` of a camera, part by part: the inverse depths; if they are to be smoothed, those of the surface,
+        half of the interval that is left to search, and the costs as well."""
+        images = [torch.empty_like(start) for _ in range(4 if smooth else 1)]
 
         def match(outer: _Box, inner: _Box) -> None:
             (left, top), (right, bottom) = outer
@@ -137,10 +202,11 @@ class Matcher:
                 principal_px=camera.principal_px - camera.principal_px.new_tensor([left, top]),
                 size_px=camera.size_px.new_tensor([[right - left, bottom - top]]),
             )
-            surface, around = self._match(part, start[top:bottom, left:right], reach, levels)
+            its = _read_at(weight, camera, outer)
+            found, fit = self._level(part, start[top:bottom, left:right], its, views, steps, reach)
             (x0, y0), (x1, y1) = inner
-            found[y0:y1, x0:x1] = surface[y0 - top : y1 - top, x0 - left : x1 - left]
-            half[y0:y1, x0:x1] = around[y0 - top : y1 - top, x0 - left : x1 - left]
+            for image, values in zip(images, [found, *_surface(found, fit)] if smooth else [found], strict=True):
+                image[y0:y1, x0:x1] = values[y0 - top : y1 - top, x0 - left : x1 - left]
 
         side = FRAME_PX * (1 if start.device.type == "cpu" else GPU_FACTOR)
         parts = [partial(match, *part) for part in _parts(camera, side)]
@@ -148,37 +214,7 @@ class Matcher:
             in_parallel(parts, start.device)
         else:
             parts[0]()
-        return found, half
-
-    def _match(
-        self, camera: Cameras, start: Float[Tensor, "H W"], reach: float, levels: int
-    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-        """Inverse depths of the surface, and half of the interval that is left to search (0 if nothing matches).
-
-        The interval is the wider the more the depths of neighbouring pixels differ: there are edges, or matches that
-        are not to be trusted.
-
-        Args:
-            reach: how far around the start the first level searches, where that is more than usual.
-            levels: `LEVELS`, or one more.
-        """
-        found, surfaces = start, []
-        coarsest = _smaller(camera, levels - 1)
-        weight, views = self._views(coarsest, _resized(start, coarsest))
-        if not len(views):
-            return start, torch.zeros_like(start)
-        for level in reversed(range(levels)):
-            small, first = _smaller(camera, level), level == levels - 1
-            own = FIRST_STEPS if first else STEPS
-            found, fit = self._level(small, _resized(found, small), weight, views, own, reach if first else 0.0)
-            if level <= levels - LEVELS:
-                surfaces.append((*_surface(found, fit), fit))
-        (surface, half, _), (finer, finer_half, fit) = surfaces[0], surfaces[-1]
-        surface, half = _resized(surface, camera), _resized(half, camera)
-        if len(surfaces) == 1 or not fit.step:
-            return surface, half
-        share = 1 / (1 + (_box(fit.cost, SPREAD_PX) / AGREEMENT) ** 4)
-        return surface.lerp(finer, share), half.lerp(finer_half, share)
+        return images
 
     def _views(
         self, camera: Cameras, inverse_depth: Float[Tensor, "H W"]
@@ -212,7 +248,7 @@ class Matcher:
         self,
         camera: Cameras,
         start: Float[Tensor, "H W"],
-        weight: Float[Tensor, "V a b"],
+        weight: Float[Tensor, "V H W"],
         views: Int[Tensor, " V"],
         steps: int,
         reach: float,
@@ -221,7 +257,7 @@ class Matcher:
 
         Args:
             start: inverse depths to try others around.
-            weight: of the views, at the coarsest level's pixels.
+            weight: of the views.
             reach: inverse depth on each side that more steps are made for.
         """
         looks = self._looks(camera, start, weight, views)
@@ -255,14 +291,13 @@ class Matcher:
         return found, _Fit(known, lowest, step)
 
     def _looks(
-        self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V a b"], views: Int[Tensor, " V"]
+        self, camera: Cameras, start: Float[Tensor, "H W"], weight: Float[Tensor, "V H W"], views: Int[Tensor, " V"]
     ) -> list[_Look]:
         height, width = start.shape
         rays = camera.directions_world(pixel_grid(width, height, self.device)[None])[0].T.unflatten(1, start.shape)
         rays = rays.contiguous()
         origin = camera.position_world[0]
         middle = origin + camera.directions_world(camera.size_px[None].to(start) / 2)[0] / start.median()
-        weight = F.interpolate(weight[None], size=(height, width), mode="bilinear", align_corners=False)[0]
         levels = self.pyramid.levels(camera.to("cpu"), views[None], middle.cpu())[0]
         extents = [(_extent((view > 0).any(1)), _extent((view > 0).any(0))) for view in weight]
         keys = list(zip(views.tolist(), levels.tolist(), strict=True))
@@ -299,14 +334,16 @@ class _Fit:
     step: float
 
 
-def _surface(found: Float[Tensor, "H W"], fit: _Fit) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """What a level found, smoothed up to its edges, and half of the interval that is left to search."""
+def _surface(
+    found: Float[Tensor, "H W"], fit: _Fit
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """What a level found, smoothed up to its edges, half of the interval that is left to search, and the costs."""
     if not fit.step:
-        return found, torch.zeros_like(found)
+        return found, torch.zeros_like(found), fit.cost
     for dilation in DILATIONS:
         found = _smoothed_up_to_edges(found, fit.known, EDGE * fit.step, dilation)
     spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
-    return found, HALF_PX * fit.step + SPREADS * spread
+    return found, HALF_PX * fit.step + SPREADS * spread, fit.cost
 
 
 class _Look:
@@ -339,7 +376,7 @@ class _Look:
         inverse = _positive(torch.addcmul(far[2], start, near[2])).reciprocal_()
         uv = torch.addcmul(far[:2], start, near[:2, None, None]) * inverse
         self.parallax_px = torch.hypot(*((near[:2, None, None] - uv * near[2]) * inverse))
-        # The weights are of the coarsest level's pixels, which may lie half outside of the photograph.
+        # The weights are of a coarser level's pixels, which may lie half outside of the photograph.
         width, height = source.size_px[0].tolist()
         inside = ((uv > MARGIN_PX) & (uv < uv.new_tensor([width, height])[:, None, None] - MARGIN_PX)).all(0)
         self.weight = self.weight * inside
@@ -456,6 +493,14 @@ def _on_cells(cells: Float[Tensor, "3 h w"], image: Float[Tensor, "H W"]) -> Flo
 
 _Box = tuple[tuple[int, int], tuple[int, int]]
 """Upper left corner of a part of a picture, and the corner that it ends before."""
+
+
+def _read_at(images: Float[Tensor, "V a b"], camera: Cameras, box: _Box) -> Float[Tensor, "V h w"]:
+    """Images of a camera at any size, interpolated at the pixels of a part of its picture."""
+    (left, top), (right, bottom) = box
+    x, y = ((torch.arange(*of, device=images.device) + 0.5) for of in ((left, right), (top, bottom)))
+    grid = torch.stack(torch.meshgrid(2 * x / camera.width - 1, 2 * y / camera.height - 1, indexing="xy"), dim=-1)
+    return F.grid_sample(images[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
 def _parts(camera: Cameras, most_px: int) -> list[tuple[_Box, _Box]]:
