@@ -3,7 +3,8 @@
 A plane sweep from coarse to fine: at each level every pixel tries a few depths around those of the level before. The
 photographs are projected there and compared without their local means and contrasts, over windows; the depth at which
 they agree best is taken from a parabola through the three best costs, and smoothed the more the less it is determined.
-The first level starts from the depth prior, that is from the sparse points.
+The first level starts from the depth prior, that is from the sparse points. What the coarse levels find has to fit
+better than that start, which counts elsewhere.
 
 Alphabet: V photographs, K depths that are tried, H W pixels of a camera, h w cells of a prior.
 """
