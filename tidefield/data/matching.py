@@ -147,21 +147,24 @@ class Matcher:
         side = max(camera.width, camera.height)
         levels = max(LEAST_LEVELS + finer, 1 + round(math.log2(side / COARSEST_PX)))
         last_coarse = max(1 + finer, math.ceil(math.log2(side / COARSE_PX)))
-        found, weight, views, surfaces = start, start.new_zeros(0, 1, 1), torch.zeros(0, dtype=torch.long), []
+        found, cost, surfaces = start, torch.ones_like(start), []
+        weight, views = start.new_zeros(0, 1, 1), torch.zeros(0, dtype=torch.long)
         for level in reversed(range(levels)):
             small = _smaller(camera, level)
             found = _resized(found, small)
             if level >= last_coarse:
                 weight, views = self._views(small, found)
             if not len(views):
-                return _resized(start, camera), torch.zeros_like(_resized(start, camera))
+                kept = _resized(start, camera)
+                return kept, torch.zeros_like(kept)
             steps = COARSE_STEPS if level >= last_coarse else STEPS
             around = reach if level == levels - 1 else 0.0
-            found, *surface = self._in_parts(small, found, weight, views, steps, around, smooth=level <= finer)
+            found, cost, *surface = self._in_parts(small, found, weight, views, steps, around, smooth=level <= finer)
             if level == last_coarse and not reach:
                 found = self._found_or_start(small, found, _resized(start, small), weight, views)
-            surfaces.append([_resized(image, camera) for image in surface])
-        (surface, half, _), (fine, fine_half, cost) = surfaces[-1 - finer], surfaces[-1]
+            if surface:
+                surfaces.append([_resized(image, camera) for image in surface])
+        (surface, half), (fine, fine_half) = surfaces[0], surfaces[-1]
         if not finer:
             return surface, half
         share = 1 / (1 + (_box(cost, SPREAD_PX) / AGREEMENT) ** 4)
@@ -177,8 +180,8 @@ class Matcher:
     ) -> Float[Tensor, "H W"]:
         """What coarse levels found, where photographs agree on it better than around the start, which counts elsewhere:
         two photographs agree on many a wrong depth, and what moves seems to lie at another."""
-        (found, *_, cost), (start, *_, before) = (
-            self._in_parts(camera, depths, weight, views, STEPS, 0.0, smooth=True) for depths in (found, start)
+        (found, cost), (start, before) = (
+            self._in_parts(camera, depths, weight, views, STEPS, 0.0, smooth=False) for depths in (found, start)
         )
         return torch.where(_box(cost, WINDOW_PX) + DOUBT < _box(before, WINDOW_PX), found, start)
 
@@ -192,9 +195,9 @@ class Matcher:
         reach: float,
         smooth: bool,
     ) -> list[Float[Tensor, "H W"]]:
-        """`_level` of a camera, part by part: the inverse depths; if they are to be smoothed, those of the surface,
-        half of the interval that is left to search, and the costs as well."""
-        images = [torch.empty_like(start) for _ in range(4 if smooth else 1)]
+        """`_level` of a camera, part by part: inverse depths and their costs; where they are to be smoothed, those of
+        the surface and half of the interval that is left to search as well."""
+        images = [torch.empty_like(start) for _ in range(4 if smooth else 2)]
 
         def match(outer: _Box, inner: _Box) -> None:
             (left, top), (right, bottom) = outer
@@ -206,7 +209,8 @@ class Matcher:
             its = _read_at(weight, camera, outer)
             found, fit = self._level(part, start[top:bottom, left:right], its, views, steps, reach)
             (x0, y0), (x1, y1) = inner
-            for image, values in zip(images, [found, *_surface(found, fit)] if smooth else [found], strict=True):
+            results = found, fit.cost, *(_surface(found, fit) if smooth else ())
+            for image, values in zip(images, results, strict=True):
                 image[y0:y1, x0:x1] = values[y0 - top : y1 - top, x0 - left : x1 - left]
 
         side = FRAME_PX * (1 if start.device.type == "cpu" else GPU_FACTOR)
@@ -335,16 +339,14 @@ class _Fit:
     step: float
 
 
-def _surface(
-    found: Float[Tensor, "H W"], fit: _Fit
-) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """What a level found, smoothed up to its edges, half of the interval that is left to search, and the costs."""
+def _surface(found: Float[Tensor, "H W"], fit: _Fit) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """What a level found, smoothed up to its edges, and half of the interval that is left to search."""
     if not fit.step:
-        return found, torch.zeros_like(found), fit.cost
+        return found, torch.zeros_like(found)
     for dilation in DILATIONS:
         found = _smoothed_up_to_edges(found, fit.known, EDGE * fit.step, dilation)
     spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
-    return found, HALF_PX * fit.step + SPREADS * spread, fit.cost
+    return found, HALF_PX * fit.step + SPREADS * spread
 
 
 class _Look:
