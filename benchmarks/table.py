@@ -13,7 +13,7 @@ from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_tables, summarise
 from tidefield.compare.results import Result, Results, read_figures
-from tidefield.compare.run import OTHER_SEED, WHOLE
+from tidefield.compare.run import WHOLE
 from tidefield.compare.tables import (
     NOTHING,
     REGIONS,
@@ -34,7 +34,6 @@ from tidefield.compare.tables import (
     shown,
     trainings,
 )
-from tidefield.config import VARIANTS
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import read_json, write_text
@@ -120,7 +119,7 @@ def write_page(
     """
     compared, ablated = (
         read_figures(comparison, SCENES, names()),
-        read_figures(ablation, SCENES, (WHOLE, OTHER_SEED, *VARIANTS)),
+        read_figures(ablation, SCENES),
     )
     others = [read_figures([file], SCENES, (WHOLE,)) for file in lengths]
     sized = by_width(widths)

@@ -71,7 +71,20 @@ class PassConfig:
     """H, channels of the aggregated features and of the ray transformer."""
 
 
-Part = Literal["direction weights", "ray transformer", "target colour"]
+Part = Literal[
+    "direction weights",
+    "ray transformer",
+    "target colour",
+    "sparse points",
+    "matched surface",
+    "doubled photographs",
+    "sharpening",
+    "agreement",
+    "density head",
+]
+"""Parts of a network that it can do without: the paper's, those of both, and ours."""
+PARTS: dict[str, tuple[Part, ...]] = {"paper": typing.get_args(Part)[:4], "swift": typing.get_args(Part)}
+"""Those that a kind of network can have."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +105,15 @@ class NetworkConfig:
     uniform_fraction: Share = 0.05
     """Share of a finer pass's samples that are spread evenly instead of where the coarser pass found the surface."""
     without: tuple[Part, ...] = ()
-    """Parts of the paper that are left out: views count alike instead of by direction (eq. 6),
-    densities come from each sample alone, colours from the neighbours alone."""
+    """Parts that are left out. Of the paper: views count alike instead of by direction (eq. 6), densities come from
+    each sample alone, colours from the neighbours alone. Of both: nothing comes from the scene's sparse points, neither
+    where rays are sampled nor what depths learn from. Of ours: the surface is not matched before it is searched for,
+    photographs are read at their own size only, nothing is sharpened, views that agree make no surface likelier, and
+    neither do learned features."""
+
+    def has(self, part: Part) -> bool:
+        """Whether the network has a part."""
+        return part in PARTS[self.kind] and part not in self.without
 
 
 @dataclass(frozen=True)
@@ -277,11 +297,17 @@ def warm_start(config: Config) -> Config:
 
 
 def vary(config: Config, name: str) -> AnyConfig:
-    """The variant of that name: one part changed, left out or added, for the ablation.
+    """The variant of that name, for the ablation: one part changed, left out or added, or several, joined by `+`.
 
     Raises:
         RunError: there is none, or none of this configuration.
     """
+    first, plus, rest = name.partition("+")
+    if plus:
+        varied = vary(config, first)
+        if not isinstance(varied, Config):
+            raise RunError(f"{name} was asked for: expected nothing after {first}, which has no parts; leave it out")
+        return vary(varied, rest)
     if name not in VARIANTS:
         raise RunError(f"there is no variant {name}: expected one of {', '.join(VARIANTS)}")
     try:
@@ -310,19 +336,19 @@ def _network(config: Config, **changes: Any) -> Config:
 
 
 def _without(config: Config, part: Part) -> Config:
-    if part in config.network.without:
+    if not config.network.has(part):
         raise _NotApplicable(f"it has no {part}")
     return _network(config, without=(*config.network.without, part))
 
 
 def _with(config: Config, part: Part) -> Config:
-    if part not in config.network.without:
+    if config.network.has(part):
         raise _NotApplicable(f"it has its {part} already")
     return _network(config, without=tuple(other for other in config.network.without if other != part))
 
 
 def _degree(config: Config, degree: int) -> Config:
-    if "target colour" in config.network.without:
+    if not config.network.has("target colour"):
         raise _NotApplicable("it has no target colour")
     return _network(config, harmonics_degree=degree)
 
@@ -330,6 +356,13 @@ def _degree(config: Config, degree: int) -> Config:
 def _neighbours(config: Config, strategy: Literal["seen", "direction"]) -> Config:
     """Another choice of the neighbouring views, of the same network."""
     return dataclasses.replace(config, train=dataclasses.replace(config.train, neighbours=strategy))
+
+
+def _weight(config: Config, field: str, weight: float) -> Config:
+    """Another weight of the loss."""
+    if getattr(config.train, field) == weight:
+        raise _NotApplicable(f"its {field} is {weight:g} already")
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **{field: weight}))
 
 
 def _samples(config: Config, share: float) -> Config:
@@ -340,9 +373,7 @@ def _samples(config: Config, share: float) -> Config:
 
 VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     "no-neighbours": lambda _: NerfConfig(),
-    "no-direction-weights": partial(_without, part="direction weights"),
-    "no-ray-transformer": partial(_without, part="ray transformer"),
-    "no-target-colour": partial(_without, part="target colour"),
+    **{f"no-{part.replace(' ', '-')}": partial(_without, part=part) for part in typing.get_args(Part)},
     "with-ray-transformer": partial(_with, part="ray transformer"),
     "with-target-colour": partial(_with, part="target colour"),
     "with-every-part": lambda config: _with(_with(config, "ray transformer"), "target colour"),
@@ -350,6 +381,9 @@ VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
     "neighbours-seen": partial(_neighbours, strategy="seen"),
     "neighbours-direction": partial(_neighbours, strategy="direction"),
+    "no-depth-loss": partial(_weight, field="depth_weight", weight=0.0),
+    "no-structure-loss": partial(_weight, field="structure_weight", weight=0.0),
+    "unseen-alike": partial(_weight, field="unseen_weight", weight=1.0),
     "samples-half": partial(_samples, share=0.5),
     "samples-double": partial(_samples, share=2.0),
 }

@@ -8,14 +8,17 @@ import torch
 from networks import CPU, NETWORKS, SMALL_PAPER, TARGET, looking, network, outputs, scene
 from torch import Tensor, nn
 
-from tidefield.config import PAPER, SWIFT, Config, Sampling
+from tidefield.config import PAPER, PARTS, SWIFT, Config, Part, Sampling, vary
 from tidefield.data.neighbours import Neighbours
+from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
+from tidefield.methods import given, make_trainer
 from tidefield.model.cache import FeatureCache
 from tidefield.model.network import Network, TileRendering
 from tidefield.model.renderer import Renderer, in_turn
 from tidefield.model.sampling import Intervals, Tiles, place_samples
+from tidefield.train import loop
 
 PASSES = {"swift": "passes", "paper": "aggregate"}
 
@@ -61,6 +64,51 @@ def test_where_views_see_an_opaque_scene_all_light_is_stopped(name: str):
     own = network(NETWORKS[name], stir=0.02)
     result = own(*looking(own, scene()), True)
     torch.testing.assert_close(result.opacity, torch.ones(2, 256), atol=1e-4, rtol=0)
+
+
+DRAWN = [part for part in PARTS["swift"] if SWIFT.network.has(part) and part != "doubled photographs"]
+
+
+@pytest.mark.parametrize("part", DRAWN)
+def test_without_a_part_the_network_is_finite_and_renders_something_else(part: Part):
+    without = replace(SWIFT, network=replace(SWIFT.network, without=(*SWIFT.network.without, part)))
+    own, whole, at = network(without.network, stir=0.02), network(SWIFT.network, stir=0.02), scene(width=96, height=72)
+    # Of the parts that are learned, the rest keeps its random numbers.
+    own.load_state_dict(whole.state_dict(), strict=False)
+    result = own(*looking(own, at), True)
+    assert finite_forward_and_backward(own, result) >= {"encoder", "colour", "passes"}
+    with torch.inference_mode():
+        camera = at.cameras[TARGET]
+        one, other = (
+            Renderer(each.eval(), given(config, at), config, CPU)(camera).colour
+            for each, config in ((own, without), (whole, SWIFT))
+        )
+    assert (one - other).abs().max() > 1e-4
+
+
+def test_without_doubled_photographs_none_is_read(monkeypatch: pytest.MonkeyPatch):
+    def read(*_: object) -> None:
+        raise AssertionError("photographs were read at twice the size")
+
+    monkeypatch.setattr(Pyramid, "read_doubled", read)
+    monkeypatch.setattr(loop, "at_twice_the_size", read)
+    at, without = scene(), vary(SWIFT, "no-doubled-photographs")
+    assert isinstance(without, Config)
+    Renderer(network(without.network).eval(), at, without, CPU)(at.cameras[TARGET])
+    make_trainer(without, at, 0, CPU).prepare()
+    with pytest.raises(AssertionError, match="at twice the size"):
+        Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU)(at.cameras[TARGET])
+    with pytest.raises(AssertionError, match="at twice the size"):
+        make_trainer(SWIFT, at, 0, CPU).prepare()
+
+
+def test_without_sparse_points_nothing_comes_from_them():
+    at, config = scene(width=96, height=72), vary(SWIFT, "no-sparse-points")
+    assert isinstance(config, Config)
+    trainers = [make_trainer(config, each, 0, CPU) for each in (at, replace(at, points=None))]
+    first, second = (trainer.renderer()(at.cameras[TARGET]) for trainer in trainers)
+    torch.testing.assert_close(first.colour, second.colour, atol=0, rtol=0)
+    torch.testing.assert_close(first.depth, second.depth, atol=0, rtol=0)
 
 
 def test_a_scene_a_thousand_times_as_large_has_the_same_colours():

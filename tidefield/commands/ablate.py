@@ -19,14 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ablate:
-    """Train and evaluate variants of a preset, each with one part left out or changed; write a table for each scene.
+    """Train and evaluate variants of a preset, each with one part left out or changed; write a table of all scenes.
 
     What is done is not repeated: the same command continues after an interruption, and with more variants or scenes.
     """
 
     scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
     variants: tuple[str, ...] = ()
-    """Which; all of them if not given."""
+    """Which; all of them if not given. Joined by `+` they are of one another: `no-sparse-points+no-agreement` is
+    compared with `no-sparse-points`."""
     preset: Preset = "swift"
     """What they are variants of."""
     budget: OmitArgPrefixes[Budget] = Budget()
@@ -36,6 +37,9 @@ class Ablate:
     """Folder for the runs and the table."""
     device: Device = "auto"
     seed: int = 0
+    """The first one."""
+    seeds: int = 2
+    """How many times each is trained, with a seed of its own: how far these results are apart is the noise."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
@@ -46,9 +50,12 @@ def ablate(options: Ablate, console: Console) -> None:
 
     if not options.scenes:
         raise RunError("nothing to compare on: expected scenes; name some")
+    if options.seeds < 1:
+        raise RunError(f"--seeds {options.seeds} was asked for: expected 1 or more; choose another")
     for name in options.variants:
         vary(PRESETS[options.preset], name)  # before anything is trained
     # From scratch, all of them: trained weights would belong to one of the variants only.
     settings = make_settings(options.budget, options.width, options.device, options.seed, True, options.preset)
-    results = run_all(named(options.scenes), variants(options.variants, options.preset), settings, options.out, console)
+    methods = variants(options.variants, options.preset, options.seeds)
+    results = run_all(named(options.scenes), methods, settings, options.out, console)
     print_lines(console, write_ablation(results, settings, options.out))

@@ -1,51 +1,85 @@
-"""Tables of an ablation: the effect of leaving out or changing one part, next to the effect of another seed."""
+"""Tables of an ablation: the effect of leaving out or changing one part, next to the effect of other seeds.
+
+A variant is compared with the whole network, or, if it changes several parts, with the variant that changes all but
+the last of them: `no-sparse-points+no-agreement` with `no-sparse-points`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
-from tidefield.compare.results import Results
-from tidefield.compare.run import OTHER_SEED, WHOLE, Settings
-from tidefield.compare.tables import Table, shown, write_figures, write_tables
+from tidefield.compare.results import Result, Results
+from tidefield.compare.run import WHOLE, Settings, of_seed, variant_and_seed
+from tidefield.compare.tables import NOTHING, Table, shown, write_figures, write_tables
 from tidefield.config import PRESETS, variants_of
 
 LEAST_DB = 0.05
-"""A smaller difference counts as noise, even if two seeds happen to agree better."""
+"""A smaller difference counts as noise, even if seeds happen to agree better."""
+ERRORS = 2.0
+"""Standard errors beyond which a difference is none of the seeds."""
 WITHIN = "within the noise"
-_METRICS = (
-    ("psnr_seen", "PSNR, dB", "{:.2f}"),
-    ("psnr_seen_cc", "PSNR after the colour fit, dB", "{:.2f}"),
-    ("ssim_seen", "SSIM", "{:.4f}"),
-    ("lpips_vgg_seen", "LPIPS, VGG", "{:.4f}"),
-)
+PSNR = "psnr_seen_cc"
+_METRICS = ((PSNR, "PSNR, dB", ".2f"), ("ssim_seen_cc", "SSIM", ".4f"), ("flip_seen_cc", "FLIP", ".4f"))
 
 
-def variants(chosen: Sequence[str], preset: str) -> tuple[str, ...]:
-    """The whole network, the same with another seed, and its variants; all that the preset has where none is chosen."""
-    return (WHOLE, OTHER_SEED, *(chosen or variants_of(PRESETS[preset])))
+@dataclass(frozen=True)
+class Difference:
+    """PSNR of a variant minus that of what it is a variant of, dB.
+
+    Attributes:
+        mean: of all seeds.
+        error: its standard error, from how far results of one variant with several seeds are apart; None where each
+            has one seed.
+    """
+
+    mean: float
+    error: float | None
+
+    @property
+    def effect(self) -> str:
+        """Better, worse or within the noise."""
+        if abs(self.mean) <= max(LEAST_DB, ERRORS * (self.error or 0.0)):
+            return WITHIN
+        return "better" if self.mean > 0 else "worse"
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f}" + ("" if self.error is None else f" ± {self.error:.2f}")
+
+
+def variants(chosen: Sequence[str], preset: str, seeds: int) -> tuple[str, ...]:
+    """The whole network and its variants, all that the preset has where none is chosen, once with each seed."""
+    names = (WHOLE, *(chosen or variants_of(PRESETS[preset])))
+    return tuple(of_seed(name, seed) for seed in range(seeds) for name in names)
 
 
 def ablation_tables(results: Results) -> list[Table]:
-    """One table for each scene that has results."""
+    """One table of all scenes for each network that has variants."""
+    groups: dict[str, list[str]] = {}
+    for name in _names(results):
+        if name != WHOLE:
+            groups.setdefault(_base(name), []).append(name)
     measured = {scene for scene, _ in results.by}
-    return [_table(results, scene) for scene in results.scenes if scene in measured]
+    scenes = [scene for scene in results.scenes if scene in measured]
+    return [_table(results, base, names, scenes) for base, names in groups.items()]
 
 
 def summarise(results: Results) -> list[str]:
-    """What the tables of all scenes show together, as sentences: which parts matter, and which bring nothing."""
+    """What the tables show together, as sentences: which parts matter, and which bring nothing."""
     groups: dict[str, list[str]] = {}
-    for method in results.methods:
-        if method not in (WHOLE, OTHER_SEED):
-            each = (_effect(results, scene, method) for scene in results.scenes)
-            found = {effect for effect in each if effect is not None}
-            beyond = found - {WITHIN}
-            if found and len(beyond) < 2:
-                groups.setdefault(next(iter(beyond), WITHIN), []).append(method)
+    for name in _names(results):
+        differences = (difference(results, scene, name) for scene in results.scenes)
+        found = {one.effect for one in differences if one is not None}
+        beyond = found - {WITHIN}
+        if found and len(beyond) < 2:
+            groups.setdefault(next(iter(beyond), WITHIN), []).append(name)
     sentences = {
-        "worse": "Worse than the whole network, and nowhere better",
-        "better": "Better than the whole network, and nowhere worse",
-        WITHIN: "Not distinguishable from another seed on any scene, so the change has no effect in this time",
+        "worse": "Worse, and nowhere better",
+        "better": "Better, and nowhere worse",
+        WITHIN: f"Within {ERRORS:g} standard errors, or {LEAST_DB:g} dB, on all scenes, so that no effect was measured",
     }
     return [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
 
@@ -63,32 +97,94 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     ]
 
 
-def _difference(results: Results, scene: str, method: str) -> float | None:
-    """PSNR minus that of the whole network, dB."""
-    own, whole = (results.metric(scene, name, "psnr_seen") for name in (method, WHOLE))
-    return None if own is None or whole is None or method == WHOLE else own - whole
-
-
-def _effect(results: Results, scene: str, method: str) -> str | None:
-    """Better, worse or within the noise, which is the difference of another seed, and at least `LEAST_DB`."""
-    difference, other = (_difference(results, scene, name) for name in (method, OTHER_SEED))
-    if difference is None:
+def difference(results: Results, scene: str, name: str) -> Difference | None:
+    """PSNR against what it is a variant of; None where either was not measured, and for the whole network."""
+    if name == WHOLE:
         return None
-    return WITHIN if abs(difference) <= max(LEAST_DB, abs(other or 0)) else "better" if difference > 0 else "worse"
+    own, other = (_values(results, scene, each) for each in (name, _base(name)))
+    if not own or not other:
+        return None
+    spread = _spread(results, scene)
+    error = None if spread is None else spread * math.sqrt(1 / len(own) + 1 / len(other))
+    return Difference(fmean(own) - fmean(other), error)
 
 
-def _table(results: Results, scene: str) -> Table:
-    """A line for each variant; metrics that no variant has are left out."""
-    found = {method: results.by[scene, method] for method in results.methods if (scene, method) in results.by}
-    metrics = [of for of in _METRICS if any(result.metric(of[0]) is not None for result in found.values())]
-    rows, budgets = [], set()
-    for method, result in found.items():
-        within = method != OTHER_SEED and _effect(results, scene, method) == WITHIN
-        difference = shown(_difference(results, scene, method), "{:+.2f}") + (f", {WITHIN}" if within else "")
-        values = (shown(result.metric(metric), style) for metric, _, style in metrics)
-        rows.append([method, *values, f"{result.evaluation['rays_per_second']:,.0f}", difference])
-        settings = result.process.get("settings", {})
-        minutes, start = settings.get("minutes"), " from random weights" if settings.get("from_scratch") else ""
-        budgets.add((f"{minutes:g} min" if minutes is not None else f"{settings.get('steps')} steps") + start)
-    title = f"{scene}, {' or '.join(sorted(budgets))}, pixels that two training photographs or more see"
-    return Table(title, ["variant", *(title for _, title, _ in metrics), "rays/s", "difference, dB"], rows)
+def _spread(results: Results, scene: str) -> float | None:
+    """Standard deviation of results of one variant with different seeds, over all variants."""
+    squares, freedom = 0.0, 0
+    for name in _names(results):
+        values = _values(results, scene, name)
+        squares += sum((value - fmean(values)) ** 2 for value in values)
+        freedom += max(0, len(values) - 1)
+    return math.sqrt(squares / freedom) if freedom else None
+
+
+def _base(name: str) -> str:
+    return name.rpartition("+")[0] or WHOLE
+
+
+def _names(results: Results) -> list[str]:
+    """Variants that were measured anywhere, in the order of the results."""
+    return list(dict.fromkeys(variant_and_seed(m)[0] for m in results.methods if any(m == x for _, x in results.by)))
+
+
+def _runs(results: Results, scene: str, name: str) -> list[Result]:
+    of = (m for m in results.methods if variant_and_seed(m)[0] == name)
+    return [results.by[scene, method] for method in of if (scene, method) in results.by]
+
+
+def _values(results: Results, scene: str, name: str) -> list[float]:
+    values = (run.metric(PSNR) for run in _runs(results, scene, name))
+    return [value for value in values if value is not None]
+
+
+def _table(results: Results, base: str, names: Sequence[str], scenes: Sequence[str]) -> Table:
+    """What variants change: PSNR on each scene, and means over the scenes of a variant of what else is measured, speeds
+    relative to those of the network that it is a variant of."""
+
+    def row(name: str) -> list[str]:
+        cells = [name, str(max(len(_runs(results, scene, name)) for scene in scenes))]
+        for scene in scenes:
+            found = difference(results, scene, name) if name != base else None
+            value = _mean([run.metric(PSNR) for run in _runs(results, scene, name)])
+            effect = NOTHING if found is None else f"{found}{', noise' if found.effect == WITHIN else ''}"
+            cells.append(shown(value, "{:.2f}") if name == base else effect)
+        both = [scene for scene in scenes if _runs(results, scene, name) and _runs(results, scene, base)]
+
+        def means(of: Callable[[Result], float | None]) -> Iterator[float | None]:
+            """Over these scenes, of the variant and of what it is a variant of."""
+            for each in (name, base):
+                yield _mean([_mean([of(run) for run in _runs(results, scene, each)]) for scene in both])
+
+        for metric, _, style in _METRICS:
+            value, usual = means(lambda run, metric=metric: run.metric(metric))
+            if name == base or value is None or usual is None:
+                cells.append(shown(value, f"{{:{style}}}"))
+            else:
+                cells.append(f"{value - usual:+{style}}")
+        for speed in (_steps_per_minute, lambda run: run.evaluation["rays_per_second"]):
+            value, usual = means(speed)
+            cells.append(NOTHING if value is None or not usual else f"{value / usual:.2f}")
+        return cells
+
+    budgets = {_budget(run) for scene in scenes for name in (base, *names) for run in _runs(results, scene, name)}
+    title = f"Of {base}: {' or '.join(sorted(budgets))}, doubly seen pixels, after the colour fit"
+    columns = ["variant", "seeds", *scenes, *(f"mean: {metric}" for _, metric, _ in _METRICS)]
+    return Table(title, [*columns, "training, times as fast", "rendering, times as fast"], [*map(row, (base, *names))])
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Of those that were measured; None where none was."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def _steps_per_minute(run: Result) -> float | None:
+    steps, seconds = run.trained("steps"), run.trained("seconds")
+    return 60 * steps / seconds if steps is not None and seconds else None
+
+
+def _budget(run: Result) -> str:
+    settings = run.process.get("settings", {})
+    minutes, start = settings.get("minutes"), " from random weights" if settings.get("from_scratch") else ""
+    return (f"{minutes:g} min" if minutes is not None else f"{settings.get('steps')} steps") + start

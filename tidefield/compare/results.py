@@ -96,21 +96,22 @@ def figures_of(results: Results) -> list[dict[str, Any]]:
     ]
 
 
-def read_figures(files: Sequence[Path], scenes: Sequence[str], methods: Sequence[str]) -> Results:
+def read_figures(files: Sequence[Path], scenes: Sequence[str], methods: Sequence[str] | None = None) -> Results:
     """Read results that comparisons stored as JSON (`figures_of`); of a result in several files the last one counts.
 
     Args:
         files: comparison.json or ablation.json; missing files are skipped.
         scenes: the order of the tables' first scenes; other scenes follow by name.
-        methods: to read.
+        methods: to read; all if not given, in the order of the files.
     """
     found = {}
     for file in files:
         for one in (read_json(file) or {"results": []})["results"]:
-            if one["method"] in methods:
+            if methods is None or one["method"] in methods:
                 curve = [(float(x), float(y)) for x, y in one["curve"]]
                 found[one["scene"], one["method"]] = Result(one["evaluation"], one["process"], curve)
     there = {scene for scene, _ in found}
+    methods = tuple(dict.fromkeys(method for _, method in found)) if methods is None else methods
     order = (*(scene for scene in scenes if scene in there), *sorted(there - set(scenes)))
     pairs = [(scene, method) for scene in order for method in methods]
     return Results(order, tuple(methods), {pair: found[pair] for pair in pairs if pair in found})

@@ -13,6 +13,7 @@ started it, so the measuring process must stay small.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -32,8 +33,8 @@ from tidefield.machine import describe
 from tidefield.methods import METHODS
 from tidefield.processes import Ended, end_with_parent
 
-WHOLE, OTHER_SEED = "tidefield", "another-seed"
-"""Our network, and the same with another seed, for the noise of an ablation."""
+WHOLE = "tidefield"
+"""Our network, of which an ablation has variants."""
 WRITER_SECONDS = 120.0
 """More than a training needs to save, and a shared folder to release the lock of a machine that died."""
 RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
@@ -187,15 +188,15 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str], output:
 
 def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict[str, list[str]]:
     """The tidefield commands of a method, or of a variant of our network, on a scene, by name, in their order."""
-    kind, preset = _kind(method), METHODS[method].preset if method in METHODS else None
+    kind, (name, further) = _kind(method), variant_and_seed(method)
+    preset = METHODS[method].preset if method in METHODS else None
     device = ["--device", settings.device]
     width = [] if settings.width is None else ["--width", str(settings.width)]
     start = ["--from-scratch"] if settings.from_scratch else []
     if method in (WHOLE, "zero-shot"):
         preset = settings.preset
     if kind == "variant":
-        variant = [] if method == OTHER_SEED else ["--variant", method]
-        source = ["--preset", settings.preset, *variant, *start]
+        source = ["--preset", settings.preset, *([] if name == WHOLE else ["--variant", name]), *start]
     elif kind == "preset":
         variant = METHODS[method].variant
         source = ["--preset", str(preset), *(["--variant", variant] if variant else []), *start]
@@ -209,11 +210,22 @@ def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict
         budget = ["--minutes", f"{settings.minutes:g}", "--curve"]
     else:
         budget = ["--steps", str(settings.steps)]
-    seed = ["--seed", str(settings.seed + (method == OTHER_SEED))]
+    seed = ["--seed", str(settings.seed + further)]
     return {
         "train": ["train", str(scene), str(folder), *source, *budget, *width, *device, *seed],
         "evaluate": ["evaluate", str(folder), *device],
     }
+
+
+def of_seed(name: str, seed: int) -> str:
+    """The name, in a comparison, of a variant of our network with one of several seeds, counted from that of all."""
+    return f"{name}-seed-{seed}" if seed else name
+
+
+def variant_and_seed(method: str) -> tuple[str, int]:
+    """What `of_seed` made a name of."""
+    found = re.fullmatch(r"(.+)-seed-(\d+)", method)
+    return (found[1], int(found[2])) if found else (method, 0)
 
 
 def compare(
@@ -371,7 +383,7 @@ def _is_number(value: object) -> bool:
 
 
 def _kind(method: str) -> str:
-    """The kind of a method, or "variant" for variants of our network and for its other seed."""
+    """The kind of a method, or "variant" for variants of our network and for other seeds."""
     return METHODS[method].kind if method in METHODS else "variant"
 
 

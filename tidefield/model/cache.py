@@ -171,7 +171,7 @@ class FeatureCache:
     def _encode(self, block: Block, slot: int) -> None:
         colours, mask = self.pyramid.read(block.photograph, block.level)
         doubled = None
-        if self._cones and self.network.reads_doubled:
+        if self._cones and self.network.config.has("doubled photographs"):
             doubled = self.pyramid.read_doubled(block.photograph, block.level)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
         last = (_block_counts(size, self._block_px) - 1).clamp(min=1)

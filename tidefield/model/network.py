@@ -66,13 +66,9 @@ class Network(nn.Module, ABC):
         config: its configuration.
         grids: the rays of its passes, coarse to fine.
         fills_unseen: whether renderings are continued into pixels that no neighbour sees.
-        matches_surface: whether photographs are matched first, for the surface that its rays are searched around.
-        reads_doubled: whether `encode` makes use of photographs at twice the size.
     """
 
     fills_unseen = False
-    reads_doubled = False
-    matches_surface = False
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -134,14 +130,9 @@ class Network(nn.Module, ABC):
         )
 
 
-def network_class(config: NetworkConfig) -> type[Network]:
-    """The class of a configuration's network."""
+def make_network(config: NetworkConfig) -> Network:
+    """The network of a configuration, with random weights."""
     from tidefield.model.paper import PaperNetwork
     from tidefield.model.swift import SwiftNetwork
 
-    return {"paper": PaperNetwork, "swift": SwiftNetwork}[config.kind]
-
-
-def make_network(config: NetworkConfig) -> Network:
-    """The network of a configuration, with random weights."""
-    return network_class(config)(config)
+    return {"paper": PaperNetwork, "swift": SwiftNetwork}[config.kind](config)

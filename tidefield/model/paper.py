@@ -46,10 +46,10 @@ class PaperNetwork(Network):
         hidden, channels = self.rays.hidden, self.rays.feature_channels
         # The shipped weights have learned with displaced features (docs/method.md, section 2).
         self.encoder = Encoder(config.encoder, ((self.rays.feature_stride, channels),), aligned=False)
-        self.aggregate = Aggregate(channels, hidden, uniform_weights="direction weights" in config.without)
-        self.transformer = None if "ray transformer" in config.without else RayTransformer(hidden, config.heads)
+        self.aggregate = Aggregate(channels, hidden, uniform_weights=not config.has("direction weights"))
+        self.transformer = RayTransformer(hidden, config.heads) if config.has("ray transformer") else None
         self.density = nn.Linear(hidden, 1)
-        self.colour = ColourBlend(hidden, config.harmonics_degree, "target colour" in config.without)
+        self.colour = ColourBlend(hidden, config.harmonics_degree, not config.has("target colour"))
 
     def encode(
         self,

@@ -84,7 +84,7 @@ class Renderer:
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.cache = FeatureCache(network, scene, device, sampling.cones)
         self.matcher = None
-        if network.matches_surface:
+        if config.network.has("matched surface"):
             self.matcher = Matcher(scene, self.cache.pyramid, finer=True, device=device)
         self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)

@@ -68,8 +68,6 @@ class SwiftNetwork(Network):
     """Coarse and fine pass: features -> samples -> aggregation -> density; then colour and volume rendering."""
 
     fills_unseen = True
-    matches_surface = True
-    reads_doubled = True
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -81,9 +79,9 @@ class SwiftNetwork(Network):
                 for stride, c in channels.items()
             }
         )
-        self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5))
+        self.sharpen = nn.Parameter(torch.zeros(1, 1, 5, 5)) if config.has("sharpening") else None
         self.passes = nn.ModuleList(Pass(config, one, first=k == 0) for k, one in enumerate(config.passes))
-        neighbours_only = "target colour" in config.without
+        neighbours_only = not config.has("target colour")
         self.colour = AngularColourBlend(config.passes[-1].hidden, config.harmonics_degree, neighbours_only)
 
     def forward(
@@ -164,6 +162,8 @@ class SwiftNetwork(Network):
         Args:
             colours: of texels of which `step` are a pixel.
         """
+        if self.sharpen is None:
+            return colours
         padded = F.pad(colours, (2 * step,) * 4, mode="replicate")
         # One convolution of all channels is faster than one of each.
         each = torch.eye(3, device=colours.device)[:, :, None, None]
@@ -181,22 +181,23 @@ class Pass(nn.Module):
     def __init__(self, network: NetworkConfig, config: PassConfig, first: bool) -> None:
         super().__init__()
         hidden = config.hidden
-        uniform = "direction weights" in network.without
+        uniform = not network.has("direction weights")
         self.aggregate = ComparingAggregate(config.feature_channels, hidden, folded=True, uniform_weights=uniform)
-        self.transformer = None if "ray transformer" in network.without else RayTransformer(hidden, network.heads)
-        self.density = nn.Linear(hidden, 1)
+        self.transformer = RayTransformer(hidden, network.heads) if network.has("ray transformer") else None
+        self.density = nn.Linear(hidden, 1) if network.has("density head") else None
         self.prior_features = nn.Linear(3, hidden)
         self.agreement_features = nn.Linear(2, hidden)
         # At the start the surface is where the views agree and, in the first pass, within about two samples of where
         # it is expected (2 - 0.3 x^2 changes sign at x = 2.6); the network corrects it.
-        self.agreement = nn.Parameter(torch.tensor(3.0))
+        self.agreement = nn.Parameter(torch.tensor(3.0)) if network.has("agreement") else None
         self.prior_height = nn.Parameter(torch.tensor(2.0 if first else 0.0))
         self.prior_steepness = nn.Parameter(torch.tensor(0.3 if first else 0.0))
         self.single_view_steepness = nn.Parameter(torch.tensor(10.0 if first else 0.0))
         # Of there being no surface, where a scene may be empty: as likely as one in a single sample of usual score.
         self.empty = nn.Parameter(torch.tensor(-math.log(config.samples)))
-        nn.init.zeros_(self.density.weight)
-        nn.init.zeros_(self.density.bias)
+        if self.density is not None:
+            nn.init.zeros_(self.density.weight)
+            nn.init.zeros_(self.density.bias)
 
     def weights(self, evidence: Evidence, samples: Samples, intervals: Intervals, opaque: bool) -> Weights:
         """How much each sample contributes to its ray.
@@ -213,7 +214,10 @@ class Pass(nn.Module):
         x, score = self._prior(evidence.density.unflatten(1, rays[1:]), samples, intervals, degrees, agreement)
         if self.transformer is not None:
             x = self.transformer(*(t.flatten(0, 1) for t in (x, samples.s, valid))).unflatten(0, rays[:2])
-        score = score + agreement + self.density(x)[..., 0] + widths(samples.s).log()
+        score = score + agreement
+        if self.density is not None:
+            score = score + self.density(x)[..., 0]
+        score = score + widths(samples.s).log()
         empty = None if opaque else self.empty
         likely = surface_shares(score, empty)
         delta = samples.delta
@@ -233,6 +237,8 @@ class Pass(nn.Module):
         elsewhere. The logarithm of the likelihood ratio grows with k - 1, so a single view, which always agrees with
         itself, says nothing.
         """
+        if self.agreement is None:
+            return torch.zeros_like(degrees)
         variance = self.aggregate.disagreement(evidence).unflatten(1, degrees.shape[1:])
         log_variance = torch.log(variance + COLOUR_NOISE)
         # The floor keeps rays that no two views see at 0.

@@ -267,7 +267,7 @@ class SceneTrainer(Trainer):
         return super().random_state if self._ahead is None else self._ahead[0]
 
     def prepare(self, progress: Progress | None = None) -> None:
-        if not self._prepared and self.network.reads_doubled:
+        if not self._prepared and self.network.config.has("doubled photographs"):
             self._doubled = at_twice_the_size(self.scene, progress)
         self._prepared = True
 
@@ -286,7 +286,7 @@ class SceneTrainer(Trainer):
             whole, targets = len(self.areas) == 1, self.areas[number]
             area = (Area if whole else select)(self.scene, targets, self._doubled)
             match = None
-            if self.network.matches_surface:
+            if self.network.config.has("matched surface"):
                 match = Matcher(area.scene, most_px=MATCHED_PX, finer=True, device=self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match))
         return self._open

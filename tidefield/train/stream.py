@@ -28,7 +28,6 @@ from tidefield.data.load import at_width, load_scene
 from tidefield.data.matching import Matcher
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.network import network_class
 from tidefield.processes import start_worker
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
@@ -198,7 +197,7 @@ class Stream:
         self.folder, self.seed = folder, seed
         widths = WHOLE_WIDTHS if config.train.crop_px is None else WIDTHS
         self.real = [scene for path in real for scene in at_several_widths(path, widths)]
-        self.matches_surface = network_class(config.network).matches_surface
+        self.network = config.network
         self.pool: dict[int, Drawn] = {}
         self.pending: dict[int, Future[None]] = {}
         # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
@@ -261,7 +260,8 @@ class Stream:
         shading = scene.cameras.shading
         shading = None if shading is None else shading[:, :, own.channels]
         cameras = replace(scene.cameras, principal_px=principal, gain=gain, shading=shading)
-        points = scene.points if own.points_share else None
+        observed = scene.points if self.network.has("sparse points") else None
+        points = observed if own.points_share else None
         if points is not None and own.points_share < 1:
             points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))
         photographs = scene.photographs
@@ -270,5 +270,5 @@ class Stream:
                 photographs, colours=tuple(c[..., own.channels] for c in photographs.colours), files=()
             )
         augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
-        match = Matcher(augmented) if self.matches_surface else None
-        return Drawn(augmented, DepthPriors(augmented, scene.points, match), cameras)
+        match = Matcher(augmented) if self.network.has("matched surface") else None
+        return Drawn(augmented, DepthPriors(augmented, observed, match), cameras)
