@@ -123,7 +123,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
         "| caliterra, tidefield | 10.0 | 1,234 | 2.00 | 50,000 | 2.00, 2.00 |",
         "    tidefield evaluate RUN tidefield",
         "No lpips_alex: no weights.",
-        "| no-ray-transformer | 26.00 | 26.00 | 0.6500 | 0.1000 | 50,000 | -1.00 |",
+        "| no-ray-transformer | 1 | -1.00 | -1.00 | -0.0250 | +0.0000 | 1.00 | 1.00 |",
         "- The column `paper` began with random weights and was trained for 1,234 steps.",
         "- The column `zero-shot` has trained weights as they are, without a step on the scene.",
         "| IBRNet (Wang et al., CVPR 2021) | LLFF | 25.13 | 26.73 | 1.60 |",
