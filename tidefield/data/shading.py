@@ -201,7 +201,11 @@ class _Model:
         back = sparse.csr_array((sparse.diags_array(to_mean) @ sums).T)
         products = self.design.T @ (sparse.diags_array(weight) @ self.design)
         right = self.design.T @ (weight[:, None] * self.value) - back @ (to_points @ self.value)
-        eliminated = back.toarray() @ sums.toarray() if len(right) <= MOST_DENSE else None
+        eliminated = None
+        if len(right) <= MOST_DENSE:
+            # A matrix times its own transpose takes half the time of two matrices' product.
+            root = (sparse.diags_array(np.sqrt(to_mean)) @ sums).toarray()
+            eliminated = root.T @ root
         return _Equations(sparse.csr_array(products), sums, back, right, eliminated)
 
     def solve(
