@@ -1,6 +1,7 @@
 """Scenes with cameras and points only: a survey, a forward-facing capture, an object."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,10 +39,11 @@ def scene_of(position: Tensor, forward: Tensor, image_up: Tensor, near_far=(2.0,
     return Scene(Path("nowhere"), names, cameras, blank, points, everyone, (), torch.zeros(3, dtype=torch.float64))
 
 
-def survey(rows: int = 3, every: int = 1) -> Scene:
-    """Boustrophedon nadir flight at 40 above a flat ground; the drone keeps its heading.
+def survey(rows: int = 3, every: int = 1, turned: Sequence[int] = ()) -> Scene:
+    """Boustrophedon nadir flight at 40 above a flat ground; the drone keeps its heading but on `turned` lines.
 
-    One photograph every 5 along lines 12 apart, of which `every` one in so many is kept.
+    One photograph every 5 along lines 12 apart, of which `every` one in so many is kept. On turned lines the heading is
+    to the side.
     """
     lines = [
         torch.stack([torch.arange(13) * 5.0, torch.full((13,), 12.0 * r), torch.full((13,), 40.0)], 1)
@@ -55,7 +57,9 @@ def survey(rows: int = 3, every: int = 1) -> Scene:
         ],
         1,
     )
-    scene = scene_of(position, torch.tensor([0.0, 0.0, -1.0]), torch.tensor([0.0, 1.0, 0.0]), (20.0, 56.0))
+    side = torch.isin((position[:, 1] / 12).round().long(), torch.tensor(turned, dtype=torch.long))
+    heading = torch.where(side[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+    scene = scene_of(position, torch.tensor([0.0, 0.0, -1.0]), heading, (20.0, 56.0))
     xyz = ground @ TILT.T
     uv, z = scene.cameras.project(xyz)
     seen = (z > 0) & (uv > 0).all(-1) & (uv < torch.tensor([400.0, 300.0])).all(-1)

@@ -30,9 +30,9 @@ def planted() -> Tensor:
     return shading
 
 
-def observed(shading: Tensor | None) -> tuple[Tensor, Cameras, SparsePoints]:
+def observed(shading: Tensor | None, turned: tuple[int, ...] = ()) -> tuple[Tensor, Cameras, SparsePoints]:
     """Log colours of all observations in a light; cameras that know nothing of it; and the points."""
-    scene = survey()
+    scene = survey(turned=turned)
     points = scene.points
     assert points is not None
     generator = torch.Generator().manual_seed(2)
@@ -58,6 +58,12 @@ def seen_in(which: tuple[int, ...], value: Tensor, points: SparsePoints) -> Seen
     return all_seen.part(np.isin(np.arange(len(value)), row))
 
 
+def directions(cameras: Cameras, points: SparsePoints) -> np.ndarray:
+    """Of the view of every observation, across the mean optical axis."""
+    ray = points.xyz_world[points.point_index] - cameras.position_world[points.camera_index]
+    return torch.nn.functional.normalize(ray, dim=1).double().numpy() @ across_views(cameras, TRAIN)
+
+
 def differences(value: Tensor, points: SparsePoints, which: tuple[int, ...]) -> float:
     """How much photographs differ from the training photographs in the points' colours, but for their means."""
     train = torch.isin(points.camera_index, torch.tensor(TRAIN))
@@ -76,6 +82,19 @@ def test_the_light_is_found_and_foretold_for_held_out_photographs(caplog: pytest
     assert differences(even, points, TRAIN) < 1.3 * NOISE
     assert differences(even, points, HELD_OUT) < 0.6 * differences(value, points, HELD_OUT)
     assert "applied" in caplog.text
+
+
+def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings():
+    value, cameras, points = observed(None, turned=(1,))
+    direction = directions(cameras, points)
+    along, across = direction.T
+    # Such as grass, brightest where its blades hide their shadows.
+    value += torch.from_numpy(0.6 * (along + 0.4 * across) ** 2)[:, None].float()
+    seen = replace(seen_in(TRAIN, value, points), direction=direction[np.isin(points.camera_index, TRAIN)])
+    found = estimate_shading(seen, cameras, points, LENSES, TRAIN)
+    even = value - light(cameras, points, found)
+    assert differences(value, points, HELD_OUT) > 2 * NOISE
+    assert differences(even, points, HELD_OUT) < 1.15 * NOISE
 
 
 def test_forming_the_normal_matrix_and_iterating_find_the_same(monkeypatch: pytest.MonkeyPatch):
@@ -151,7 +170,6 @@ def test_what_depends_on_the_direction_is_a_polynomial_over_each_frame():
     by_direction = np.array([[0.3, 0.2, 0.1], [-0.1, 0.0, 0.2]])
     shading = directional_shading(scene.cameras, TRAIN, by_direction)
     found = light(scene.cameras, points, shading) - light(scene.cameras, points, None)
-    ray = points.xyz_world[points.point_index] - scene.cameras.position_world[points.camera_index]
-    direction = torch.nn.functional.normalize(ray, dim=1).double().numpy() @ across_views(scene.cameras, TRAIN)
+    direction = directions(scene.cameras, points)
     assert np.ptp(direction @ by_direction) > 0.1
     np.testing.assert_allclose(found.numpy(), direction @ by_direction, atol=3e-3)

@@ -2,17 +2,19 @@
 
 docs/method.md, section 12. Photograph i shows sparse point p at x, in the plane z = 1, as
 
-    log I_ip = g_i + s_l(x) + t_i(x) + a_p:
+    log I_ip = g_i + q(d) + s_l(x) + t_i(x) + a_p:
 
-the point's own colour a_p, the photograph's gain g_i (`exposure`), a polynomial s of degree 4 that all photographs of
-one lens share (vignetting, and light that comes from one side all through the flight), and a polynomial t of degree 3
-of the photograph's own (clouds, the sun and what mirrors it). Consecutive photographs with one heading have similar
-t_i, and so a held-out photograph's comes from its neighbours, never from its pixels.
+the point's own colour a_p, the photograph's gain g_i (`exposure`), a quadratic form q of the direction of view d that
+all photographs share (grass is brightest where its blades hide their shadows), a polynomial s of degree 4 that all
+photographs of one lens share (vignetting, and light that comes from one side all through the flight), and a polynomial
+t of degree 3 of the photograph's own (clouds, the sun and what mirrors it). Consecutive photographs with one heading
+have similar t_i, and so a held-out photograph's comes from its neighbours, never from its pixels.
 
 How much photographs differ is chosen by what it explains in photographs that are left out, and nothing is changed
 unless it explains some of each.
 
-Alphabet: V photographs, O observations of sparse points, K coefficients of a polynomial, N unknowns.
+Alphabet: V photographs, O observations of sparse points, K coefficients of a polynomial, D of the
+direction, N unknowns.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ from tidefield.geometry.cameras import SHADING_DEGREE, Cameras, monomials
 
 OWN_DEGREE = 3
 """Degree of a photograph's own polynomial."""
-OWN_TERMS = (OWN_DEGREE + 1) * (OWN_DEGREE + 2) // 2
+OWN_TERMS, SQUARES = (OWN_DEGREE + 1) * (OWN_DEGREE + 2) // 2, 3
+"""Numbers of a photograph's own terms, and of products of two components of the direction of view."""
 SPREADS = (0.003, 0.01, 0.03)
 """Standard deviations of a linear term among photographs to choose from, natural logarithms. Terms of degree d have
 this over d."""
@@ -114,18 +117,20 @@ def estimate_shading(
     for _ in range(ROUNDS - 1):
         weight, noise = huber_weights(seen.centred(model.value - model.design @ found, weight))
         found = model.solve(SPREADS[best], noise, model.equations(weight), found)
-    return model.polynomials(found)
+    of_direction = np.concatenate([np.zeros((2, 3)), found[-SQUARES:] / model.deviation[:, None]])
+    return model.polynomials(found) + directional_shading(cameras, train, of_direction)
 
 
 def directional_shading(
-    cameras: Cameras, train: Sequence[int], by_direction: Float64[np.ndarray, "2 3"]
+    cameras: Cameras, train: Sequence[int], by_direction: Float64[np.ndarray, "D 3"]
 ) -> Float[Tensor, "V K 3"]:
     """The shading (`Cameras.shading`) of what depends on the direction of view alone: a polynomial over each frame.
 
     Args:
         cameras: of the photographs.
         train: the training photographs.
-        by_direction: of `exposure.estimate_gains`.
+        by_direction: factors of the two components of the direction (`exposure.estimate_gains`), and, if there are
+            five, of their products (`_squares`).
     """
     to_world = cameras.T_world_camera[:, :, :3].double().numpy()
     across = to_world.transpose(0, 2, 1) @ across_views(cameras, train)  # in the cameras' axes
@@ -137,24 +142,33 @@ def directional_shading(
         size, focal, principal = frame.split(2)
         xy = (share * size - principal) / focal
         ray = torch.nn.functional.normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], 1), dim=1).numpy()
-        to_polynomial = np.linalg.pinv(monomials(xy, SHADING_DEGREE).numpy()) @ ray
+        to_polynomial = np.linalg.pinv(monomials(xy, SHADING_DEGREE).numpy())
         same = (frames == frame).all(1).numpy()
-        found[same] = to_polynomial @ across[same] @ by_direction
+        direction = ray @ across[same]
+        terms = np.concatenate([direction, _squares(direction)], axis=-1)[..., : len(by_direction)]
+        found[same] = to_polynomial @ (terms @ by_direction)
     return torch.from_numpy(found).float()
+
+
+def _squares(direction: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 3"]:
+    x, y = direction[..., 0], direction[..., 1]
+    return np.stack([x * x, x * y, y * y], axis=-1)
 
 
 @dataclass(frozen=True)
 class _Model:
-    """Log colours as linear functions of the photographs' and lenses' terms, which are orthonormal on the observations.
+    """Log colours as linear functions of unknowns: terms of the photographs and lenses, which are orthonormal on the
+    observations, and of the direction.
 
     Attributes:
         seen: the observations.
         value: their log colours at the common exposure.
         design: derivative of the values with respect to the unknowns: OWN_TERMS of each photograph, then those of the
-            lenses.
+            lenses, then SQUARES of the direction.
         prior: inverse covariance of the unknowns of the photographs, at a spread of 1.
         to_monomials: from coefficients of the orthonormal terms to those of monomials.
         lens: of each photograph.
+        deviation: standard deviation of the direction's products, which are divided by it.
     """
 
     seen: Seen
@@ -163,6 +177,7 @@ class _Model:
     prior: sparse.csr_array
     to_monomials: Float64[np.ndarray, "K K"]
     lens: Int64[np.ndarray, " V"]
+    deviation: Float64[np.ndarray, "3"]
 
     @staticmethod
     def of(
@@ -177,7 +192,11 @@ class _Model:
         names = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
         lens = np.array([names[own] for own in lenses])
         own, shared = terms[:, :OWN_TERMS], terms[:, 1:]
-        design = sparse.hstack([_blocks(own, photograph, count), _blocks(shared, lens[photograph], len(names))])
+        squares = _squares(seen.direction)
+        deviation = np.maximum(squares.std(0), 1e-9)
+        of_direction = sparse.csr_array((squares - squares.mean(0)) / deviation)
+        of_frames = _blocks(own, photograph, count), _blocks(shared, lens[photograph], len(names))
+        design = sparse.hstack([*of_frames, of_direction])
         chain = _chain(cameras, in_sequence(exposure_and_clock(metadata, count)[1], np.arange(count)))
         degree = np.repeat(np.arange(OWN_DEGREE + 1), np.arange(OWN_DEGREE + 1) + 1)
         precision = np.maximum(degree, 1.0) ** 2
@@ -191,6 +210,7 @@ class _Model:
             prior=sparse.csr_array(sparse.kron(chain, sparse.diags_array(precision))),
             to_monomials=to_monomials,
             lens=lens,
+            deviation=deviation,
         )
 
     def equations(self, weight: Float64[np.ndarray, " O"]) -> _Equations:
@@ -252,10 +272,11 @@ class _Model:
         return float(np.where(size < HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
 
     def polynomials(self, unknowns: Float64[np.ndarray, "N 3"]) -> Float[Tensor, "V K 3"]:
+        """Shading of the photographs' and lenses' terms."""
         count, own = len(self.lens), OWN_TERMS * len(self.lens)
         coefficients = np.zeros((count, len(self.to_monomials), 3))
         coefficients[:, :OWN_TERMS] = unknowns[:own].reshape(count, -1, 3)
-        coefficients[:, 1:] += unknowns[own:].reshape(-1, len(self.to_monomials) - 1, 3)[self.lens]
+        coefficients[:, 1:] += unknowns[own:-SQUARES].reshape(-1, len(self.to_monomials) - 1, 3)[self.lens]
         return torch.from_numpy(self.to_monomials @ coefficients).float()
 
 
