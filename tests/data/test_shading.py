@@ -81,10 +81,12 @@ def test_the_light_is_found_and_foretold_for_held_out_photographs(caplog: pytest
     assert differences(value, points, TRAIN) > 0.03
     assert differences(even, points, TRAIN) < 1.3 * NOISE
     assert differences(even, points, HELD_OUT) < 0.6 * differences(value, points, HELD_OUT)
+    assert "without the direction's squares" in caplog.text
     assert "applied" in caplog.text
 
 
-def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings():
+def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings(caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.DEBUG, "tidefield")
     value, cameras, points = observed(None, turned=(1,))
     direction = directions(cameras, points)
     along, across = direction.T
@@ -95,6 +97,7 @@ def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings()
     even = value - light(cameras, points, found)
     assert differences(value, points, HELD_OUT) > 2 * NOISE
     assert differences(even, points, HELD_OUT) < 1.15 * NOISE
+    assert "with the direction's squares" in caplog.text
 
 
 def test_forming_the_normal_matrix_and_iterating_find_the_same(monkeypatch: pytest.MonkeyPatch):

@@ -14,7 +14,7 @@ How much photographs differ is chosen by what it explains in photographs that ar
 unless it explains some of each.
 
 Alphabet: V photographs, O observations of sparse points, K coefficients of a polynomial, D of the
-direction, N unknowns.
+direction, N unknowns, F folds.
 """
 
 from __future__ import annotations
@@ -104,21 +104,33 @@ def estimate_shading(
         whole = model.solve(spread, noise, everything, whole)
         row[:] = [model.cost(model.solve(spread, noise, without[k], whole), fold == k, noise) for k in range(FOLDS)]
     best = int(costs.sum(1).argmin())
-    helps = bool((costs[best] < (1 - LEAST_GAIN) * none).all())
+    spread, cost = SPREADS[best], costs[best]
+    plain = [model.solve(spread, noise, without[k], whole, squares=False) for k in range(FOLDS)]
+    less = np.array([model.cost(plain[k], fold == k, noise) for k in range(FOLDS)])
+    squares = _helps(cost, less)
+    cost = cost if squares else less
+    helps = _helps(cost, none)
     _log.debug(
-        "shading with a spread of %.1f%%: left-out photographs' differences cost %.1f%% less: %s",
-        100 * SPREADS[best],
-        100 * (1 - costs[best].sum() / none.sum()),
+        "shading with a spread of %.1f%%, %s the direction's squares: left-out photographs' differences cost %.1f%% "
+        "less: %s",
+        100 * spread,
+        "with" if squares else "without",
+        100 * (1 - cost.sum() / none.sum()),
         "applied" if helps else "not applied",
     )
     if not helps:
         return None
-    found = model.solve(SPREADS[best], noise, everything, whole)
+    found = model.solve(spread, noise, everything, whole, squares)
     for _ in range(ROUNDS - 1):
         weight, noise = huber_weights(seen.centred(model.value - model.design @ found, weight))
-        found = model.solve(SPREADS[best], noise, model.equations(weight), found)
+        found = model.solve(spread, noise, model.equations(weight), found, squares)
     of_direction = np.concatenate([np.zeros((2, 3)), found[-SQUARES:] / model.deviation[:, None]])
     return model.polynomials(found) + directional_shading(cameras, train, of_direction)
+
+
+def _helps(cost: Float64[np.ndarray, " F"], without: Float64[np.ndarray, " F"]) -> bool:
+    """Whether what left-out photographs cost is less in every fold."""
+    return bool((cost < (1 - LEAST_GAIN) * without).all())
 
 
 def directional_shading(
@@ -234,12 +246,17 @@ class _Model:
         noise: float,
         equations: _Equations,
         start: Float64[np.ndarray, "N 3"] | None = None,
+        squares: bool = True,
     ) -> Float64[np.ndarray, "N 3"]:
         """Find the most probable unknowns.
 
         Args:
             start: unknowns near the solution, from which an iterative solution starts.
+            squares: whether there is something quadratic in the direction; 0 without.
         """
+        if not squares:
+            first = None if start is None else start[:-SQUARES]
+            return np.pad(self.solve(spread, noise, equations.without_last(SQUARES), first), ((0, SQUARES), (0, 0)))
         own, right = OWN_TERMS * len(self.lens), equations.right
         ridge = sparse.diags_array(SHARED_RIDGE * equations.products.diagonal()[own:] + 1e-9)
         prior = sparse.block_diag([self.prior * (noise / spread) ** 2, ridge])
@@ -297,6 +314,16 @@ class _Equations:
     back: sparse.csr_array
     right: Float64[np.ndarray, "N 3"]
     eliminated: Float64[np.ndarray, "N N"] | None
+
+    def without_last(self, count: int) -> _Equations:
+        """Those of all but the last unknowns, which are 0."""
+        rest = slice(-count)
+        products, sums, back = self.products[rest, rest], self.sums[:, rest], self.back[rest]
+        return _Equations(
+            *(sparse.csr_array(matrix) for matrix in (products, sums, back)),
+            right=self.right[rest],
+            eliminated=None if self.eliminated is None else self.eliminated[rest, rest],
+        )
 
 
 def _blocks(terms: Float64[np.ndarray, "O K"], group: Int64[np.ndarray, " O"], count: int) -> sparse.csr_array:
