@@ -236,7 +236,7 @@ class _Model:
         eliminated = None
         if len(right) <= MOST_DENSE:
             # A matrix times its own transpose takes half the time of two matrices' product.
-            root = (sparse.diags_array(np.sqrt(to_mean)) @ sums).toarray()
+            root = np.sqrt(to_mean)[:, None] * sums.toarray()
             eliminated = root.T @ root
         return _Equations(sparse.csr_array(products), sums, back, right, eliminated)
 
