@@ -117,10 +117,7 @@ def write_page(
     Raises:
         RunError: when there is no measurement at all.
     """
-    compared, ablated = (
-        read_figures(comparison, SCENES, names()),
-        read_figures(ablation, SCENES),
-    )
+    compared, ablated = read_figures(comparison, SCENES, names()), read_figures(ablation, SCENES)
     others = [read_figures([file], SCENES, (WHOLE,)) for file in lengths]
     sized = by_width(widths)
     files = (SPEED_FILE, MEMORY_FILE, FRAMES_FILE, depth.DEPTH_FILE, points.POINTS_FILE, paper_parts.PARTS_FILE)

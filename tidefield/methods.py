@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -120,7 +120,7 @@ def make_trainer(
         return NerfTrainer(config, scene, seed, device)
     from tidefield.train.loop import SceneTrainer
 
-    return SceneTrainer(config, given(config, scene), seed, device, weights)
+    return SceneTrainer(config, scene, seed, device, weights)
 
 
 def zero_shot(
@@ -138,12 +138,7 @@ def zero_shot(
     network = make_network(config.network).to(device)
     read_weights(weights, network)
     network.eval()
-    return Renderer(network, given(config, scene), config, device, sampling), weights_sha256(weights)
-
-
-def given(config: Config, scene: Scene) -> Scene:
-    """The scene as a preset or one of its variants is given it."""
-    return scene if config.network.has("sparse points") else replace(scene, points=None)
+    return Renderer(network, scene, config, device, sampling), weights_sha256(weights)
 
 
 @contextmanager

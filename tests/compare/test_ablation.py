@@ -153,6 +153,11 @@ def test_a_variant_of_a_variant_is_compared_with_that_one(flats: Scene):
     assert pointless.title.startswith("Of no-sparse-points: ")
 
 
+def test_a_variant_of_what_was_not_measured_has_no_difference(flats: Scene):
+    (table,) = ablation_tables(results(flats, {"flats": {"no-agreement+views-2": 27.0}}))
+    assert [row[:4] for row in table.rows] == [["no-agreement", "0", "-", "-"], ["no-agreement+views-2", "1", "-", "-"]]
+
+
 def test_the_summary_names_what_has_no_effect_on_any_scene(flats: Scene):
     psnr = {
         "flats": {

@@ -13,7 +13,7 @@ from tidefield.data.neighbours import Neighbours
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
-from tidefield.methods import given, make_trainer
+from tidefield.methods import make_trainer
 from tidefield.model.cache import FeatureCache
 from tidefield.model.network import Network, TileRendering
 from tidefield.model.renderer import Renderer, in_turn
@@ -80,8 +80,7 @@ def test_without_a_part_the_network_is_finite_and_renders_something_else(part: P
     with torch.inference_mode():
         camera = at.cameras[TARGET]
         one, other = (
-            Renderer(each.eval(), given(config, at), config, CPU)(camera).colour
-            for each, config in ((own, without), (whole, SWIFT))
+            Renderer(each.eval(), at, config, CPU)(camera).colour for each, config in ((own, without), (whole, SWIFT))
         )
     assert (one - other).abs().max() > 1e-4
 

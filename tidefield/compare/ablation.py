@@ -7,7 +7,7 @@ the last of them: `no-sparse-points+no-agreement` with `no-sparse-points`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -58,20 +58,20 @@ def variants(chosen: Sequence[str], preset: str, seeds: int) -> tuple[str, ...]:
 
 def ablation_tables(results: Results) -> list[Table]:
     """One table of all scenes for each network that has variants."""
+    runs = _by_variant(results)
     groups: dict[str, list[str]] = {}
-    for name in _names(results):
+    for name in _names(runs):
         if name != WHOLE:
             groups.setdefault(_base(name), []).append(name)
-    measured = {scene for scene, _ in results.by}
-    scenes = [scene for scene in results.scenes if scene in measured]
-    return [_table(results, base, names, scenes) for base, names in groups.items()]
+    return [_table(runs, base, names) for base, names in groups.items()]
 
 
 def summarise(results: Results) -> list[str]:
     """What the tables show together, as sentences: which parts matter, and which bring nothing."""
+    runs = _by_variant(results)
     groups: dict[str, list[str]] = {}
-    for name in _names(results):
-        differences = (difference(results, scene, name) for scene in results.scenes)
+    for name in _names(runs):
+        differences = (_difference(of, name) for of in runs.values())
         found = {one.effect for one in differences if one is not None}
         beyond = found - {WITHIN}
         if found and len(beyond) < 2:
@@ -97,64 +97,75 @@ def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path
     ]
 
 
-def difference(results: Results, scene: str, name: str) -> Difference | None:
-    """PSNR against what it is a variant of; None where either was not measured, and for the whole network."""
-    if name == WHOLE:
-        return None
-    own, other = (_values(results, scene, each) for each in (name, _base(name)))
-    if not own or not other:
-        return None
-    spread = _spread(results, scene)
-    error = None if spread is None else spread * math.sqrt(1 / len(own) + 1 / len(other))
-    return Difference(fmean(own) - fmean(other), error)
+_Runs = dict[str, list[Result]]
+"""The runs of each variant on one scene, one for each seed; of all variants, in the order of the results."""
 
 
-def _spread(results: Results, scene: str) -> float | None:
-    """Standard deviation of results of one variant with different seeds, over all variants."""
-    squares, freedom = 0.0, 0
-    for name in _names(results):
-        values = _values(results, scene, name)
-        squares += sum((value - fmean(values)) ** 2 for value in values)
-        freedom += max(0, len(values) - 1)
-    return math.sqrt(squares / freedom) if freedom else None
+def _by_variant(results: Results) -> dict[str, _Runs]:
+    """What was measured, by scene, in the order of the results."""
+    there = {method for _, method in results.by}
+    names = dict.fromkeys(variant_and_seed(method)[0] for method in results.methods if method in there)
+    measured = {scene for scene, _ in results.by}
+    runs: dict[str, _Runs] = {s: {name: [] for name in names} for s in results.scenes if s in measured}
+    for scene, of in runs.items():
+        for method in results.methods:
+            if (scene, method) in results.by:
+                of[variant_and_seed(method)[0]].append(results.by[scene, method])
+    return runs
+
+
+def _names(runs: Mapping[str, _Runs]) -> list[str]:
+    return list(dict.fromkeys(name for of in runs.values() for name in of))
 
 
 def _base(name: str) -> str:
     return name.rpartition("+")[0] or WHOLE
 
 
-def _names(results: Results) -> list[str]:
-    """Variants that were measured anywhere, in the order of the results."""
-    return list(dict.fromkeys(variant_and_seed(m)[0] for m in results.methods if any(m == x for _, x in results.by)))
+def _difference(runs: _Runs, name: str) -> Difference | None:
+    """PSNR against what it is a variant of; None where either was not measured, and for the whole network."""
+    if name == WHOLE:
+        return None
+    own, other = (_values(runs, each) for each in (name, _base(name)))
+    if not own or not other:
+        return None
+    spread = _spread(runs)
+    error = None if spread is None else spread * math.sqrt(1 / len(own) + 1 / len(other))
+    return Difference(fmean(own) - fmean(other), error)
 
 
-def _runs(results: Results, scene: str, name: str) -> list[Result]:
-    of = (m for m in results.methods if variant_and_seed(m)[0] == name)
-    return [results.by[scene, method] for method in of if (scene, method) in results.by]
+def _spread(runs: _Runs) -> float | None:
+    """Standard deviation of results of one variant with different seeds, over all variants."""
+    squares, freedom = 0.0, 0
+    for name in runs:
+        values = _values(runs, name)
+        squares += sum((value - fmean(values)) ** 2 for value in values)
+        freedom += max(0, len(values) - 1)
+    return math.sqrt(squares / freedom) if freedom else None
 
 
-def _values(results: Results, scene: str, name: str) -> list[float]:
-    values = (run.metric(PSNR) for run in _runs(results, scene, name))
+def _values(runs: _Runs, name: str) -> list[float]:
+    values = (run.metric(PSNR) for run in runs.get(name, ()))
     return [value for value in values if value is not None]
 
 
-def _table(results: Results, base: str, names: Sequence[str], scenes: Sequence[str]) -> Table:
+def _table(runs: Mapping[str, _Runs], base: str, names: Sequence[str]) -> Table:
     """What variants change: PSNR on each scene, and means over the scenes of a variant of what else is measured, speeds
     relative to those of the network that it is a variant of."""
 
     def row(name: str) -> list[str]:
-        cells = [name, str(max(len(_runs(results, scene, name)) for scene in scenes))]
-        for scene in scenes:
-            found = difference(results, scene, name) if name != base else None
-            value = _mean([run.metric(PSNR) for run in _runs(results, scene, name)])
+        cells = [name, str(max(len(of.get(name, ())) for of in runs.values()))]
+        for of in runs.values():
+            found = _difference(of, name) if name != base else None
+            value = _mean(_values(of, name))
             effect = NOTHING if found is None else f"{found}{', noise' if found.effect == WITHIN else ''}"
             cells.append(shown(value, "{:.2f}") if name == base else effect)
-        both = [scene for scene in scenes if _runs(results, scene, name) and _runs(results, scene, base)]
+        both = [of for of in runs.values() if of.get(name) and of.get(base)]
 
-        def means(of: Callable[[Result], float | None]) -> Iterator[float | None]:
+        def means(measure: Callable[[Result], float | None]) -> Iterator[float | None]:
             """Over these scenes, of the variant and of what it is a variant of."""
             for each in (name, base):
-                yield _mean([_mean([of(run) for run in _runs(results, scene, each)]) for scene in both])
+                yield _mean([_mean([measure(run) for run in of[each]]) for of in both])
 
         for metric, _, style in _METRICS:
             value, usual = means(lambda run, metric=metric: run.metric(metric))
@@ -167,9 +178,9 @@ def _table(results: Results, base: str, names: Sequence[str], scenes: Sequence[s
             cells.append(NOTHING if value is None or not usual else f"{value / usual:.2f}")
         return cells
 
-    budgets = {_budget(run) for scene in scenes for name in (base, *names) for run in _runs(results, scene, name)}
+    budgets = {_budget(run) for of in runs.values() for name in (base, *names) for run in of.get(name, ())}
     title = f"Of {base}: {' or '.join(sorted(budgets))}, doubly seen pixels, after the colour fit"
-    columns = ["variant", "seeds", *scenes, *(f"mean: {metric}" for _, metric, _ in _METRICS)]
+    columns = ["variant", "seeds", *runs, *(f"mean: {metric}" for _, metric, _ in _METRICS)]
     return Table(title, [*columns, "training, times as fast", "rendering, times as fast"], [*map(row, (base, *names))])
 
 

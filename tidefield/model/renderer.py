@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -62,6 +62,11 @@ class _Piece:
     detail: Float[Tensor, "T R"]
 
 
+def as_given(scene: Scene, config: Config) -> Scene:
+    """What a preset, or a variant of it, is given of a scene: not the sparse points where it does without."""
+    return scene if config.network.has("sparse points") else replace(scene, points=None)
+
+
 class Renderer:
     """Renders views of one scene with a network.
 
@@ -81,6 +86,7 @@ class Renderer:
         device: torch.device,
         sampling: Sampling = USUAL_SAMPLING,
     ) -> None:
+        scene = as_given(scene, config)
         self.network, self.scene, self.config, self.device = network, scene, config, device
         self.cache = FeatureCache(network, scene, device, sampling.cones)
         self.matcher = None

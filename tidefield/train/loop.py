@@ -30,7 +30,7 @@ from tidefield.device import choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network, make_network
-from tidefield.model.renderer import Renderer
+from tidefield.model.renderer import Renderer, as_given
 from tidefield.model.rendering import Render, Rendering
 from tidefield.processes import STOPPING, handled
 from tidefield.progress import ProgressBar
@@ -205,6 +205,7 @@ class SceneTrainer(Trainer):
         weights: Path | None = None,
         areas: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
+        scene = as_given(scene, config)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = make_network(config.network).to(device)
