@@ -23,7 +23,7 @@ COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", 
 ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
 STRICT_400 = tuple(MEASURED / f"strict_400{rest}.json" for rest in ("", "_scenes"))
 WIDTHS = (*STRICT_400, *(MEASURED / f"strict_{width}.json" for width in (800, 1600)))
-LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("seconds", "minute", "minute_scratch", "scratch"))
+LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("minute", "scratch"))
 DESCRIPTION = """Measure speed, views, memory, surveys and robustness, and write the pages of results. Without a name,
 it is speed. `tidefield compare` and `tidefield ablate` measure quality.
 
@@ -773,7 +773,7 @@ def table(
     Args:
         comparison: Files of `tidefield compare`; of a result in several files the last one counts.
         ablation: Files of `tidefield ablate`, likewise.
-        lengths: Files of `tidefield compare` with other lengths of training, and from scratch.
+        lengths: Files of `tidefield compare` at 400 px with other lengths of training, and from scratch.
         widths: Files of `tidefield compare` with the scenes at several widths.
         runs: Folder of speed, frames, memory, depth, points and parts.
         out: The Markdown file to write; replaced if it is there.

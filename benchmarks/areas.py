@@ -20,7 +20,7 @@ import torch
 
 from tidefield.compare.run import Runner, run_measured, tidefield
 from tidefield.compare.tables import Table
-from tidefield.config import PRESETS, Budget, warm_start
+from tidefield.config import PRESETS, Budget
 from tidefield.data.areas import cut
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
@@ -114,7 +114,7 @@ def compare(folder: Path, plan: LargeFlight, by_areas: bool, steps: int) -> dict
     """
     scene = load_scene(folder)
     areas, budget = cut(scene), Budget(steps=steps)
-    config, weights = warm_start(PRESETS["swift"]), given_or_shipped(None, "swift")
+    config, weights = PRESETS["swift"], given_or_shipped(None, "swift")
     own = areas if by_areas else [scene.train]
     trainer = SceneTrainer(config, scene, 0, torch.device("cpu"), weights, own)
     for _ in range(steps):

@@ -45,6 +45,8 @@ SHOWN_REGIONS = ("", "_seen_cc")
 """Of `REGIONS`, those on the page; docs/measured has all."""
 GPU_FOLDER, GPU_QUALITY, LARGE_FRAMES_FILE = "gpu", "strict_800.json", "frames_1920.json"
 """What was measured on a GPU, beside files of speed and frames."""
+LENGTHS_PX = 400
+"""Width of the photographs in comparisons of lengths of training."""
 SCENES = (*TABLE_3, "caliterra", "swindale", "turin_lot", "brighton_beach", "fern", "lego")
 """In the order of the tables."""
 WITHOUT_ALPHA = Mark(
@@ -112,7 +114,7 @@ def write_page(
 ) -> None:
     """Read the stored measurements and write the page as Markdown.
 
-    `lengths` are comparisons with other trainings, `widths` such of the same scenes at several widths.
+    `widths` are comparisons of the same scenes at several widths, `lengths` such with other trainings at LENGTHS_PX.
 
     Raises:
         RunError: when there is no measurement at all.
@@ -142,7 +144,8 @@ def page(
     """The whole page: results first, circumstances and commands last."""
     records = [*_records(compared, ablated, others, sized, stored), *_gpu_records(gpu)]
     marks = scene_marks(learned_from())
-    lengths = [marked(table, marks) for table in length_tables(by_length(compared, others))]
+    same_width = [results for width, results in sized.items() if width == LENGTHS_PX]
+    lengths = [marked(table, marks) for table in length_tables(by_length([*same_width, *others]))]
     parts = [
         "# Results",
         "## Quality, by width",
@@ -155,7 +158,7 @@ def page(
         "over neighbouring views get without training on a scene, and what that training adds.",
         published_table().markdown(),
         "## Quality against training time",
-        *(_age([result for of in (compared, *others) for result in of.by.values()]) if lengths else []),
+        f"Photographs of {LENGTHS_PX} px, on CPUs; from the shipped weights, or *from scratch*, from random ones.",
         *([table.markdown() for table in lengths] or ["Not measured."]),
         "## Ablation",
         *_age([*ablated.by.values()]),
@@ -350,10 +353,10 @@ ByLength = Mapping[str, Mapping[str, Result]]
 """Results by the name of the length of training, and by scene."""
 
 
-def by_length(compared: Results, others: Sequence[Results]) -> ByLength:
+def by_length(compared: Sequence[Results]) -> ByLength:
     """Our network after several lengths of training; shorter ones first, those from scratch last."""
     found: dict[tuple[bool, float, str], dict[str, Result]] = {}
-    for results in (compared, *others):
+    for results in compared:
         for (scene, method), result in results.by.items():
             settings = result.process.get("settings", {})
             minutes, scratch = settings.get("minutes"), bool(settings.get("from_scratch"))
@@ -380,13 +383,14 @@ def length_tables(lengths: ByLength) -> list[Table]:
     counted = [scene for scenes in lengths.values() for scene in scenes]
     shared = [scene for scene in dict.fromkeys(counted) if counted.count(scene) > 2]
     columns = {name: scenes for name, scenes in lengths.items() if set(scenes) & set(shared)}
-    tables = []
+    tables, suffix = [], SHOWN_REGIONS[-1]
     for name, metric in METRICS.items():
-        values = [[(of[s].metric(name) if s in of else None) for of in columns.values()] for s in shared]
+        values = [[(of[s].metric(name + suffix) if s in of else None) for of in columns.values()] for s in shared]
         if any(value is not None for row in values for value in row):
             rows = [[s, *(shown(v, metric.style) for v in row)] for s, row in zip(shared, values, strict=True)]
             better = "more" if metric.more_is_better else "less"
-            tables.append(Table(f"{metric.title}, all pixels ({better} is better)", ["scene", *columns], rows))
+            title = f"{metric.title}, {REGIONS[suffix]} ({better} is better)"
+            tables.append(Table(title, ["scene", *columns], rows))
     return tables
 
 

@@ -233,7 +233,7 @@ SWIFT = Config(
         tile_px=32,
         tiles=4,
         crop_px=96,
-        learning_rate=3e-3,
+        learning_rate=1e-2,
         unseen_weight=0.02,
         structure_weight=3e-2,
         depth_weight=1e-4,
@@ -282,18 +282,6 @@ def checked_seed(seed: int) -> int:
     if not 0 <= seed < 1 << 63:
         raise RunError(f"--seed {reprlib.repr(seed)} was asked for: expected 0 to {(1 << 63) - 1}; choose another")
     return seed
-
-
-def warm_start(config: Config) -> Config:
-    """The configuration for training from trained weights: a third of the learning rate, reached four times as slowly.
-
-    Adam's steps are too large until its averages mean something, which takes 2 / (1 - beta2) = 200 steps (Ma and
-    Yarats, 2021, "On the adequacy of untuned warmup for adaptive optimization"). Random weights do not mind. The whole
-    rate undoes part of what trained weights know, which scenes of few photographs do not teach again.
-    """
-    train = config.train
-    train = dataclasses.replace(train, learning_rate=train.learning_rate / 3, warm_up=4 * train.warm_up)
-    return dataclasses.replace(config, train=train)
 
 
 def vary(config: Config, name: str) -> AnyConfig:

@@ -11,7 +11,7 @@ from networks import SMALL
 
 from benchmarks.areas import _in_world, border_cameras, border_steps, measure_areas, slope_bytes, tables
 from tidefield.compare.run import Usage
-from tidefield.config import PRESETS, Budget, warm_start
+from tidefield.config import PRESETS, Budget
 from tidefield.data.areas import cut
 from tidefield.data.load import load_scene
 from tidefield.model.rendering import Rendering
@@ -69,7 +69,7 @@ def test_a_step_at_borders_is_found_and_elsewhere_there_is_none(scene, flat):
 
 @pytest.mark.slow
 def test_training_by_areas_leaves_no_seam_on_flat_mud(scene, flat):
-    areas, config = AREAS(scene), warm_start(PRESETS["swift"])
+    areas, config = AREAS(scene), PRESETS["swift"]
     weights = given_or_shipped(None, "swift")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tidefield.train.loop.STEPS_EACH", 25)

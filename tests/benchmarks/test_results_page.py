@@ -81,7 +81,7 @@ def test_lengths_of_training_are_compared(tmp_path: Path) -> None:
     for scene in ("fern", "swindale", "caliterra", "turin_lot", "lego"):
         keep_result(tmp_path / "comparison.json", scene, "zero-shot", 24.0)
     compared = read_figures([tmp_path / "comparison.json"], table.SCENES, names())
-    lengths = by_length(compared, found)
+    lengths = by_length([compared, *found])
     assert list(lengths) == ["zero-shot", "10 s", "1 min", "10 min from scratch"]
     made = length_tables(lengths)[0]
     assert list(made.rows[0]) == ["caliterra", "24.00", "24.00", "24.50", "24.25"]

@@ -26,7 +26,7 @@ from tidefield.errors import RunError
 from tidefield.model.network import make_network
 from tidefield.synthetic import Flight
 from tidefield.train import pretrain, stream
-from tidefield.train.checkpoint import SHIPPED, read_weights, weights_sha256, write_weights
+from tidefield.train.checkpoint import SHIPPED, read_weights, read_weights_file, weights_sha256, write_weights
 from tidefield.train.loop import SceneTrainer
 from tidefield.train.losses import Inputs
 from tidefield.train.pretrain import Pretrainer, Validation
@@ -305,4 +305,7 @@ def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     pretrain_command(Pretrain(tmp_path / "out", budget=Budget(steps=3), device="cpu", resume=True), QUIET)
     points = json.loads((tmp_path / "out" / "validation.json").read_text())
     assert [point["step"] for point in points] == [2, 3]
-    read_weights(tmp_path / "out" / "weights.safetensors", make_network(SMALL.network))
+    weights = tmp_path / "out" / "weights.safetensors"
+    read_weights(weights, make_network(SMALL.network))
+    learned_at = read_weights_file(weights)[0]["config"]["train"]["learning_rate"]
+    assert learned_at == pretrain.HIGHEST_RATE < SMALL.train.learning_rate, "less than a single scene takes"

@@ -218,7 +218,7 @@ def test_memory_of_training_does_not_grow_with_the_photographs(tmp_path: Path) -
     assert (together[1] - few[1]) / (320 - 192) > 0.6e6, "this test would notice"
 
 
-def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_goes_on_from_the_shipped_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setitem(PRESETS, "swift", SMALL)
     write_colmap(tmp_path / "flats", survey(PINHOLE))
@@ -238,10 +238,9 @@ def test_training_goes_on_from_the_shipped_weights_gently(tmp_path: Path, monkey
 
     started, far = moved("started")
     assert started.weights == weights_sha256(tmp_path / "swift.safetensors")
-    assert isinstance(started.config, Config)
-    assert started.config.train.warm_up == 200
-    assert started.config.train.learning_rate == SMALL.train.learning_rate / 3
-    assert far < 1e-4, "two steps of a two-hundred-step rise"
+    assert started.config == SMALL, "as from random weights"
+    rise = (1 + 2) / SMALL.train.warm_up
+    assert far < 1.01 * rise * SMALL.train.learning_rate, "two steps of Adam, which begin small"
     same, _ = moved("same", variant="neighbours-direction")
     assert same.weights == started.weights, "other neighbours, but the same network"
     assert moved("fewer", variant="views-2")[0].weights is None

@@ -100,5 +100,5 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
             "processes": across.world_size(),
             "validation": validation.points,
         }
-        write_weights(folder / WEIGHTS_FILE, trainer.network, config, description)
+        write_weights(folder / WEIGHTS_FILE, trainer.network, trainer.config, description)
     report_end(trainer.progress, stopped, folder, console)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, OpensplatProgram, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import PRESETS, Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary, warm_start
+from tidefield.config import PRESETS, Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary
 from tidefield.errors import RunError, SceneError
 from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
@@ -230,10 +230,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
         )
     if weights is None and not options.from_scratch and isinstance(config, Config):
         weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
-    digest = None
-    if weights is not None:
-        assert isinstance(config, Config), "only our networks start from weights"
-        config, digest = warm_start(config), weights_sha256(weights)
+    digest = None if weights is None else weights_sha256(weights)
     root = Path(os.path.realpath(options.scene))
     return Run(root, options.width, checked_seed(options.seed), config, digest), weights
 

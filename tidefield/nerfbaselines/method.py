@@ -18,7 +18,7 @@ from nerfbaselines import Cameras as GivenCameras
 from nerfbaselines import Dataset, Method, MethodInfo, ModelInfo, RenderOptions, RenderOutput
 from PIL import Image
 
-from tidefield.config import PRESETS, Budget, Range, Seed, from_json, warm_start
+from tidefield.config import PRESETS, Budget, Range, Seed, from_json
 from tidefield.data.load import load_scene
 from tidefield.data.pictures import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
@@ -65,7 +65,7 @@ class TidefieldMethod(Method):
         self.scene = load_scene(self.folder / SCENE, hold_out=False)
         preset, seed = str(self.settings["preset"]), int(self.settings["seed"])
         weights = given_or_shipped(None, preset)
-        self.trainer = SceneTrainer(warm_start(PRESETS[preset]), self.scene, seed, choose_device("auto"), weights)
+        self.trainer = SceneTrainer(PRESETS[preset], self.scene, seed, choose_device("auto"), weights)
         if checkpoint is not None:
             self.trainer.resume(self.folder)
         self.loaded_step = None if checkpoint is None else self.trainer.progress.step

@@ -26,7 +26,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from tidefield.config import PRESETS, warm_start
+from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
@@ -138,10 +138,10 @@ class TidefieldModel(Model):
 
     def populate_modules(self) -> None:
         self.scene, self.scale, device = self._given
-        config, weights = PRESETS[self.config.preset], None
+        preset, weights = self.config.preset, None
         if not self.config.from_scratch:
-            weights, config = given_or_shipped(self.config.weights, self.config.preset), warm_start(config)
-        self.trainer = SceneTrainer(config, self.scene, self.config.seed, device, weights)
+            weights = given_or_shipped(self.config.weights, preset)
+        self.trainer = SceneTrainer(PRESETS[preset], self.scene, self.config.seed, device, weights)
         self.network = self.trainer.network
         self._render: Render | None = None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -30,6 +31,8 @@ from tidefield.train.stream import Recipe, Stream, make
 
 VIEWS = {4: 0.2, 5: 0.35, 6: 0.2, 8: 0.15, 10: 0.06, 12: 0.04}
 """Numbers of neighbouring views of a step, and how often: what users may set, the cheap ones more often."""
+HIGHEST_RATE = 3e-3
+"""Of learning: less than one scene takes, since scenes change from step to step."""
 LEAST_ERROR = 1e-5
 """Mean squared error (50 dB) below which a batch counts less and less."""
 VALIDATION_FILE = "validation.json"
@@ -97,7 +100,8 @@ class Pretrainer(SceneTrainer):
     """
 
     def __init__(self, config: Config, stream: Stream, shown: Scene, seed: int, device: torch.device) -> None:
-        super().__init__(config, shown, seed, device)
+        rate = min(config.train.learning_rate, HIGHEST_RATE)
+        super().__init__(replace(config, train=replace(config.train, learning_rate=rate)), shown, seed, device)
         self.stream, self.seed, self.is_main_process = stream, process_seed(seed), is_main_process()
         self.generator.manual_seed(self.seed)
         if is_distributed():
