@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 import tidefield as tf
-from tidefield.config import PRESETS, Budget, config_to_json, warm_start
+from tidefield.config import PRESETS, Budget, config_to_json
 from tidefield.evaluation.evaluate import evaluate
 from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256, write_run
@@ -25,7 +25,7 @@ scene = tf.load_scene(folder / "scene")
 
 # From trained weights on, as the command does it.
 weights = shipped_weights("swift")
-config = warm_start(PRESETS["swift"])
+config = PRESETS["swift"]
 write_run(folder / "run", Run(scene.root, None, seed=0, config=config, weights=weights_sha256(weights)))
 trainer = SceneTrainer(config, scene, seed=0, device=torch.device("cpu"), weights=weights)
 train(trainer, folder / "run", Budget(steps=5), Console(quiet=True))
