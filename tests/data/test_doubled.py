@@ -23,6 +23,8 @@ from tidefield.model.network import make_network
 from tidefield.model.renderer import Renderer
 from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.loop import SceneTrainer
+from tidefield.train.pretrain import Pretrainer
+from tidefield.train.stream import Draw, Stream
 
 CPU = torch.device("cpu")
 WIDTH = 32
@@ -120,6 +122,27 @@ def test_training_matches_at_twice_the_size_as_views_do(scene: Scene, monkeypatc
     torch.manual_seed(0)
     Renderer(make_network(SMALL.network).eval(), scene, SMALL, CPU)(scene.cameras[scene.train[0]])
     assert [width for width, _ in sizes] == [2 * WIDTH, 2 * WIDTH]
+
+
+def test_training_across_scenes_matches_and_reads_photographs_as_training_on_one_does(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sizes, twice, own = matched_sizes(monkeypatch), at_twice_the_size(scene), []
+    assert twice is not None
+    with Stream(tmp_path / "scenes", [], 1, SMALL) as scenes:
+        for channels in ((0, 1, 2), (2, 0, 1)):
+            drawn = scenes._augmented(scene, Draw(None, 0.0, 1.0, 0.0, 0.0, channels, 7))
+            assert drawn.doubled is not None
+            assert torch.equal(drawn.doubled.photographs[2], twice.photographs[2][..., channels])
+            assert torch.equal(drawn.scene.photographs[2], scene.photographs[2][..., channels])
+            own.append(drawn.priors[scene.train[0]])
+            monkeypatch.setattr(scenes, "draw", lambda *_, drawn=drawn: drawn)
+            assert Pretrainer(SMALL, scenes, scene, 0, CPU).draw().batch.image_doubled
+    assert [width for width, _ in sizes] == [2 * WIDTH] * len(sizes)
+    assert torch.equal(own[0].cells, own[1].cells)
+    assert own[0].detail is not None
+    assert own[1].detail is not None
+    assert torch.equal(own[0].detail, own[1].detail)
 
 
 def test_a_view_comes_closer_to_the_photograph_that_was_not_used(tmp_path: Path):

@@ -74,6 +74,9 @@ MARGIN_PX = 2.0
 """Pixels at the borders of photographs that are not compared: other depths would be read outside of them."""
 SELECT_ABOVE = 256
 """With more photographs than this, those that see the camera's surface are found first."""
+MATCHED_PX = 1024
+"""Longest side at which the surfaces of photographs are matched to learn from: all pixels of larger ones would take
+most of a few minutes."""
 KEPT_BYTES = 300_000_000
 """Memory for photographs without their means and contrasts; those that were not read for the longest time go first."""
 

@@ -118,7 +118,7 @@ class Pretrainer(SceneTrainer):
         shares = torch.tensor(list(VIEWS.values()))
         views = list(VIEWS)[int(torch.multinomial(shares, 1, generator=self.generator))]
         given = drawn.scene, drawn.priors, views, self.generator
-        return Inputs.draw(self.network, self.config.train, *given, cameras=drawn.cameras)
+        return Inputs.draw(self.network, self.config.train, *given, doubled=drawn.doubled, cameras=drawn.cameras)
 
     def loss(self, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
         loss, error = super().loss(inputs)

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from tidefield.config import Config
 from tidefield.data.depth_prior import DepthPriors
-from tidefield.data.load import at_width, load_scene
-from tidefield.data.matching import Matcher
+from tidefield.data.load import at_twice_the_size, at_width, load_scene
+from tidefield.data.matching import MATCHED_PX, Matcher
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.processes import start_worker
@@ -99,11 +99,15 @@ class Draw:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A scene with its depth priors, and the cameras that the network is given."""
+    """A scene with its depth priors, and the cameras that the network is given.
+
+    `doubled` is the scene at twice the size, where its files have as much and the network reads it.
+    """
 
     scene: Scene
     priors: DepthPriors
     cameras: Cameras
+    doubled: Scene | None = None
 
 
 @cache  # called several times at every step
@@ -256,19 +260,31 @@ class Stream:
         random = np.random.default_rng(own.seed)
         shift = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
         light = torch.from_numpy(np.exp(random.normal(scale=own.exposure_error, size=(len(scene.names), 1)))).float()
-        principal, gain = scene.cameras.principal_px + shift, scene.cameras.gain[:, own.channels] * light
-        shading = scene.cameras.shading
-        shading = None if shading is None else shading[:, :, own.channels]
-        cameras = replace(scene.cameras, principal_px=principal, gain=gain, shading=shading)
+        cameras = scene.cameras
+        cameras = replace(cameras, principal_px=cameras.principal_px + shift, gain=cameras.gain * light)
         observed = scene.points if self.network.has("sparse points") else None
         points = observed if own.points_share else None
         if points is not None and own.points_share < 1:
             points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))
-        photographs = scene.photographs
-        if own.channels != (0, 1, 2):
-            photographs = replace(
-                photographs, colours=tuple(c[..., own.channels] for c in photographs.colours), files=()
-            )
-        augmented = replace(scene, cameras=cameras, photographs=photographs, points=points)
-        match = Matcher(augmented) if self.network.has("matched surface") else None
-        return Drawn(augmented, DepthPriors(augmented, observed, match), cameras)
+        misaligned = replace(scene, cameras=cameras, points=points)
+        augmented = recoloured(misaligned, own.channels)
+        match = doubled = None
+        if self.network.has("matched surface"):  # as for one scene; on greys, which are those of any order of channels
+            match = Matcher(misaligned, most_px=MATCHED_PX, finer=True)
+        if self.network.has("doubled photographs") and (twice := at_twice_the_size(scene)) is not None:
+            doubled = recoloured(twice, own.channels)
+        return Drawn(augmented, DepthPriors(augmented, observed, match), augmented.cameras, doubled)
+
+
+def recoloured(scene: Scene, channels: tuple[int, ...]) -> Scene:
+    """A scene with its colour channels in another order; its photographs no longer come from files."""
+    if channels == (0, 1, 2):
+        return scene
+    own, shading = scene.cameras, scene.cameras.shading
+    shading = None if shading is None else shading[:, :, channels]
+    colours = tuple(c[..., channels] for c in scene.photographs.colours)
+    return replace(
+        scene,
+        cameras=replace(own, gain=own.gain[:, channels], shading=shading),
+        photographs=replace(scene.photographs, colours=colours, files=()),
+    )
