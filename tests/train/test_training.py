@@ -39,6 +39,7 @@ from tidefield.config import (
     config_to_json,
 )
 from tidefield.data.areas import cut
+from tidefield.data.depth_prior import DepthPrior
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.geometry.lenses import Lens
@@ -140,6 +141,28 @@ def test_what_an_area_needed_is_given_back(monkeypatch: pytest.MonkeyPatch) -> N
         del own
         trainer.step(Budget(steps=8))
         assert len(alive) <= 4, "one area's at a time"
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_training_begins_with_few_photographs_and_learns_from_all(
+    at_once: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not at_once:
+        monkeypatch.setattr("tidefield.train.loop.cut", partial(cut, whole=6, most=9))
+    monkeypatch.setattr("tidefield.train.loop.Matcher", lambda *_, **__: lambda camera, cells: DepthPrior(cells))
+    many = wall.scene(wall.cameras(20, step=0.3))  # areas of five and seven
+    trainer = SceneTrainer(SMALL, many, seed=3, device=CPU)
+    assert (len(trainer.areas) == 1) == at_once
+    drawn, first = set[int](), trainer.open_area()
+    for step in range(200):
+        trainer.progress.step = step
+        assert trainer.open_area() is first
+        drawn.update(trainer.draw().batch.targets.tolist())
+        assert len(drawn) <= 4 + step // 4
+    assert drawn == set(first.area.targets)
+    trainer.progress.step = 200
+    assert (trainer.open_area() is first) == at_once
+    assert (len(trainer._targets(trainer.open_area().area)) > 4) == at_once
 
 
 HELD = """

@@ -24,7 +24,7 @@ from tidefield.data.areas import Area, cut, select
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.images import Progress
 from tidefield.data.load import at_twice_the_size
-from tidefield.data.matching import Matcher
+from tidefield.data.matching import MATCHED_PX, Matcher
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
@@ -53,9 +53,9 @@ FINAL_RATE = 0.02
 STEPS_EACH = 200
 """Steps in an area before the next one: each depth prior, which takes as long as a step where photographs are large, is
 then used a dozen times."""
-MATCHED_PX = 1024
-"""Longest side at which the surfaces of photographs are matched to learn from: all pixels of larger ones would take
-most of a few minutes."""
+FIRST_TARGETS, STEPS_PER_TARGET = 4, 4
+"""Photographs that the first step in an area draws from, and steps after which another one is drawn from as well: to
+match the surface of one takes as long as some steps, and a minute would go by without any."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
 
@@ -234,8 +234,16 @@ class SceneTrainer(Trainer):
         """Draw the next batch, on the CPU."""
         own, views = self.open_area(), self.config.network.views
         part = own.area
-        drawn_from = part.scene, own.priors, views, self.generator, part.targets, part.doubled
+        drawn_from = part.scene, own.priors, views, self.generator, self._targets(part), part.doubled
         return Inputs.draw(self.network, self.config.train, *drawn_from)
+
+    def _targets(self, area: Area) -> list[int]:
+        """The photographs of an area that the next step draws from: a few at first, then more and more."""
+        turn, within = divmod(self.progress.step, STEPS_EACH)
+        if len(self.areas) == 1:
+            turn, within = 0, self.progress.step
+        order = torch.randperm(len(area.targets), generator=torch.Generator().manual_seed(turn))
+        return [area.targets[k] for k in order[: FIRST_TARGETS + within // STEPS_PER_TARGET].tolist()]
 
     def loss(self, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the loss of a batch on the network's device, and the mean squared error of its colours."""
