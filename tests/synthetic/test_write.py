@@ -94,6 +94,13 @@ def test_photographs_can_be_jpegs(survey: Survey, tmp_path: Path) -> None:
     assert np.abs(picture[..., ::-1].astype(int) - survey.photographs[1].numpy()).mean() < 4
 
 
+def test_the_truth_can_be_left_out(survey: Survey, folder: Path, tmp_path: Path) -> None:
+    write_survey(survey, tmp_path / "scene", truth=False)
+    written = {path.relative_to(tmp_path / "scene") for path in (tmp_path / "scene").rglob("*") if path.is_file()}
+    whole = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+    assert written == {path for path in whole if path.parts[0] != "truth"}
+
+
 def test_a_folder_that_is_not_empty_is_refused(survey: Survey, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("keep me")
     with pytest.raises(SceneError, match="not empty"):

@@ -24,8 +24,8 @@ _LEAST_PLANT_M, _LEAST_WATER_M = 0.03, 0.0125
 """Height above the ground from which a plant counts, and the depth at which water is half drawn."""
 
 
-def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
-    """Write `images/`, a COLMAP model in `sparse/0`, and `truth/`.
+def write_survey(survey: Survey, folder: Path, suffix: str = ".png", truth: bool = True) -> None:
+    """Write `images/`, a COLMAP model in `sparse/0`, and, with `truth`, `truth/`.
 
     `truth/` holds `depth/NAME.npy` (float32 z-depth at pixel centres, metres), and on one north-up grid
     `orthophoto.png`, `surface.npy` (float32 height, metres), `bare.npy` (the same without plants) and `classes.png`
@@ -35,6 +35,7 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
         survey: photographs, cameras and truth.
         folder: new or empty.
         suffix: of the photographs, .png or .jpg (quality 97).
+        truth: takes a quarter of the time.
 
     Raises:
         SceneError: the folder is not empty or cannot be written.
@@ -44,13 +45,15 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png") -> None:
     # The order of the flight is sorted order.
     names = [f"{survey.category}_{i + 1:04d}{suffix}" for i in range(len(survey.cameras))]
     try:
-        for part in ("images", "sparse/0", "truth/depth"):
+        for part in ("images", "sparse/0", *(("truth/depth",) if truth else ())):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        for name, photograph, depth in zip(names, survey.photographs, survey.depth, strict=True):
+        for name, photograph in zip(names, survey.photographs, strict=True):
             _write_picture(folder / "images" / name, photograph)
-            np.save(folder / "truth" / "depth" / f"{Path(name).stem}.npy", depth.numpy())
         _reconstruction(survey, names).write_binary(folder / "sparse" / "0")
-        _write_map(survey, names, folder / "truth")
+        if truth:
+            for name, depth in zip(names, survey.depth, strict=True):
+                np.save(folder / "truth" / "depth" / f"{Path(name).stem}.npy", depth.numpy())
+            _write_map(survey, names, folder / "truth")
     except OSError as error:
         raise SceneError(f"cannot write to {folder}: {error}; free some space or name another folder") from error
 

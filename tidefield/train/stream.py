@@ -158,7 +158,7 @@ def make(given: Recipe, folder: Path) -> None:
     half = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(half, ignore_errors=True)
     survey = make_survey(given.category, given.seed, given.views, given.width, given.flight)
-    write_survey(misposed(survey, given), half, suffix=".jpg")
+    write_survey(misposed(survey, given), half, suffix=".jpg", truth=False)
     half.rename(folder)
 
 
