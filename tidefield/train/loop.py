@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -53,11 +54,14 @@ FINAL_RATE = 0.02
 STEPS_EACH = 200
 """Steps in an area before the next one: each depth prior, which takes as long as a step where photographs are large, is
 then used a dozen times."""
-FIRST_TARGETS, STEPS_PER_TARGET = 4, 4
+FIRST_TARGETS, STEPS_PER_TARGET = 4, 2
 """Photographs that the first step in an area draws from, and steps after which another one is drawn from as well: to
 match the surface of one takes as long as some steps, and a minute would go by without any."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
+ENCODER_SHARE = 0.3
+"""Of the learning rate, for encoders without norms: nothing bounds their features, and at the whole rate of a preset
+these may grow until nothing else is seen."""
 
 Callback = Callable[["Trainer", float], None]
 """Called with the trainer and the share of the budget that is used."""
@@ -67,7 +71,8 @@ class Trainer(ABC):
     """A network, its optimiser and its position in the sequence of random batches.
 
     The same seed, scene and budget in steps give the same weights bit for bit on a CPU, however often training is
-    stopped and resumed there. `learning_rate` is the peak; `adam` are further options of the optimiser.
+    stopped and resumed there. `learning_rate` is the peak; `adam` are further options of the optimiser; `share_of_rate`
+    gives the share of the learning rate that a parameter has, by its name.
     """
 
     def __init__(
@@ -78,12 +83,17 @@ class Trainer(ABC):
         seed: int,
         device: torch.device,
         adam: dict[str, Any],
+        share_of_rate: Callable[[str], float] = lambda _: 1.0,
     ) -> None:
         self.network, self.learning_rate, self.scene, self.device = network, learning_rate, scene, device
         self.generator = torch.Generator().manual_seed(seed)
         # Fused: a GPU takes all parameters at once.
         fused = True if device.type == "cuda" else None
-        self.optimizer = torch.optim.Adam(network.parameters(), fused=fused, **adam)
+        groups = [
+            {"params": [parameter for _, parameter in members], "share": share}
+            for share, members in groupby(network.named_parameters(), lambda named: share_of_rate(named[0]))
+        ]
+        self.optimizer = torch.optim.Adam(groups, fused=fused, **adam)
         self.progress = TrainingProgress()
 
     is_main_process = True
@@ -154,7 +164,7 @@ class Trainer(ABC):
         start = time.perf_counter()
         rate = self.rate(budget.share(self.progress.step, self.progress.seconds))
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * self.learning_rate
+            group["lr"] = rate * self.learning_rate * group["share"]
         error = self.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
@@ -211,7 +221,12 @@ class SceneTrainer(Trainer):
             network = make_network(config.network).to(device)
         if weights is not None:
             read_weights(weights, network)
-        super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM)
+        bounded = config.network.encoder.instance_norm
+
+        def share_of_rate(parameter: str) -> float:
+            return ENCODER_SHARE if parameter.startswith("encoder.") and not bounded else 1.0
+
+        super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM, share_of_rate)
         self.config, self.areas = config, areas or cut(scene)
         self._seed, self._open = seed, None
         self._prepared, self._doubled, self._ahead = False, None, None
