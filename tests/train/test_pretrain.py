@@ -180,7 +180,7 @@ def test_views_vary_from_step_to_step(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     inputs = learner.draw()
 
-    def drawn(network, config, scene, priors, views, generator, cameras) -> Inputs:
+    def drawn(network, config, scene, priors, views, generator, doubled, cameras) -> Inputs:
         seen.append(views)
         return inputs
 
