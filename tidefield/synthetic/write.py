@@ -45,12 +45,13 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png", truth: bool
     # The order of the flight is sorted order.
     names = [f"{survey.category}_{i + 1:04d}{suffix}" for i in range(len(survey.cameras))]
     try:
-        for part in ("images", "sparse/0", *(("truth/depth",) if truth else ())):
+        for part in ("images", "sparse/0"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         for name, photograph in zip(names, survey.photographs, strict=True):
             _write_picture(folder / "images" / name, photograph)
         _reconstruction(survey, names).write_binary(folder / "sparse" / "0")
         if truth:
+            (folder / "truth" / "depth").mkdir(parents=True, exist_ok=True)
             for name, depth in zip(names, survey.depth, strict=True):
                 np.save(folder / "truth" / "depth" / f"{Path(name).stem}.npy", depth.numpy())
             _write_map(survey, names, folder / "truth")

@@ -59,9 +59,9 @@ FIRST_TARGETS, STEPS_PER_TARGET = 4, 2
 match the surface of one takes as long as some steps, and a minute would go by without any."""
 ADAM = {"betas": (0.9, 0.99), "eps": 1e-12}
 """Of our networks. With Adam's usual epsilon of 1e-8, parameters with tiny gradients would hardly move."""
-ENCODER_SHARE = 0.3
-"""Of the learning rate, for encoders without norms: nothing bounds their features, and at the whole rate of a preset
-these may grow until nothing else is seen."""
+UNBOUNDED_RATE = 3e-3
+"""Highest learning rate of encoders without norms: nothing bounds their features, and at a higher one these may grow
+until nothing else is seen."""
 
 Callback = Callable[["Trainer", float], None]
 """Called with the trainer and the share of the budget that is used."""
@@ -221,12 +221,13 @@ class SceneTrainer(Trainer):
             network = make_network(config.network).to(device)
         if weights is not None:
             read_weights(weights, network)
-        bounded = config.network.encoder.instance_norm
+        rate, bounded = config.train.learning_rate, config.network.encoder.instance_norm
+        encoder = 1.0 if bounded or rate <= UNBOUNDED_RATE else UNBOUNDED_RATE / rate
 
         def share_of_rate(parameter: str) -> float:
-            return ENCODER_SHARE if parameter.startswith("encoder.") and not bounded else 1.0
+            return encoder if parameter.startswith("encoder.") else 1.0
 
-        super().__init__(network, config.train.learning_rate, scene, seed, device, ADAM, share_of_rate)
+        super().__init__(network, rate, scene, seed, device, ADAM, share_of_rate)
         self.config, self.areas = config, areas or cut(scene)
         self._seed, self._open = seed, None
         self._prepared, self._doubled, self._ahead = False, None, None
@@ -254,9 +255,8 @@ class SceneTrainer(Trainer):
 
     def _targets(self, area: Area) -> list[int]:
         """The photographs of an area that the next step draws from: a few at first, then more and more."""
-        turn, within = divmod(self.progress.step, STEPS_EACH)
-        if len(self.areas) == 1:
-            turn, within = 0, self.progress.step
+        step = self.progress.step
+        turn, within = (0, step) if len(self.areas) == 1 else divmod(step, STEPS_EACH)
         order = torch.randperm(len(area.targets), generator=torch.Generator().manual_seed(turn))
         return [area.targets[k] for k in order[: FIRST_TARGETS + within // STEPS_PER_TARGET].tolist()]
 
