@@ -14,9 +14,10 @@ from scenes_on_disk import BARREL, PINHOLE, Truth, survey, write_colmap, write_t
 from tidefield.config import PAPER, SWIFT
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
-from tidefield.data.load import load_scene
+from tidefield.data.load import at_twice_the_size, load_scene
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.pictures import fill_masked
+from tidefield.data.pyramid import PER_OCTAVE, Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import SceneError
@@ -169,3 +170,25 @@ def test_photographs_that_are_masked_there_are_no_neighbours() -> None:
     found = choose_neighbours(own.cameras[3], prior, corner, (1, 1), 8, own, 2, "view")
     weighty = found.index[found.blend_weight.amax(-1) > 1e-3]
     assert not torch.isin(weighty, torch.tensor([2, 4])).any()
+
+
+def test_what_is_open_at_twice_the_size_is_not_decoded_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = survey(BARREL)
+    write_colmap(tmp_path / "a", truth)
+    write_masks(tmp_path / "a", truth, range(4))
+    scene = load(tmp_path / "a", width=32)
+    levels = [(photograph, PER_OCTAVE) for photograph in range(9)]
+    decoded = [Pyramid(scene).read(*key) for key in levels]
+    pyramid = Pyramid(scene, at_twice_the_size(scene, cache=tmp_path / "cache"))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("decoded again")
+
+    monkeypatch.setattr("tidefield.data.pyramid.read_at_size", refuse)
+    for (colours, mask), (expected, where) in zip(map(pyramid.read, *zip(*levels, strict=True)), decoded, strict=True):
+        assert torch.equal(colours, expected)
+        assert (mask is None) == (where is None)
+        assert mask is None or torch.equal(mask, where)
+    assert sum(mask is not None for _, mask in decoded) == 4
+    with pytest.raises(AssertionError, match="decoded again"):
+        pyramid.read(4, PER_OCTAVE - 1)

@@ -38,13 +38,17 @@ Read = tuple[UInt8[Tensor, "_ _ 3"], Bool[Tensor, "_ _"] | None]
 class Pyramid:
     """The photographs of a scene at all levels: 0 is the scene's own size, those above are finer, as far as files go.
 
+    Args:
+        scene: of the photographs.
+        doubled: the same at twice its size (`load.at_twice_the_size`), where it is open: what it has is not decoded.
+
     Attributes:
         first: the coarsest level of any photograph.
         cameras: of all photographs at the first level, then at the next, and so on.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, doubled: Scene | None = None) -> None:
+        self.scene, self.doubled = scene, doubled
         width = scene.cameras.size_px[:, 0]
         finest = torch.tensor([scene.photographs.finest_width(i) for i in range(len(width))])
         octaves = torch.log2(torch.stack([COARSEST_PX / width, finest / width]).double())
@@ -144,6 +148,10 @@ class Pyramid:
 
     def _read(self, photograph: int, width: int, height: int) -> Read:
         """Read a photograph's file at a size."""
+        if self.doubled is not None:
+            colours, masks = self.doubled.photographs[photograph], self.doubled.photographs.masks_of([photograph])
+            if colours.shape[:2] == (height, width):
+                return colours, masks[0] if masks else None
 
         def decode(key: tuple[int, int, int]) -> Read:
             with self._decoding:

@@ -26,6 +26,7 @@ from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.images import Progress
 from tidefield.data.load import at_twice_the_size
 from tidefield.data.matching import MATCHED_PX, Matcher
+from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
 from tidefield.evaluation.metrics import psnr_from_mse
@@ -311,7 +312,8 @@ class SceneTrainer(Trainer):
             area = (Area if whole else select)(self.scene, targets, self._doubled)
             match = None
             if self.network.config.has("matched surface"):
-                match = Matcher(area.scene, most_px=MATCHED_PX, finer=True, device=self.device)
+                pyramid = Pyramid(area.scene, area.doubled)
+                match = Matcher(area.scene, pyramid, most_px=MATCHED_PX, finer=True, device=self.device)
             self._open = OpenArea(number, area, DepthPriors(area.scene, match=match))
         return self._open
 

@@ -26,6 +26,7 @@ from tidefield.config import Config
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.data.load import at_twice_the_size, at_width, load_scene
 from tidefield.data.matching import MATCHED_PX, Matcher
+from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.processes import start_worker
@@ -268,11 +269,11 @@ class Stream:
             points = points.subset(torch.from_numpy(random.random(len(points.xyz_world)) < own.points_share))
         misaligned = replace(scene, cameras=cameras, points=points)
         augmented = recoloured(misaligned, own.channels)
-        match = doubled = None
+        twice = at_twice_the_size(scene) if self.network.has("doubled photographs") else None
+        match = None
         if self.network.has("matched surface"):  # as for one scene; on greys, which are those of any order of channels
-            match = Matcher(misaligned, most_px=MATCHED_PX, finer=True)
-        if self.network.has("doubled photographs") and (twice := at_twice_the_size(scene)) is not None:
-            doubled = recoloured(twice, own.channels)
+            match = Matcher(misaligned, Pyramid(misaligned, twice), most_px=MATCHED_PX, finer=True)
+        doubled = None if twice is None else recoloured(twice, own.channels)
         return Drawn(augmented, DepthPriors(augmented, observed, match), augmented.cameras, doubled)
 
 
