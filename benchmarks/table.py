@@ -277,29 +277,37 @@ PLACED_AFTERWARDS = (
 )
 
 
-def _commits(results: Results) -> list[str]:
-    """Which commit measured what: columns, or scenes of a column, of different commits are not of the same code."""
-    measured = sorted(
-        (str(one.evaluation["commit"])[:7], method, scene)
-        for (scene, method), one in results.by.items()
-        if "commit" in one.evaluation
+def _circumstances(results: Results) -> list[str]:
+    """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
+    commits = _groups({k: str(one.evaluation.get("commit", ""))[:7] for k, one in results.by.items()})
+    machines = _groups(
+        {k: step["machine"]["processor"] for k, one in results.by.items() if (step := one.process.get("evaluate"))}
     )
-    commits = sorted({commit for commit, _, _ in measured})
-    if len(commits) < 2:
-        return [f"Measured at commit {commit}." for commit in commits]
+    sentences = [f"Measured at commit {commit}." for commit in commits]
+    if len(commits) > 1:
+        parts = "; ".join(f"{commit} ({of})" for commit, of in commits.items())
+        sentences = [f"Measured at different commits, whose code and settings differ: {parts}."]
+    if len(machines) > 1:
+        parts = "; ".join(f"{machine} ({of})" for machine, of in machines.items())
+        sentences.append(f"Measured on different machines, on which a minute does not bring the same: {parts}.")
+    return sentences
 
-    def scenes(commit: str, method: str) -> str:
-        """Of a column that one commit did not measure alone."""
-        own = [scene for *of, scene in measured if of == [commit, method]]
+
+def _groups(labels: Mapping[tuple[str, str], str]) -> dict[str, str]:
+    """What has each label, from labels of scenes and methods: columns, or scenes of a column that has several."""
+    measured = sorted((label, method, scene) for (scene, method), label in labels.items() if label)
+
+    def scenes(label: str, method: str) -> str:
+        own = [scene for *of, scene in measured if of == [label, method]]
         return "" if len(own) == sum(other == method for _, other, _ in measured) else f" of {', '.join(own)}"
 
-    parts = []
-    for commit in commits:
+    groups = {}
+    for label in dict.fromkeys(label for label, _, _ in measured):
         columns: dict[str, list[str]] = {}
-        for method in sorted({method for of, method, _ in measured if of == commit}):
-            columns.setdefault(scenes(commit, method), []).append(method)
-        parts.append(f"{commit} ({'; '.join(', '.join(methods) + of for of, methods in columns.items())})")
-    return [f"Measured at different commits, whose code and settings differ: {'; '.join(parts)}."]
+        for method in sorted({method for of, method, _ in measured if of == label}):
+            columns.setdefault(scenes(label, method), []).append(method)
+        groups[label] = "; ".join(", ".join(methods) + of for of, methods in columns.items())
+    return groups
 
 
 def _widths(sized: Mapping[int, Results]) -> list[str]:
@@ -319,7 +327,7 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
         parts += [
             f"### {width} px",
-            *_commits(results),
+            *_circumstances(results),
             *([PLACED_AFTERWARDS] if placed_afterwards else []),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),

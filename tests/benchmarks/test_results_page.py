@@ -181,7 +181,16 @@ def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
     assert "code and settings differ: 1234567 (tidefield); abcdefa (sparse-depth).\n" in page("method", "tidefield")
     keep_result(file, "lego", "tidefield", 25.0)
     found = "differ: 1234567 (tidefield of lego); abcdefa (sparse-depth; tidefield of fern).\n"
-    assert found in page("scene", "lego"), "the scenes, where a column is of two commits"
+    text = page("scene", "lego")
+    assert found in text, "the scenes, where a column is of two commits"
+    assert "different machines" not in text
+    record = read_json(file) or {}
+    record["results"][0]["process"]["evaluate"]["machine"]["processor"] = "A Slow One"
+    write_json(file, record)
+    own = this_machine.describe()["machine"]["processor"]
+    slower = f"A Slow One (tidefield of fern); {own} (sparse-depth; tidefield of lego)"
+    rest = " on which a minute does not bring the same: "
+    assert f"{rest}{slower}.\n" in page("scene", "lego")
 
 
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
