@@ -277,25 +277,29 @@ PLACED_AFTERWARDS = (
 )
 
 
-def _circumstances(results: Results) -> list[str]:
+def _code_and_machines(results: Results) -> list[str]:
     """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
-    commits = _groups({k: str(one.evaluation.get("commit", ""))[:7] for k, one in results.by.items()})
+    commits = _groups({k: str(of)[:7] for k, one in results.by.items() if (of := one.evaluation.get("commit"))})
     machines = _groups(
         {k: step["machine"]["processor"] for k, one in results.by.items() if (step := one.process.get("evaluate"))}
     )
+
+    def each(groups: Mapping[str, str]) -> str:
+        return "; ".join(f"{label} ({of})" for label, of in groups.items())
+
     sentences = [f"Measured at commit {commit}." for commit in commits]
     if len(commits) > 1:
-        parts = "; ".join(f"{commit} ({of})" for commit, of in commits.items())
-        sentences = [f"Measured at different commits, whose code and settings differ: {parts}."]
+        sentences = [f"Measured at different commits, whose code and settings differ: {each(commits)}."]
     if len(machines) > 1:
-        parts = "; ".join(f"{machine} ({of})" for machine, of in machines.items())
-        sentences.append(f"Measured on different machines, on which a minute does not bring the same: {parts}.")
+        sentences.append(
+            f"Measured on different machines, on which a minute does not bring the same: {each(machines)}."
+        )
     return sentences
 
 
 def _groups(labels: Mapping[tuple[str, str], str]) -> dict[str, str]:
     """What has each label, from labels of scenes and methods: columns, or scenes of a column that has several."""
-    measured = sorted((label, method, scene) for (scene, method), label in labels.items() if label)
+    measured = sorted((label, method, scene) for (scene, method), label in labels.items())
 
     def scenes(label: str, method: str) -> str:
         own = [scene for *of, scene in measured if of == [label, method]]
@@ -327,7 +331,7 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
         parts += [
             f"### {width} px",
-            *_circumstances(results),
+            *_code_and_machines(results),
             *([PLACED_AFTERWARDS] if placed_afterwards else []),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),

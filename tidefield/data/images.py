@@ -32,6 +32,8 @@ from tidefield.machine import cores
 
 Progress = Callable[[int, int], None]
 """Called with the number of photographs that are ready, and the number of all."""
+Read = tuple[UInt8[Tensor, "_ _ 3"], Bool[Tensor, "_ _"] | None]
+"""A photograph, and where it is used if it has a mask."""
 Masks = Sequence[Bool[Tensor, "_ _"] | None]
 """One for each of some photographs, or none at all (`Photographs.masks_of`)."""
 
@@ -95,6 +97,10 @@ class Photographs:
         """Return which pixels of a photograph are to be used: all of them where it has no mask."""
         mask = self.masks[index] if self.masks else None
         return torch.ones(self.colours[index].shape[:2], dtype=torch.bool) if mask is None else mask
+
+    def read(self, index: int) -> Read:
+        """Return a photograph, and where it is used if it has a mask."""
+        return self.colours[index], self.masks[index] if self.masks else None
 
     def masks_of(self, which: Sequence[int]) -> Masks:
         """Return the masks of some photographs, one each; empty if no photograph of the scene has one."""
@@ -201,14 +207,12 @@ def photographs_key(files: Sequence[PhotographFile], background_rgb: tuple[float
     return key([_PIXELS_VERSION, background_rgb, parts])
 
 
-def read_at_size(
-    photographs: Photographs, index: int, width: int, height: int
-) -> tuple[UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+def read_at_size(photographs: Photographs, index: int, width: int, height: int) -> Read:
     """Read a photograph from its file at another size, and its mask if it has one."""
     file = replace(photographs.files[index], width=width, height=height)
     with quiet_pillow():
         one = _views(_decode(file, photographs.background_rgb), [file], photographs.background_rgb)
-    return one[0], one.masks[0] if one.masks else None
+    return one.read(0)
 
 
 def decoded_at_once(files: Sequence[PhotographFile]) -> int:

@@ -15,10 +15,10 @@ import threading
 
 import cv2
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from tidefield.data.images import decoded_at_once, read_at_size
+from tidefield.data.images import Read, decoded_at_once, read_at_size
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, concatenate
 from tidefield.parallel import SharedValues
@@ -31,8 +31,6 @@ COARSEST_PX = 32
 """Least width of a level."""
 KEPT_BYTES = 800_000_000
 """Memory for decoded levels; those that were not read for the longest time go first."""
-Read = tuple[UInt8[Tensor, "_ _ 3"], Bool[Tensor, "_ _"] | None]
-"""A photograph, and where it is used if it has a mask."""
 
 
 class Pyramid:
@@ -48,7 +46,7 @@ class Pyramid:
     """
 
     def __init__(self, scene: Scene, doubled: Scene | None = None) -> None:
-        self.scene, self.doubled = scene, doubled
+        self.scene, self._doubled = scene, doubled
         width = scene.cameras.size_px[:, 0]
         finest = torch.tensor([scene.photographs.finest_width(i) for i in range(len(width))])
         octaves = torch.log2(torch.stack([COARSEST_PX / width, finest / width]).double())
@@ -122,8 +120,7 @@ class Pyramid:
 
     def read(self, photograph: int, level: int) -> Read:
         """Read a photograph at a level, and where it is used if it has a mask."""
-        photographs = self.scene.photographs
-        own = photographs[photograph], photographs.masks[photograph] if photographs.masks else None
+        own = self.scene.photographs.read(photograph)
         if level == 0:
             return own
         camera = self.camera(photograph, level)
@@ -148,10 +145,8 @@ class Pyramid:
 
     def _read(self, photograph: int, width: int, height: int) -> Read:
         """Read a photograph's file at a size."""
-        if self.doubled is not None:
-            colours, masks = self.doubled.photographs[photograph], self.doubled.photographs.masks_of([photograph])
-            if colours.shape[:2] == (height, width):
-                return colours, masks[0] if masks else None
+        if self._doubled is not None and self._doubled.photographs[photograph].shape[:2] == (height, width):
+            return self._doubled.photographs.read(photograph)
 
         def decode(key: tuple[int, int, int]) -> Read:
             with self._decoding:
