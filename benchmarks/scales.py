@@ -56,18 +56,22 @@ def measure_scales(
         say: reports progress.
         pictures: folder for a detail of the first held-out photograph, at the largest width, beside how it is rendered.
 
+    Returns:
+        By source, its figures by width and way, how it was opened, and where and when it was measured last.
+
     Raises:
         RunError: two sources have one name.
     """
     named = {source.resolve().name: source for source in sources}
     if len(named) < len(sources):
         raise RunError(f"two of {', '.join(map(str, sources))} have one name: expected different ones; rename a folder")
-    record = read_json(runs / SCALES_FILE) or {"figures": {}}
+    record = read_json(runs / SCALES_FILE) or {}
     for name, source in named.items():
+        measured = record.setdefault(name, {"figures": {}})
         shown: dict[str, Image8] = {}
         for picture in widths:
             for way, options in WAYS.items():
-                place = record["figures"].setdefault(name, {}).setdefault(str(picture), {})
+                place = measured["figures"].setdefault(str(picture), {})
                 detail = pictures is not None and picture == max(widths) and way in SHOWN
                 if way in place and not detail:
                     continue
@@ -81,7 +85,7 @@ def measure_scales(
                         file = min((out / "renderings").rglob("*.png"))
                         shown[SHOWN[way]] = torch.from_numpy(decode(file).copy())
                 trained = found["configuration"].get("trained")
-                record.setdefault("opened", {})[name] = (
+                measured["opened"] = (
                     f"Opened at {width} px, with trained weights as they are."
                     if trained is None
                     else f"Trained at {found['configuration']['trained_width']} px for {trained['seconds'] / 60:.1f} "
@@ -89,11 +93,11 @@ def measure_scales(
                 )
                 place[way] = {metric: found["mean"][metric] for metric in METRICS}
                 place[way] |= {"seconds": found["seconds_per_frame"], "protocol": found["protocol"]}
-                command = "python -m benchmarks scales RUN|SCENE..."
-                write_json(runs / SCALES_FILE, {**record, **describe(), "command": command})
+                measured |= describe() | {"command": "python -m benchmarks scales RUN|SCENE..."}
+                write_json(runs / SCALES_FILE, record)
         if pictures is not None:
             _write_detail(source, shown, pictures / f"scales-{name}.png")
-    return record["figures"]
+    return record
 
 
 def _write_detail(source: Path, renderings: Mapping[str, Image8], picture: Path) -> None:
@@ -119,7 +123,7 @@ def write_page(runs: Path, out: Path) -> None:
         "pixels are much larger than those of the photographs. PSNR, SSIM and FLIP of doubly seen pixels; the second "
         "PSNR after the colour fit.",
     ]
-    for name, of_widths in record["figures"].items():
+    for name, measured in record.items():
         columns = ["width, px", "way", "PSNR", "PSNR, colour fit", "SSIM", "FLIP", "s per frame"]
         rows = [
             (
@@ -129,13 +133,13 @@ def write_page(runs: Path, out: Path) -> None:
                 *(f"{cell[metric]:.4f}" for metric in METRICS[2:]),
                 f"{cell['seconds']:.1f}",
             )
-            for width, ways in of_widths.items()
+            for width, ways in measured["figures"].items()
             for way, cell in ways.items()
         ]
-        parts += [f"## {name}", record["opened"][name], Table(name, columns, rows).markdown()]
+        parts += [f"## {name}", measured["opened"], Table(name, columns, rows).markdown()]
         picture = f"scales-{name}.png"
         if (out.parent / picture).is_file():
             about = "The middle of a held-out photograph, and of how it is rendered"
             parts.append(f"![{about}]({picture})")
-    parts += ["## How this was measured", "\n".join(f"- {line}" for line in circumstances([("scales", record)]))]
+    parts += ["## How this was measured", "\n".join(f"- {line}" for line in circumstances(list(record.items())))]
     write_text(out, "\n\n".join(parts) + "\n")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.scales import METRICS, SHOWN, WAYS, measure_scales, write_page
-from tidefield.files import write_json
+from benchmarks.scales import METRICS, SCALES_FILE, SHOWN, WAYS, measure_scales, write_page
+from tidefield.files import read_json, write_json
 from tidefield.synthetic import make_survey, write_survey
 
 
@@ -32,10 +32,15 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
     assert len(commands) == 2 * 2 * len(WAYS)
     assert ("--zero-shot" in commands[0], "--zero-shot" in commands[-1]) == (False, True)
     assert commands[1][-4:] == ["--rays-per-pixel", "4", "--device", "cpu"]
+    record = read_json(tmp_path / SCALES_FILE)
+    record["run"]["machine"]["processor"] = "another"
+    write_json(tmp_path / SCALES_FILE, record)
     write_page(tmp_path, tmp_path / "page.md")
     lines = (tmp_path / "page.md").read_text().splitlines()
     assert "Trained at 400 px for 10.0 minutes, 1,833 steps." in lines
     assert "Opened at 400 px, with trained weights as they are." in lines
+    machines = [line for line in lines if line.startswith("- Machine: ")]
+    assert [("another" in line, line.split(": ")[-1]) for line in machines] == [(True, "run."), (False, "scene.")]
     assert "| 100 | points | 1.00 | 1.00 | 1.0000 | 1.0000 | 0.5 |" in lines
     assert "| | as usual | 20.00 | 20.00 | 20.0000 | 20.0000 | 0.5 |" in [line.replace("|  |", "| |") for line in lines]
 
