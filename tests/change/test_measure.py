@@ -9,8 +9,8 @@ from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, Options, measure
-from tidefield.change.regions import Region
-from tidefield.change.surfaces import ChangeError, open_surface
+from tidefield.change.regions import Region, read_regions
+from tidefield.change.surfaces import ChangeError, common_grid, open_surface
 
 AREA = 0.25
 
@@ -134,6 +134,34 @@ def test_a_tilt_is_found(tmp_path: Path):
     assert gx == pytest.approx(0.002, abs=2e-4)
     assert gy == pytest.approx(0.001, abs=2e-4)
     assert np.nanstd(found.dz) < 0.03
+
+
+def test_an_outline_has_the_systematic_error_of_its_own_cells(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 9, 0.3)
+    found = measured(earlier, later, options=Options(register="tilt"))
+    assert len(found.each) >= 2
+    for number, volume, _ in found.each:
+        inside = found.outlines.labels == number
+        expected = found.errors.registration.deviation_of_sum(found.grid, inside) * AREA
+        assert volume.systematic_m3 == pytest.approx(expected)
+
+
+def test_polygons_of_one_name_stay_apart_and_none_is_called_as_the_whole(tmp_path: Path):
+    import json
+
+    names = ["mud", "mud", "all", "", "mud (2)"]
+    corners = [(0, 0), (10, 0), (10, 10), (0, 0)]
+    shapes = [[[WEST + x, NORTH - 20 + y] for x, y in corners] for _ in names]
+    features = [
+        {"type": "Feature", "properties": {"name": name}, "geometry": {"type": "Polygon", "coordinates": [shape]}}
+        for name, shape in zip(names, shapes, strict=True)
+    ]
+    system = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32630"}}
+    path = tmp_path / "a.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": system, "features": features}))
+    grid = common_grid([open_surface(write_surface(tmp_path / "a.tif", np.zeros((100, 100), np.float32)))])
+    found = [region.name for region in read_regions(path, grid)]
+    assert found == ["mud", "mud (2)", "all (2)", "4", "mud (2) (2)"]
 
 
 def test_a_folder_of_maps_is_opened_by_its_names(tmp_path: Path):

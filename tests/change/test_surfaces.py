@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
 from tidefield.change.surfaces import ChangeError, common_grid, open_surface
@@ -63,8 +64,6 @@ def test_cells_without_heights_are_not_heights(tmp_path: Path, nodata: float, de
 
 
 def test_another_coordinate_system_is_converted(tmp_path: Path):
-    from pyproj import Transformer
-
     to = Transformer.from_crs("EPSG:32630", "EPSG:27700", always_xy=True)
     one = write_surface(tmp_path / "a.tif", plane(80, 100, 0.5))
     x0, y0 = to.transform(WEST + 25, NORTH - 20)
@@ -84,6 +83,51 @@ def test_another_coordinate_system_is_converted(tmp_path: Path):
 def test_feet_are_converted_to_metres(tmp_path: Path):
     path = write_surface(tmp_path / "a.tif", np.full((30, 30), 100, np.float32), crs="EPSG:6318+6360")
     assert open_surface(path).metres == pytest.approx(0.3048, abs=1e-5)
+
+
+def test_feet_without_a_unit_of_heights_are_remarked(tmp_path: Path):
+    plain = write_surface(tmp_path / "a.tif", np.full((30, 30), 100, np.float32), crs="EPSG:2263")
+    assert any("US survey foot" in remark for remark in open_surface(plain).remarks)
+    known = write_surface(tmp_path / "b.tif", np.full((30, 30), 100, np.float32), crs="EPSG:2263+6360")
+    assert open_surface(known).remarks == []
+
+
+@pytest.mark.parametrize("system", ["EPSG:4326", "EPSG:3857", "EPSG:3395"])
+def test_cells_are_those_of_the_ground_where_units_of_the_map_are_not(tmp_path: Path, system: str):
+    to = Transformer.from_crs("EPSG:32630", system, always_xy=True)
+    (west, east), (south, north) = to.transform([WEST, WEST + 100], [NORTH - 100, NORTH])
+    size = (east - west) / 200, (north - south) / 200
+    surface = open_surface(
+        write_surface(tmp_path / "a.tif", np.zeros((200, 200), np.float32), 0, west, north, system, size=size)
+    )
+    grid = common_grid([surface])
+    assert CRS(grid.crs).to_epsg() == 32630
+    with surface.on_grid(grid) as rows:
+        known = np.isfinite(rows(0, grid.rows)).sum() * grid.cell_area_m2
+    assert known == pytest.approx(10_000, rel=0.03)
+
+
+def test_whole_numbers_with_a_scale_and_an_offset_are_heights(tmp_path: Path):
+    import rasterio
+
+    heights = plane(40, 40, 0.5) + np.float32(3)
+    path = write_surface(tmp_path / "a.tif", np.round((heights - 1) / 0.001).astype(np.int16), nodata=-9999)
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (0.001,), (1.0,)
+    found = read(path, common_grid([open_surface(path)]))
+    assert np.abs(found - heights).max() < 0.001
+
+
+def test_zeros_are_heights_of_a_scaled_file_whose_other_heights_are_low(tmp_path: Path):
+    import rasterio
+
+    values = np.full((40, 40), 20, np.int16)
+    values[:10] = 0
+    path = write_surface(tmp_path / "a.tif", values)
+    with rasterio.open(path, "r+") as file:
+        file.scales = (0.01,)
+    found = read(path, common_grid([open_surface(path)]))
+    assert [found[0, 0], found[-1, 0]] == pytest.approx([0, 0.2])
 
 
 def test_surveys_of_different_places_are_refused_with_their_places(tmp_path: Path):

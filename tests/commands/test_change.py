@@ -225,8 +225,13 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
     assert "The same place then and now" in (tmp_path / "out" / "change.html").read_text()
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
     assert "--scenes" in told
+    # Mistakes about views are found before anything is measured.
+    monkeypatch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
     assert "none" in told
+    nowhere = ("--scenes", tmp_path / "early", tmp_path / "nowhere")
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *nowhere)
+    assert "nowhere" in told
     assert not (tmp_path / "new").exists()
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
-from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.change.registration import Registration
+from tidefield.change.surfaces import ChangeError, Grid, is_local, same_system
 from tidefield.files import reading_from
+from tidefield.geometry.geodesy import horizontal, metres_per_height, metric_system, zero_of_heights
 from tidefield.maps.classes import NOISE, WATER
 
 if TYPE_CHECKING:
@@ -33,14 +36,17 @@ class Cloud:
     """Points in metres.
 
     Attributes:
+        crs: a system of true metres; None where the file states none, or a local one.
         xyz: east, north, up.
         sigma: standard errors of their heights, if the file has them.
+        zero: name of the datum of the heights, if the file states one.
     """
 
     path: Path
     crs: CRS | None
     xyz: Float64[np.ndarray, "N 3"]
     sigma: Float64[np.ndarray, " N"] | None
+    zero: str | None = None
 
 
 def require_laspy() -> ModuleType:
@@ -61,8 +67,10 @@ def require_laspy() -> ModuleType:
 def read_cloud(path: Path) -> Cloud:
     """Read the points of a LAS or LAZ file without those that are classified as noise or water.
 
+    Those of systems in feet, or of Web Mercator, are converted to the UTM zone of their middle.
+
     Raises:
-        ChangeError: the file is damaged, empty or too large, or in degrees.
+        ChangeError: the file is damaged, empty or too large, in degrees, or outside of its system.
     """
     laspy = require_laspy()
     expected = "expected a LAS or LAZ file with points; name another"
@@ -93,43 +101,44 @@ def read_cloud(path: Path) -> Cloud:
         raise ChangeError(f"{path} has no points but noise and water: {expected}")
     if crs is not None and crs.is_geographic:
         raise ChangeError(f"{path} is in degrees: expected a projected system in metres; convert it first")
-    return Cloud(path, crs, xyz * _metres(crs), np.concatenate(sigmas) if sigmas else None)
+    sigma = np.concatenate(sigmas) if sigmas else None
+    if crs is None or is_local(crs):
+        return Cloud(path, None, xyz, sigma)
+    up = metres_per_height(crs)
+    xyz[:, 2] *= up
+    try:
+        metric = metric_system(crs, *xyz[:, :2].mean(axis=0).tolist())
+    except ProjError as error:
+        raise ChangeError(
+            f"{path} lies outside of {crs.name} ({error}): expected coordinates of its system; assign the right one "
+            "(pdal translate --writers.las.a_srs)"
+        ) from error
+    own = crs if up == 1 else horizontal(crs)
+    cloud = Cloud(path, own, xyz, None if sigma is None else sigma * up, zero_of_heights(crs))
+    return in_system(cloud, metric)
 
 
-def _metres(crs: CRS | None) -> np.ndarray:
-    """Length of one unit of each axis."""
-    factors = np.ones(3)
-    if crs is not None:
-        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
-        factors[:2] = horizontal.axis_info[0].unit_conversion_factor
-        up = [axis for axis in crs.axis_info if axis.direction == "up"]
-        factors[2] = up[0].unit_conversion_factor if up else 1.0
-    return factors
-
-
-def in_system(cloud: Cloud, other: Cloud) -> Cloud:
-    """Convert a cloud to another one's coordinate system.
+def in_system(cloud: Cloud, crs: CRS | None) -> Cloud:
+    """Convert the eastings and northings of a cloud to another system of metres.
 
     Raises:
         ChangeError: only one of them has a system, or there is no way between them.
     """
-    if cloud.crs is None and other.crs is None:
+    if cloud.crs is None and crs is None:
         return cloud
-    if cloud.crs is None or other.crs is None:
-        bare = cloud if cloud.crs is None else other
+    if cloud.crs is None or crs is None:
+        lacks = cloud.path.name if cloud.crs is None else f"what {cloud.path.name} is compared with"
         raise ChangeError(
-            f"{bare.path.name} has no coordinate system, the other cloud has one: expected it in both or in none; "
-            "assign it (pdal translate --writers.las.a_srs)"
+            f"{lacks} has no coordinate system: expected it in both surveys or in none; assign it (pdal translate "
+            "--writers.las.a_srs)"
         )
-    if cloud.crs.equals(other.crs, ignore_axis_order=True):
+    if same_system(cloud.crs, crs):
         return cloud
-    own, theirs = (c.sub_crs_list[0] if c.is_compound else c for c in (cloud.crs, other.crs))
-    scale = _metres(cloud.crs)[:2], _metres(other.crs)[:2]
-    x, y = Transformer.from_crs(own, theirs, always_xy=True).transform(*(cloud.xyz[:, :2] / scale[0]).T)
-    xy = np.stack([x, y], axis=1) * scale[1]
-    if not np.isfinite(xy).all():
-        raise ChangeError(f"{cloud.path} cannot be converted to {theirs.name}: expected a system that fits its place")
-    return Cloud(cloud.path, other.crs, np.column_stack([xy, cloud.xyz[:, 2]]), cloud.sigma)
+    xy = Transformer.from_crs(horizontal(cloud.crs), horizontal(crs), always_xy=True).transform(*cloud.xyz[:, :2].T)
+    xyz = np.column_stack([*xy, cloud.xyz[:, 2]])
+    if not np.isfinite(xyz).all():
+        raise ChangeError(f"{cloud.path} cannot be converted to {crs.name}: expected a system that fits its place")
+    return replace(cloud, crs=crs, xyz=xyz)
 
 
 def default_cell(cloud: Cloud) -> float:
@@ -162,8 +171,6 @@ def write_surface(cloud: Cloud, cell_m: float, path: Path) -> None:
     count = np.bincount(at, minlength=rows * columns)
     total = np.bincount(at, cloud.xyz[:, 2], rows * columns)
     heights = np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32).reshape(rows, columns)
-    crs = cloud.crs.sub_crs_list[0] if cloud.crs is not None and cloud.crs.is_compound else cloud.crs
-    metric = crs is None or abs(crs.axis_info[0].unit_conversion_factor - 1) < 1e-9
     with rasterio.open(
         path,
         "w",
@@ -173,7 +180,7 @@ def write_surface(cloud: Cloud, cell_m: float, path: Path) -> None:
         count=1,
         dtype="float32",
         nodata=math.nan,
-        crs=crs.to_wkt() if crs is not None and metric else None,
+        crs=horizontal(cloud.crs).to_wkt() if cloud.crs is not None else None,
         transform=grid.transform,
     ) as file:
         file.write(heights, 1)
@@ -183,8 +190,7 @@ def compare_clouds(
     earlier: Cloud,
     later: Cloud,
     spacing_m: float,
-    registration_m: float,
-    vertical_m: float,
+    registration: Registration,
     tick: Callable[[int, int], Any] | None = None,
 ) -> Distances:
     """M3C2 at core points that are one point of the earlier cloud in each cell of a grid.
@@ -192,16 +198,16 @@ def compare_clouds(
     Normals are of points within 3 spacings, cylinders have a radius of 2 spacings and reach as far as heights differ.
 
     Args:
-        registration_m: one sigma of the systematic error.
-        vertical_m: what is taken from the later heights.
+        registration: moves the later cloud, in the system of both; the level of detection counts its error.
     """
     cells = np.floor(earlier.xyz[:, :2] / spacing_m).astype(np.int64)
     _, first = np.unique(cells - cells.min(axis=0), axis=0, return_index=True)
     cores = earlier.xyz[np.sort(first)]
-    moved = later.xyz - np.array([0, 0, vertical_m])
+    moved = registration.moved(later.xyz)
     # About the middle, so that large coordinates cost no digits.
     middle = cores.mean(axis=0).round()
     normals = fit_normals(earlier.xyz - middle, cores - middle, 3 * spacing_m)
+    across = np.hypot(normals[:, 0], normals[:, 1])
     reach = max(10 * spacing_m, 1.0)
     found = m3c2(
         earlier.xyz - middle,
@@ -210,7 +216,7 @@ def compare_clouds(
         normals,
         2 * spacing_m,
         reach,
-        registration_m,
+        np.hypot(registration.deviation_at(cores), registration.shift_error_m * across),
         (earlier.sigma, later.sigma),
         tick,
     )
@@ -237,7 +243,7 @@ def write_distances(found: Distances, crs: CRS | None, path: Path) -> None:
     for name in values:
         header.add_extra_dim(laspy.ExtraBytesParams(name, np.float32))
     las = laspy.LasData(header)
-    las.x, las.y, las.z = found.cores.T / _metres(crs)[:, None]
+    las.x, las.y, las.z = found.cores.T
     for name, value in values.items():
         las[name] = value.astype(np.float32)
     las.write(str(path))

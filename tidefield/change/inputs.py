@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, write_surface
-from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface
+from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, require_one_zero
 
 FILLED = "filled.tif"
 """Of `tidefield map --fill`, next to the surface."""
@@ -121,8 +121,9 @@ def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tu
 
 
 def _both(earlier: Path, later: Path) -> tuple[Cloud, Cloud]:
-    first = read_cloud(earlier)
-    return first, in_system(read_cloud(later), first)
+    first, second = read_cloud(earlier), read_cloud(later)
+    require_one_zero([(cloud.path, cloud.zero) for cloud in (first, second)])
+    return first, in_system(second, first.crs)
 
 
 def first_of(folder: Path, names: tuple[str, ...]) -> Path | None:

@@ -61,7 +61,7 @@ def m3c2(
     normals: Points,
     radius_m: float,
     half_length_m: float,
-    registration_m: float = 0.0,
+    registration_m: float | Float64[np.ndarray, " N"] = 0.0,
     sigmas: tuple[Float64[np.ndarray, " A"] | None, Float64[np.ndarray, " B"] | None] = (None, None),
     tick: Callable[[int, int], Any] | None = None,
 ) -> Distances:
@@ -70,7 +70,7 @@ def m3c2(
     Args:
         radius_m: of the cylinder (half of CloudCompare's projection diameter).
         half_length_m: H, how far the cylinder reaches to either side.
-        registration_m: error of the registration, 1 sigma.
+        registration_m: error of the registration, 1 sigma, of all core points or of each.
         sigmas: standard errors of the points of either cloud, along any direction.
     """
     if not (radius_m > 0 and half_length_m > 0):

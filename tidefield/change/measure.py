@@ -121,10 +121,11 @@ def read_difference(
                     tick(rows.stop + (grid.rows if sign > 0 else 0), 2 * grid.rows)
         if sigma is not None:
             assert surface.sigma is not None
-            raster = open_surface(surface.sigma)
+            # In the unit of the heights, whatever unit of heights the raster of errors states.
+            raster = replace(open_surface(surface.sigma), metres=surface.metres)
             with raster.on_grid(grid, moved) as read:
                 for rows in grid.strips():
-                    own = read(rows.start, rows.stop) * np.float32(surface.metres)
+                    own = read(rows.start, rows.stop)
                     own[~(own > 0)] = np.nan
                     sigma[rows] = own if sign < 0 else np.hypot(sigma[rows], own)
         if surface.filled is not None:
@@ -431,14 +432,12 @@ def _in_box(
     sigma = errors.sigma[box] if isinstance(errors.sigma, np.ndarray) else errors.sigma
     own = region_error(sigma, inside, errors.variogram, errors.grid.cell_m)
     area = errors.grid.cell_area_m2
-    x, y = (axis.start for axis in box[::-1])
-    middle = errors.registration.deviation(errors.grid, slice(y, y + 1))[0, min(x, errors.grid.columns - 1)]
     return (
         Volume(
             sign * float(values.sum()) * area,
             own.random * area,
             own.correlated * area,
-            float(middle) * len(values) * area,
+            errors.registration.deviation_of_sum(errors.grid, inside, box) * area,
             len(values) * area,
             degrees_of_freedom=errors.degrees_of_freedom,
         ),

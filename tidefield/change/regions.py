@@ -51,7 +51,7 @@ def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
 
 
 def read_regions(path: Path, grid: Grid) -> list[Region]:
-    """Read all geometries of a file's first layer, in the grid's system.
+    """Read all geometries of a file's first layer, in the grid's system; no two have one name.
 
     Raises:
         ChangeError: it cannot be read, is empty or too large, or has no geometry on the grid.
@@ -85,7 +85,8 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
     if crs is not None and grid.crs is not None:
         to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
     frame = shapely.box(*grid.bounds)
-    found = []
+    found: list[Region] = []
+    taken = {"all"}  # what tables call the whole survey
     for k, geometry in enumerate(geometries):
         if geometry is None or geometry.is_empty:
             continue
@@ -93,7 +94,13 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
             geometry = shapely.transform(geometry, partial(_converted, to))
         if not np.isfinite(geometry.bounds).all():
             raise ChangeError(f"{path} has a geometry at no place of the surveys' system: {expected}")
-        name = str(columns[chosen][k]) if chosen is not None else str(k + 1)
+        value = columns[chosen][k] if chosen is not None else None
+        name = own = str(k + 1) if value is None or value == "" else str(value)
+        times = 1
+        while name in taken:
+            times += 1
+            name = f"{own} ({times})"
+        taken.add(name)
         found.append(Region(name, shapely.make_valid(geometry)))
     if not any(region.geometry.intersects(frame) for region in found):
         raise ChangeError(

@@ -71,14 +71,36 @@ class Registration:
     def deviation(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of the systematic error of each cell, for some rows of a grid."""
         x, y = offsets(grid, self.centre_m, rows)
-        v = self.covariance
-        x, y = x[None], y[:, None]
-        square = v[0, 0] + 2 * v[0, 1] * x + 2 * v[0, 2] * y + v[1, 1] * x**2 + 2 * v[1, 2] * x * y + v[2, 2] * y**2
-        return np.sqrt(np.maximum(square, 0)).astype(np.float32)
+        return self._deviation(x[None], y[:, None]).astype(np.float32)
 
-    def deviation_of_sum(self, grid: Grid, region: Bool[np.ndarray, "rows columns"]) -> float:
-        """One sigma of the systematic error of a sum of dz over a region, metres times cells."""
-        x, y = offsets(grid, self.centre_m, slice(0, grid.rows))
+    def deviation_at(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """One sigma of the systematic error of heights at points of the grid's system."""
+        return self._deviation(*(xyz[:, :2] - self.centre_m).T)
+
+    def moved(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Points of the later survey, in the grid's system, moved onto the earlier one."""
+        c, gx, gy = self.coefficients
+        moved = xyz + np.array([*self.shift_m, 0.0])
+        x, y = (moved[:, :2] - self.centre_m).T
+        moved[:, 2] -= c + gx * x + gy * y
+        return moved
+
+    def _deviation(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        v = self.covariance
+        square = v[0, 0] + 2 * v[0, 1] * x + 2 * v[0, 2] * y + v[1, 1] * x**2 + 2 * v[1, 2] * x * y + v[2, 2] * y**2
+        return np.sqrt(np.maximum(square, 0))
+
+    def deviation_of_sum(
+        self, grid: Grid, region: Bool[np.ndarray, "rows columns"], box: tuple[slice, slice] | None = None
+    ) -> float:
+        """One sigma of the systematic error of a sum of dz over a region, metres times cells.
+
+        Args:
+            box: the rows and columns of the grid that the region covers; all if None.
+        """
+        rows, columns = box or (slice(0, grid.rows), slice(0, grid.columns))
+        x, y = offsets(grid, self.centre_m, rows)
+        x = x[columns]
         down, across = region.sum(axis=1, dtype=np.float64), region.sum(axis=0, dtype=np.float64)
         sums = np.array([down.sum(), across @ x, down @ y])
         return math.sqrt(max(0.0, float(sums @ self.covariance @ sums)))

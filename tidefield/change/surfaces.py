@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float32
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.errors import TidefieldError
 from tidefield.files import reading_from
-from tidefield.geometry.geodesy import utm_zone
+from tidefield.geometry.geodesy import horizontal, in_metres, metres_per_height, metric_system, zero_of_heights
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -111,6 +111,7 @@ class Surface:
         transform: from column and row to the file's own coordinates; whole numbers are corners of pixels.
         nodata: value of pixels without a height, declared or found; None if there is none.
         metres: length of one unit of the heights.
+        scale, offset: heights are the file's values times scale plus offset.
         sigma: raster of their standard errors, if there is one.
         filled: raster that is 1 where heights were filled in, which are no measurements.
         orthophoto, cloud: of the same survey, if there are any.
@@ -127,6 +128,8 @@ class Surface:
     rows: int
     nodata: float | None
     metres: float = 1.0
+    scale: float = 1.0
+    offset: float = 0.0
     sigma: Path | None = None
     filled: Path | None = None
     orthophoto: Path | None = None
@@ -155,6 +158,8 @@ class Surface:
 
             def heights(first: int, last: int) -> Float32[np.ndarray, "rows columns"]:
                 values = read(first, last)[0]
+                if (self.scale, self.offset) != (1, 0):
+                    values = values * np.float32(self.scale) + np.float32(self.offset)
                 values[np.abs(values) > _IMPOSSIBLE_M] = np.nan
                 return values * np.float32(self.metres) if self.metres != 1 else values
 
@@ -190,7 +195,7 @@ def warped(
         # Cells on the file's own pixels are copied, not interpolated.
         offset = (moved.c - own.c) / own.a, (moved.f - own.f) / own.e
         same = (
-            source == target or (crs is not None and grid.crs is not None and _same_system(crs, CRS.from_wkt(grid.crs)))
+            source == target or (crs is not None and grid.crs is not None and same_system(crs, CRS.from_wkt(grid.crs)))
         ) and own.b == own.d == 0
         size = max(dataset.width, dataset.height)
         same = same and max(abs(own.a / moved.a - 1), abs(own.e / moved.e - 1)) * size < 0.01
@@ -276,11 +281,16 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                     f"the coordinate system of {path} is not known ({error}): expected one with an EPSG code; assign "
                     "it with gdal_edit.py -a_srs"
                 ) from error
-            metres = _metres_per_height(crs)
-            if _is_local(crs):
+            metres = metres_per_height(crs)
+            if is_local(crs):
                 crs = None
                 remarks.append(
                     f"{path.name} lies in a local frame: that both surveys have the same one is taken for granted"
+                )
+            elif crs.is_projected and zero_of_heights(crs) is None and not in_metres(crs):
+                remarks.append(
+                    f"the system of {path.name} counts in {crs.axis_info[0].unit_name} and states no unit of heights, "
+                    "which are taken as metres: where they are not, assign a compound system (gdal_edit.py -a_srs)"
                 )
         else:
             remarks.append(f"{path.name} states no coordinate system; its lengths are taken as metres")
@@ -301,6 +311,8 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
             dataset.height,
             nodata,
             metres,
+            dataset.scales[0],
+            dataset.offsets[0],
             sigma_of(path),
             date=date,
             datum=tags.get("VERTICAL_DATUM"),
@@ -323,7 +335,8 @@ def _undeclared(dataset: Any) -> float | None:
     if share > 0:
         return value
     zero, rest = float((values == 0).mean()), values[(values != 0) & np.isfinite(values)]
-    if zero > _ZERO_SHARE and len(rest) and np.quantile(np.abs(rest), 0.01) > 1.0:
+    far = len(rest) > 0 and np.quantile(np.abs(rest), 0.01) * abs(dataset.scales[0]) > 1.0
+    if zero > _ZERO_SHARE and far and dataset.offsets[0] == 0:
         return 0.0
     return None
 
@@ -334,28 +347,14 @@ def date_in(text: str) -> str | None:
     return "{}{}-{}-{}".format(*found.groups()) if found else None
 
 
-def _is_local(crs: CRS) -> bool:
+def is_local(crs: CRS) -> bool:
     """Whether a system is that of a scene without a georeference, as `tidefield map` states it."""
     return crs.type_name == "Engineering CRS"
 
 
-def _metres_per_height(crs: CRS) -> float:
-    """Metres in one unit of the heights; 1 if the system does not tell."""
-    vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None)
-    axes = vertical.axis_info if vertical is not None else [a for a in crs.axis_info if a.direction == "up"]
-    return float(axes[0].unit_conversion_factor) if axes else 1.0
-
-
-def _vertical(crs: CRS) -> CRS | None:
-    return next((part for part in crs.sub_crs_list if part.is_vertical), None)
-
-
-def _horizontal(crs: CRS) -> CRS:
-    return crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
-
-
-def _same_system(one: CRS, other: CRS) -> bool:
-    return _horizontal(one).equals(_horizontal(other), ignore_axis_order=True)
+def same_system(one: CRS, other: CRS) -> bool:
+    """Whether two systems have the same eastings and northings."""
+    return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
 
 
 def other_zeros(earlier: Surface, later: Surface) -> list[str]:
@@ -402,7 +401,7 @@ def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
             "share; choose another"
         )
     own = first.transform
-    on_first = crs is not None and first.crs is not None and _same_system(crs, first.crs)
+    on_first = crs is not None and first.crs is not None and same_system(crs, first.crs)
     exact = abs(own.a + own.e) * max(first.columns, first.rows) < 0.01 * own.a
     if (on_first or crs is None) and exact and abs(cell / own.a - 1) * max(first.columns, first.rows) < 0.01:
         cell = own.a
@@ -422,15 +421,16 @@ def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
 
 
 def _metric(surface: Surface) -> CRS | None:
-    """The surface's own horizontal system where it is projected in metres, else the UTM zone of its middle."""
+    """The horizontal system of a grid of true metres at a surface's middle; None where the surface has no system."""
     if surface.crs is None:
         return None
-    own = _horizontal(surface.crs)
-    if own.is_projected and abs(own.axis_info[0].unit_conversion_factor - 1) < 1e-9:
-        return own
-    x, y = _at(surface.transform, surface.columns / 2, surface.rows / 2)
-    longitude, latitude = Transformer.from_crs(own, "EPSG:4326", always_xy=True).transform(x, y)
-    return CRS(utm_zone(longitude, latitude))
+    try:
+        return metric_system(surface.crs, *_at(surface.transform, surface.columns / 2, surface.rows / 2))
+    except ProjError as error:
+        raise ChangeError(
+            f"{surface.path} lies outside of {surface.crs.name} ({error}): expected coordinates of its system; assign "
+            "the right one with gdal_edit.py -a_srs"
+        ) from error
 
 
 def _box(surface: Surface, crs: CRS | None) -> tuple[tuple[float, float, float, float], float]:
@@ -439,18 +439,16 @@ def _box(surface: Surface, crs: CRS | None) -> tuple[tuple[float, float, float, 
     xs, ys = zip(*corners, strict=True)
     box = (min(xs), min(ys), max(xs), max(ys))
     pixel = max(abs(surface.transform.a), abs(surface.transform.e))
-    if surface.crs is None or crs is None or _same_system(surface.crs, crs):
+    if surface.crs is None or crs is None or same_system(surface.crs, crs):
         return box, pixel
     try:
-        to = Transformer.from_crs(_horizontal(surface.crs), crs, always_xy=True)
+        to = Transformer.from_crs(horizontal(surface.crs), crs, always_xy=True)
         middle = _at(surface.transform, surface.columns / 2, surface.rows / 2)
         beside = _at(surface.transform, surface.columns / 2 + 1, surface.rows / 2)
         x0, y0 = to.transform(*middle, errcheck=True)
         x1, y1 = to.transform(*beside, errcheck=True)
         return to.transform_bounds(*box, errcheck=True), math.hypot(x1 - x0, y1 - y0)
-    except Exception as error:
-        if type(error).__module__.split(".")[0] != "pyproj":
-            raise
+    except ProjError as error:
         raise ChangeError(
             f"{surface.path} cannot be converted from {surface.crs.name} to {crs.name} ({error}): expected a system "
             "that both can be converted to; warp one of them first (gdalwarp)"
@@ -475,15 +473,15 @@ def _require_same_heights(surfaces: list[Surface]) -> None:
             f"{named[0].path.name} has a coordinate system, {bare.path.name} has none: expected it in all files or in "
             "none; assign it with gdal_edit.py -a_srs"
         )
-    heights = {}
-    for surface in named:
-        assert surface.crs is not None
-        vertical = _vertical(surface.crs)
-        if vertical is not None:
-            heights[vertical.datum.name if vertical.datum is not None else vertical.name] = surface
+    require_one_zero([(surface.path, zero_of_heights(surface.crs)) for surface in named if surface.crs is not None])
+
+
+def require_one_zero(zeros: Sequence[tuple[Path, str | None]]) -> None:
+    """Raises: ChangeError when files state heights over different zeros; None states none."""
+    heights = {zero: path for path, zero in zeros if zero is not None}
     if len(heights) > 1:
         (one, first), (other, second), *_ = heights.items()
         raise ChangeError(
-            f"heights of {first.path.name} are over {one}, those of {second.path.name} over {other}: expected one zero "
+            f"heights of {first.name} are over {one}, those of {second.name} over {other}: expected one zero "
             "for both; convert one of them first (gdalwarp -t_srs with a compound system)"
         )

@@ -95,6 +95,8 @@ def change(options: Change, console: Console) -> None:
     """Run `tidefield change`."""
     refuse_existing(options.out, replaceable=False)
     _check(options)
+    if options.scenes is not None:
+        _check_scenes(options.scenes, options.cameras, options.device)
     with TemporaryDirectory() as work:
         (_series if options.series else _compare)(options, console, Path(work))
 
@@ -211,7 +213,9 @@ def _measured(
 
 def _write(found: Found, options: Change, folder: Path, console: Console) -> None:
     """Write the files of one comparison."""
-    from tidefield.change.clouds import compare_clouds, write_distances
+    from pyproj import CRS
+
+    from tidefield.change.clouds import compare_clouds, in_system, write_distances
     from tidefield.change.page import write_page
     from tidefield.change.write import write_all
     from tidefield.pages import command_line
@@ -222,12 +226,11 @@ def _write(found: Found, options: Change, folder: Path, console: Console) -> Non
     views = [] if options.scenes is None else _views(options, change, cover, folder, console)
     write_page(change, numbers, folder / "change.html", cover, water, views)
     if clouds is not None:
-        registration = change.errors.registration
+        system = None if change.grid.crs is None else CRS.from_wkt(change.grid.crs)
+        first, second = (in_system(cloud, system) for cloud in clouds)
         with ProgressBar(console, "Measuring M3C2 distances") as bar:
-            distances = compare_clouds(
-                *clouds, change.grid.cell_m, registration.systematic_m, registration.vertical_m, bar
-            )
-        write_distances(distances, clouds[0].crs, folder / "m3c2.laz")
+            distances = compare_clouds(first, second, change.grid.cell_m, change.errors.registration, bar)
+        write_distances(distances, first.crs, folder / "m3c2.laz")
 
 
 def _say(found: Found, console: Console) -> None:
@@ -278,6 +281,24 @@ def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, 
                 made.append(view)
                 bar(k + 1, len(names))
     return made
+
+
+def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: str) -> None:
+    """Find the mistakes that views would find only after everything is measured.
+
+    Raises:
+        TidefieldError: a scene cannot be read, has no such photographs, or there is no such device.
+    """
+    from tidefield.data.load import read_posed
+    from tidefield.device import choose_device
+    from tidefield.geometry.cameras import find_name
+    from tidefield.train.checkpoint import RUN_FILE, read_run
+
+    choose_device(device)
+    roots = [read_run(path).scene if (path / RUN_FILE).exists() else path for path in scenes]
+    earlier, _ = (read_posed(root, allow_missing=False) for root in roots)
+    for name in cameras:
+        find_name(name, earlier.names, str(roots[0]))
 
 
 def _check(options: Change) -> None:

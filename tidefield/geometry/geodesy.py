@@ -21,13 +21,15 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
-from pyproj import CRS, Transformer
+from pyproj import CRS, Proj, Transformer
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 WGS84 = "EPSG:4326"
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius, for distances on a sphere that may be wrong by half a per cent."""
+_TRUE_AREA = 0.01
+"""By how much areas on a map may differ from those on the ground; lengths in one direction may by twice as much."""
 _ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
@@ -95,7 +97,7 @@ class LocalFrame:
         """Convert world to easting, northing and height in the frame's projected system and its units; exact."""
         geodetic = self._transform(self._local, xyz_world, inverse=True)
         result = self._transform(self._projection, geodetic / self._degrees, inverse=True)
-        result[:, 2] /= _metres_per_height(self._crs)
+        result[:, 2] /= metres_per_height(self._crs)
         return result
 
     def from_geographic(self, longitude_latitude_height: Points) -> Points:
@@ -108,7 +110,7 @@ class LocalFrame:
         Heights keep the frame's vertical datum.
         """
         projected = self.to_crs(xyz_world)
-        height_m = projected[:, 2] * _metres_per_height(self._crs)
+        height_m = projected[:, 2] * metres_per_height(self._crs)
         return np.column_stack([self._transform(self._wgs84, projected)[:, :2], height_m])
 
     def to_json(self) -> dict:
@@ -150,7 +152,7 @@ class LocalFrame:
 
     @cached_property
     def _wgs84(self) -> Transformer:
-        return Transformer.from_crs(_horizontal(self._crs), WGS84, always_xy=True)
+        return Transformer.from_crs(horizontal(self._crs), WGS84, always_xy=True)
 
     @cached_property
     def _degrees(self) -> Float64[np.ndarray, " 3"]:
@@ -174,14 +176,14 @@ class LocalFrame:
         system = parse_crs(crs)
         base = _base(system)
         datum = base.geodetic_crs
-        points = coordinates * np.array([1.0, 1.0, _metres_per_height(system)])
+        points = coordinates * np.array([1.0, 1.0, metres_per_height(system)])
         if datum is not None and datum.to_2d() == self._datum:
             if base.is_projected:
                 points = self._transform(Transformer.from_crs(base, self._datum, always_xy=True), points)
         else:
             # By way of the projected system as given, because its definition may hold its own shift to WGS 84.
             height_m = points[:, 2].copy()
-            shift = Transformer.from_crs(_horizontal(system), _horizontal(self._crs), always_xy=True)
+            shift = Transformer.from_crs(horizontal(system), horizontal(self._crs), always_xy=True)
             points = self._transform(self._projection, self._transform(shift, points))
             points[:, 2] = height_m
         return points * self._degrees
@@ -213,7 +215,7 @@ def parse_crs(text: str) -> CRS:
     if not (base.is_projected or base.is_geographic) or base.geodetic_crs is None:
         raise ValueError(f"{text!r} ({crs.name}) is neither projected nor geographic")
     try:
-        Transformer.from_crs(_horizontal(crs), WGS84, always_xy=True)
+        Transformer.from_crs(horizontal(crs), WGS84, always_xy=True)
     except ProjError as error:
         raise ValueError(f"{text!r} ({crs.name}) cannot be transformed to WGS 84") from error
     return crs
@@ -256,14 +258,43 @@ def _name(crs: CRS) -> str:
     return crs.to_wkt() if code is None else f"EPSG:{code}"
 
 
-def _horizontal(crs: CRS) -> CRS:
+def metric_system(crs: CRS, x: float, y: float) -> CRS:
+    """Return the horizontal part of a system where its metres are those of the ground, else the UTM zone of a place.
+
+    Web Mercator is projected in metres, too, of which one is 0.6 m on the ground at 53 degrees; volumes and areas of
+    such cells are not those of the ground.
+
+    Args:
+        x, y: the place in that system and its units, longitude or easting first.
+
+    Raises:
+        ProjError: the place is outside of what the system can hold.
+    """
+    own = horizontal(crs)
+    longitude, latitude = Transformer.from_crs(own, WGS84, always_xy=True).transform(x, y, errcheck=True)
+    if own.is_projected and in_metres(own):
+        scale = Proj(_base(own)).get_factors(longitude, latitude)
+        lengths = scale.tissot_semimajor, scale.tissot_semiminor
+        if abs(scale.areal_scale - 1) < _TRUE_AREA and max(abs(k - 1) for k in lengths) < 2 * _TRUE_AREA:
+            return own
+    geodetic = own.geodetic_crs
+    return _utm(longitude, latitude, geodetic if geodetic is not None else CRS(WGS84))
+
+
+def in_metres(crs: CRS) -> bool:
+    """Return whether the first axis of a system counts metres."""
+    return abs(crs.axis_info[0].unit_conversion_factor - 1) < 1e-9
+
+
+def horizontal(crs: CRS) -> CRS:
+    """Return a system without its heights."""
     return crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
 
 
 def _base(crs: CRS) -> CRS:
     """Return the horizontal system without a shift to WGS 84 that is bound to it."""
-    horizontal = _horizontal(crs)
-    return horizontal.source_crs if horizontal.is_bound and horizontal.source_crs is not None else horizontal
+    own = horizontal(crs)
+    return own.source_crs if own.is_bound and own.source_crs is not None else own
 
 
 def _vertical_name(crs: CRS) -> str | None:
@@ -272,8 +303,16 @@ def _vertical_name(crs: CRS) -> str | None:
     return f"the ellipsoid of {crs.name}" if crs.is_geographic and len(crs.axis_info) == 3 else None
 
 
-def _metres_per_height(crs: CRS) -> float:
-    """Unit of the system's heights; metres where it defines none."""
+def zero_of_heights(crs: CRS) -> str | None:
+    """Return the name of a system's vertical datum, or None where it defines none."""
+    if not crs.is_compound:
+        return None
+    vertical = crs.sub_crs_list[1]
+    return vertical.name if vertical.datum is None else vertical.datum.name
+
+
+def metres_per_height(crs: CRS) -> float:
+    """Return the length of the unit of a system's heights; 1 where it defines none."""
     if crs.is_compound:
         return crs.sub_crs_list[1].axis_info[0].unit_conversion_factor
     return crs.axis_info[2].unit_conversion_factor if len(crs.axis_info) == 3 else 1.0

@@ -1,0 +1,128 @@
+"""Point clouds of whatever system, in true metres, and moved as the registration says."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from tidefield.change.clouds import Cloud, compare_clouds, in_system, read_cloud, write_distances, write_surface
+from tidefield.change.inputs import open_pair
+from tidefield.change.registration import Registration
+from tidefield.change.surfaces import ChangeError, open_surface
+
+US_FOOT = 1200 / 3937
+EAST, NORTH = 1_830_000.0, 646_000.0
+"""A place in California, zone 3 of the state's plane coordinates, in metres."""
+
+
+def write_cloud(path: Path, crs: str, xyz: np.ndarray, sigma: np.ndarray | None = None) -> Path:
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_crs(CRS(crs))
+    header.offsets, header.scales = xyz.mean(axis=0).round(), np.full(3, 0.001)
+    if sigma is not None:
+        header.add_extra_dim(laspy.ExtraBytesParams("sigma_z", np.float32))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    if sigma is not None:
+        las["sigma_z"] = sigma.astype(np.float32)
+    las.write(str(path))
+    return path
+
+
+def square(rng: np.random.Generator, size_m: float, count: int = 2000) -> np.ndarray:
+    """Points of a level square, the first four at its corners."""
+    xy = np.concatenate([size_m * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]), rng.uniform(0, size_m, (count, 2))])
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+def registration(**changes: Any) -> Registration:
+    """One that moves nothing, with changes."""
+    none = (0.0, 0.0, 0.0)
+    plain = {"model": "none", "coefficients": none, "covariance": np.zeros((3, 3)), "centre_m": (0.0, 0.0)}
+    return Registration(**{**plain, "stable_cells": 100, "before": none, "after": none, **changes})
+
+
+def test_feet_become_metres_of_the_utm_zone(tmp_path: Path):
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([EAST, NORTH, 30.0])
+    path = write_cloud(tmp_path / "a.laz", "EPSG:2227+6360", xyz / US_FOOT, np.full(len(xyz), 0.1))
+    cloud = read_cloud(path)
+    assert cloud.crs is not None
+    assert cloud.crs.to_epsg() == 26910
+    expected = Transformer.from_crs("EPSG:2227", "EPSG:26910", always_xy=True).transform(*(xyz[:, :2] / US_FOOT).T)
+    assert np.abs(cloud.xyz[:, :2] - np.stack(expected, axis=1)).max() < 0.001
+    assert cloud.xyz[:, 2] == pytest.approx(30, abs=0.001)
+    assert cloud.sigma == pytest.approx(0.1 * US_FOOT)
+    write_surface(cloud, 10.0, tmp_path / "a.tif")
+    written = open_surface(tmp_path / "a.tif")
+    assert written.crs is not None
+    assert written.crs.to_epsg() == 26910
+
+
+def test_distances_of_clouds_in_feet_are_written_where_the_clouds_are(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    rng = np.random.default_rng(0)
+    place = np.array([EAST, NORTH, 30.0])
+    early, late = (square(rng, 20.0) + place for _ in range(2))
+    clouds = [
+        read_cloud(write_cloud(tmp_path / f"{name}.laz", "EPSG:2227+6360", (xyz + np.array([0, 0, up])) / US_FOOT))
+        for name, xyz, up in (("early", early, 0.0), ("late", late, 0.5))
+    ]
+    found = compare_clouds(clouds[0], clouds[1], 1.0, registration())
+    write_distances(found, clouds[0].crs, tmp_path / "m3c2.laz")
+    written = laspy.read(tmp_path / "m3c2.laz")
+    assert written.header.parse_crs().to_epsg() == 26910
+    place = Transformer.from_crs("EPSG:26910", "EPSG:2227", always_xy=True)
+    x, y = place.transform(np.asarray(written.x), np.asarray(written.y))
+    assert [x.min() * US_FOOT - EAST, y.min() * US_FOOT - NORTH] == pytest.approx([0, 0], abs=1.0)
+    assert np.nanmedian(written["M3C2_distance"]) == pytest.approx(0.5, abs=0.001)
+
+
+def test_a_square_of_web_mercator_has_the_area_of_the_ground(tmp_path: Path):
+    x, y = Transformer.from_crs("EPSG:25832", "EPSG:3857", always_xy=True).transform(450_000.0, 5_930_000.0)
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([x, y, 2.0])
+    cloud = read_cloud(write_cloud(tmp_path / "a.laz", "EPSG:3857", xyz))
+    assert np.ptp(cloud.xyz[:, 0]) == pytest.approx(100 / 1.68, rel=0.02)
+
+
+def test_clouds_over_different_zeros_are_refused(tmp_path: Path):
+    xyz = square(np.random.default_rng(0), 20.0) + np.array([450_000.0, 5_930_000.0, 2.0])
+    one = write_cloud(tmp_path / "a.laz", "EPSG:25832+7837", xyz)
+    other = write_cloud(tmp_path / "b.laz", "EPSG:25832+5783", xyz)
+    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
+        open_pair(one, other, tmp_path)
+
+
+def test_one_cloud_without_a_system_is_refused():
+    bare = Cloud(Path("a.laz"), None, np.zeros((3, 3)), None)
+    with pytest.raises(ChangeError, match=r"a\.laz has no coordinate system"):
+        in_system(bare, CRS("EPSG:25832"))
+
+
+def test_the_later_cloud_is_moved_by_the_whole_registration():
+    rng, slope = np.random.default_rng(0), np.array([0.3, 0.0])
+    early, late = square(rng, 40.0, 8000), square(rng, 40.0, 8000)
+    # What the later survey shows: the same slope, shifted to the west, raised and tilted.
+    early[:, 2] = early[:, :2] @ slope
+    late[:, 2] = (late[:, :2] + np.array([0.4, 0.0])) @ slope + 0.2 + 0.01 * (late[:, 0] + 0.4 - 20)
+    covariance = np.diag([0.03**2, 0.002**2, 0.0])
+    moves = registration(
+        coefficients=(0.2, 0.01, 0.0),
+        covariance=covariance,
+        centre_m=(20.0, 20.0),
+        shift_m=(0.4, 0.0),
+        shift_error_m=0.05,
+    )
+    clouds = [Cloud(Path("a.laz"), None, xyz, None) for xyz in (early, late)]
+    found = compare_clouds(clouds[0], clouds[1], 1.0, moves)
+    inner = (np.abs(found.cores[:, :2] - 20) < 15).all(axis=1)
+    assert np.abs(found.distance_m[inner]).max() < 0.01
+    exact = replace(moves, covariance=np.zeros((3, 3)), shift_error_m=0.0)
+    alone = compare_clouds(clouds[0], clouds[1], 1.0, exact)
+    added = (found.detection_m - alone.detection_m)[inner]
+    across = np.hypot(found.normals[inner, 0], found.normals[inner, 1])
+    vertical = np.hypot(0.03, 0.002 * (found.cores[inner, 0] - 20))
+    assert added == pytest.approx(1.96 * np.hypot(vertical, 0.05 * across))
