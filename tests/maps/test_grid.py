@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pyproj import CRS
 
+from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.grid import Grid, MapFrame, feather
+from tidefield.maps.grid import Grid, MapFrame, _vertical, feather
 
 FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
 
@@ -45,3 +47,29 @@ def test_tiles_fade_into_each_other_and_leave_nothing_out(columns: int, rows: in
     assert total.min() > 0
     # Where all neighbours exist the weights add up to one.
     np.testing.assert_allclose(total[16 : rows - 16, 16 : columns - 16], 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("system", "units"),
+    [
+        ("EPSG:27700+5701", ("m", "m")),
+        ("EPSG:2263", ("US survey foot", "m")),
+        ("EPSG:2263+5703", ("US survey foot", "m")),
+        ("EPSG:2263+6360", ("US survey foot", "US survey foot")),
+    ],
+)
+def test_lengths_and_heights_have_units_of_their_own(system: str, units: tuple[str, str]):
+    origin = (987_000.0, 211_000.0, 30.0) if "2263" in system else (351_200.0, 512_900.0, 260.0)
+    crs = CRS(system)
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    up = crs.sub_crs_list[1].axis_info[0].unit_conversion_factor if crs.is_compound else 1.0
+    metre = 1 / horizontal.axis_info[0].unit_conversion_factor
+    frame = MapFrame(LocalFrame.at(system, origin), np.zeros(3), np.eye(3), "", "", "", metre, 1 / up)
+    assert (frame.unit, frame.unit_up) == units
+
+
+def test_heights_in_metres_are_not_stated_in_feet():
+    with pytest.raises(RunError, match="US survey foot: expected a system in metres"):
+        _vertical("unknown", "EPSG:6360")
+    assert _vertical("NAVD88 height (ftUS)", None) is None
+    assert _vertical("NAVD88 height", None) == CRS("EPSG:5703")

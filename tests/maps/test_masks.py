@@ -174,6 +174,14 @@ def test_a_waterline_ends_where_the_map_ends():
     body = masks.Body(1.0, 0.01, 0.03, 10.0)
     west, south, east, north = grid.bounds
     lake = shapely.box(west, south, (west + east) / 2, north)
-    layer = masks._waterline([(lake, body)], grid)
+    everywhere = np.ones((grid.rows, grid.columns), bool)
+    layer = masks._waterline([(lake, body)], ~everywhere, grid)
     [line] = layer.shapes
     assert line.length == pytest.approx(north - south, rel=0.05)
+    # Photographs see the lake down to a line across it: below that it has no surface, and no shore there.
+    seen = everywhere.copy()
+    seen[grid.rows // 2 :] = False
+    lake = shapely.box(west, (south + north) / 2, (west + east) / 2, north)
+    [line] = masks._waterline([(lake, body)], ~seen, grid).shapes
+    assert line.length == pytest.approx((north - south) / 2, rel=0.05)
+    assert np.ptp(shapely.get_coordinates(line)[:, 0]) == 0

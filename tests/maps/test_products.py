@@ -79,6 +79,18 @@ def test_rims_that_matching_widens_are_taken_off(tmp_path: Path):
     np.testing.assert_allclose(terrain[away > 38], bare[away > 38], atol=1e-5)
 
 
+def test_the_terrain_of_a_long_coast_is_that_of_its_plane(tmp_path: Path):
+    coast = replace(GRID, columns=33_000, rows=8)
+    rows, columns = np.ogrid[: coast.rows, : coast.columns]
+    plane = (2 + 1e-4 * columns + 1e-3 * rows).astype(np.float32)
+    surface = plane.copy()
+    surface[2:4, 20_000:20_004] += 0.5
+    dsm = written(tmp_path / "dsm.tif", surface, coast)
+    sigma = written(tmp_path / "sigma.tif", np.full(plane.shape, 0.02), coast)
+    write_terrain(dsm, sigma, Raster(tmp_path / "dtm.tif", ("terrain",)), coast)
+    np.testing.assert_allclose(read_raster(tmp_path / "dtm.tif")[0], plane, atol=0.01)
+
+
 def test_hillshade_is_that_of_a_plane():
     y, x = np.mgrid[:20, :20].astype(float)
     slope = hillshade(0.5 * x, 1.0)[5:15, 5:15]  # rises to the east
@@ -161,7 +173,7 @@ def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path):
     np.testing.assert_allclose(section.height[known], truth[known], atol=1e-4)
     assert known[section.place[:, 0] < 49.9].all()
     assert not known[section.place[:, 0] > 50].any()
-    table, plot = write_sections([section], tmp_path, "m")
+    table, plot = write_sections([section], tmp_path, "US survey foot", "m")
     first = table.read_text().splitlines()[1]
     assert first.startswith('"creek, mouth",0.000,20.030,70.010,')
     low, height, high = (float(first.rsplit(",", 4)[k]) for k in (3, 1, 4))

@@ -101,7 +101,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     )
     if "check_points" in result:
         found = result["check_points"]
-        console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit)}", soft_wrap=True)
+        console.print(f"{found['remark']}: {_describe(found['vertical'], frame.unit_up)}", soft_wrap=True)
     return result
 
 

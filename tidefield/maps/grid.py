@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError
 from tidefield.data.georeference import Georeference
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.geometry.geodesy import LocalFrame, parse_crs
+from tidefield.geometry.geodesy import LocalFrame, in_metres, parse_crs
 from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
@@ -75,14 +75,18 @@ class MapFrame:
 
     @property
     def unit(self) -> str:
-        """Of lengths, for people."""
-        return (
-            "units"
-            if self.frame is None
-            else "m"
-            if self.metre == 1
-            else parse_crs(self.frame.crs).axis_info[0].unit_name
-        )
+        """Of lengths on the ground, for people."""
+        return self._unit(self.metre, 0)
+
+    @property
+    def unit_up(self) -> str:
+        """Of heights, for people."""
+        return self._unit(self.metre_up, -1)
+
+    def _unit(self, metre: float, axis: int) -> str:
+        if self.frame is None:
+            return "units"
+        return "m" if metre == 1 else parse_crs(self.frame.crs).axis_info[axis].unit_name
 
     def to_map(self, xyz_scene: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Convert scene coordinates to easting, northing and height."""
@@ -138,11 +142,17 @@ def _vertical(datum: str, given: str | None) -> CRS | None:
             raise RunError(f"--heights {given} was given: expected a vertical system, such as EPSG:5701") from error
         if not crs.is_vertical:
             raise RunError(f"--heights {given} is {crs.name}: expected a vertical system, such as EPSG:5701")
+        if not in_metres(crs):
+            raise RunError(
+                f"--heights {given} is {crs.name}, in {crs.axis_info[0].unit_name}: expected a system in metres, which "
+                "the heights of the scene are in; give that of the same datum"
+            )
         return crs
     if datum.startswith(UNKNOWN_HEIGHTS):
         return None
     names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
-    return CRS.from_epsg(int(names[datum])) if datum in names else None
+    named = CRS.from_epsg(int(names[datum])) if datum in names else None
+    return named if named is not None and in_metres(named) else None
 
 
 def _upright(scene: Scene) -> Float64[np.ndarray, "3 3"]:

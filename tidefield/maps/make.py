@@ -305,7 +305,7 @@ def _strip(row: int, sums: np.ndarray, single: np.ndarray, grid: Grid) -> Strip:
 
 def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Write the files of a map from its tiles; returns what they hold, in numbers."""
-    grid, unit = job.grid, job.grid.frame.unit
+    grid, unit = job.grid, job.grid.frame.unit_up
     names = json.dumps([*job.scene.names])
     rasters = {
         "orthophoto": Raster(out / ORTHOPHOTO, ("red", "green", "blue", "alpha"), "uint8", None),
@@ -366,7 +366,7 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
     Returns:
         Figures of them.
     """
-    grid, unit = job.grid, job.grid.frame.unit
+    grid, unit = job.grid, job.grid.frame.unit_up
     water = read_water(out / DSM, out / AGREEMENT, out / ORTHOPHOTO, grid)
     classes = Raster(
         out / CLASSES, ("class",), "uint8", 0.0, tags={"VALUES": "2 ground, 3 vegetation, 9 water"}, average=False
@@ -388,7 +388,7 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
     write_contours(lines, grid.frame, out / CONTOURS)
     progress(5, 6)
     if job.sections:
-        write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, unit)
+        write_sections(cut(job.sections, out / DSM, out / SIGMA, grid), out / SECTIONS, grid.frame.unit, unit)
     progress(6, 6)
     return {
         **_typical_errors(out),
@@ -484,6 +484,7 @@ def finish_map(job: Job, out: Path, record: dict[str, Any], bar: Callable[[str],
         "seconds": before + time.monotonic() - started,
         "coordinates": {
             "name": grid.frame.name, "wkt": grid.frame.wkt, "heights": grid.frame.heights, "unit": grid.frame.unit,
+            "unit_up": grid.frame.unit_up,
         },
         "grid": {
             "west": grid.west, "north": grid.north, "cell": grid.cell, "columns": grid.columns, "rows": grid.rows,

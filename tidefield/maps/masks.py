@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -55,6 +55,8 @@ BLOCK_M = 2.0
 SMALLEST_CELLS = 12
 """Smaller polygons are left out."""
 SIMPLIFIED_CELLS = 0.7
+END_CELLS = 3
+"""An edge of water within so many cells of where nothing is known is no shore."""
 
 
 @dataclass(frozen=True)
@@ -356,7 +358,7 @@ def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
     layers = [
         Layer("vegetation", "Polygon", plants, {"area": [shape.area for shape in plants]}),
         Layer("water", "Polygon", [shape for shape, _ in wet], fields),
-        _waterline(wet, grid),
+        _waterline(wet, ~np.isfinite(values), reduced),
     ]
     write_geopackage(folder / "masks.gpkg", layers, grid.frame)
     for layer in layers:
@@ -373,12 +375,20 @@ def _outlines(mask: Bool[np.ndarray, "h w"], grid: Grid) -> list[BaseGeometry]:
     return [shape for shape in shapes if shape.area >= SMALLEST_CELLS * grid.cell**2]
 
 
-def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], grid: Grid) -> Layer:
-    """The shores of water, without those stretches where the map ends."""
-    rim = shapely.box(*grid.bounds).buffer(-3 * grid.cell)
+def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], unknown: Bool[np.ndarray, "h w"], grid: Grid) -> Layer:
+    """The shores of water, without those stretches where the map ends.
+
+    Args:
+        unknown: cells without a surface.
+        grid: of these.
+    """
+    ends = np.pad(unknown, 1, constant_values=True)
+    ends = cv2.dilate(ends.astype(np.uint8), np.ones((2 * END_CELLS + 1, 2 * END_CELLS + 1), np.uint8)) > 0
+    around = replace(grid, west=grid.west - grid.cell, north=grid.north + grid.cell)
+    beyond = shapely.union_all(_outlines(ends, around))
     lines, bodies = [], []
     for shape, body in wet:
-        cut = shape.boundary.intersection(rim)
+        cut = shape.boundary.difference(beyond)
         merged = shapely.line_merge(cut) if cut.geom_type == "MultiLineString" else cut
         for line in getattr(merged, "geoms", [merged]):
             if line.geom_type == "LineString" and line.length > 0:

@@ -59,8 +59,8 @@ def cut(lines: Sequence[tuple[BaseGeometry, dict[str, Any]]], dsm: Path, sigma: 
     return result
 
 
-def write_sections(sections: Sequence[Section], folder: Path, unit: str) -> list[Path]:
-    """Write sections.csv and sections.svg into a folder."""
+def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up: str) -> list[Path]:
+    """Write sections.csv and sections.svg into a folder, with the units of distances and of heights."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["section", "distance", "easting", "northing", "height", "sigma", "low_95", "high_95"])
@@ -69,13 +69,13 @@ def write_sections(sections: Sequence[Section], folder: Path, unit: str) -> list
             numbers = ["" if np.isnan(value) else f"{value:.4f}" for value in (z, s, z - BAND * s, z + BAND * s)]
             writer.writerow([one.name, f"{d:.3f}", f"{x:.3f}", f"{y:.3f}", *numbers])
     write_text(folder / "sections.csv", text.getvalue())
-    plot = draw(sections, unit)
+    plot = draw(sections, unit, unit_up)
     with completed_file(folder / "sections.svg", overwrite=True) as partial:
         plot.savefig(partial, format="svg", metadata={"Date": None})
     return [folder / "sections.csv", folder / "sections.svg"]
 
 
-def draw(sections: Sequence[Section], unit: str) -> Any:
+def draw(sections: Sequence[Section], unit: str, unit_up: str) -> Any:
     """Draw sections below each other, with 95% bands."""
     from matplotlib.figure import Figure
 
@@ -86,7 +86,7 @@ def draw(sections: Sequence[Section], unit: str) -> Any:
             one.distance, one.height - BAND * one.sigma, one.height + BAND * one.sigma, color="#97cfbd", label="95%"
         )
         plot.plot(one.distance, one.height, color="#1d3d68", linewidth=1, label="surface")
-        plot.set(title=one.name, xlabel=f"distance ({unit})", ylabel=f"height ({unit})")
+        plot.set(title=one.name, xlabel=f"distance ({unit})", ylabel=f"height ({unit_up})")
         plot.grid(color="#d5dbdf", linewidth=0.6)
     axes[0].legend(frameon=False)
     return figure

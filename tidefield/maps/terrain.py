@@ -120,15 +120,26 @@ def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
     with raster_writer(out, grid) as writer:
         for (row, count, height), (_, _, error) in zip(blocks(dsm, rim), blocks(sigma, rim), strict=True):
-            u = ((np.arange(grid.columns) + 0.5) / factor - 0.5).astype(np.float32)
-            v = ((np.arange(row - rim, row + count + rim) + 0.5) / factor - 0.5).astype(np.float32)
-            u, v = np.meshgrid(u, v)
-            below = cv2.remap(ground, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            rows_of = (np.arange(row - rim, row + count + rim) + 0.5) / factor - 0.5
+            columns_of = (np.arange(grid.columns) + 0.5) / factor - 0.5
+            below = _interpolated(_interpolated(ground, rows_of, 0), columns_of, 1)
             rise = np.maximum(GROUND_SIGMAS * np.minimum(np.nan_to_num(error), LEAST_RISE_M), LEAST_RISE_M)
             other = height - below > rise * grid.frame.metre_up
             near = cv2.dilate(other.astype(np.uint8), disk) > 0
             terrain = np.where(near, np.minimum(height, below), height)[rim : rim + count]
             writer.write(row, np.nan_to_num(terrain, nan=NODATA)[None])
+
+
+def _interpolated(values: Float32[np.ndarray, "h w"], at: np.ndarray, axis: int) -> Float32[np.ndarray, "h2 w2"]:
+    """Interpolate linearly along an axis at positions in cells, constant beyond the ends.
+
+    OpenCV's remap has no more than 32,766 columns, less than a map of a coast.
+    """
+    at = at.clip(0, values.shape[axis] - 1)
+    low = at.astype(int)
+    share = (at - low).astype(np.float32)
+    one, other = (np.take(values, k, axis) for k in (low, np.minimum(low + 1, values.shape[axis] - 1)))
+    return one + (share[:, None] if axis == 0 else share) * (other - one)
 
 
 def _quantile(part: np.ndarray) -> np.ndarray:
