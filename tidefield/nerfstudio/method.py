@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -146,6 +147,10 @@ class TidefieldModel(Model):
         self._render: Render | None = None
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """One group, since nerfstudio clips each by itself; `NetworkAdam` splits it by the parameters' `share`."""
+        for group in self.trainer.optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.share = group["share"]
         return {"network": list(self.network.parameters())}
 
     def get_training_callbacks(
@@ -159,7 +164,7 @@ class TidefieldModel(Model):
             self.trainer.progress.step = step
             rate = self.trainer.rate(step / trainer.config.max_num_iterations) * self.trainer.learning_rate
             for group in optimizers.optimizers["network"].param_groups:
-                group["lr"] = rate
+                group["lr"] = rate * group["share"]
 
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], set_rate)]
 
@@ -232,6 +237,11 @@ class NetworkAdam(OptimizerConfig):
     eps: float = ADAM["eps"]
     betas: Sequence[float] = ADAM["betas"]
     max_norm: float | None = 1.0
+
+    def setup(self, params: Sequence[torch.nn.Parameter]) -> torch.optim.Optimizer:
+        """Make the optimiser, with the trainer's groups of parameters, one for each `share` of the learning rate."""
+        groups = groupby(params, lambda parameter: parameter.share)
+        return super().setup([{"params": list(members), "share": share} for share, members in groups])
 
 
 METHOD = MethodSpecification(
