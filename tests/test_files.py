@@ -15,6 +15,7 @@ from tidefield.files import (
     completed_file,
     completed_folder,
     delete_partials,
+    is_locked,
     only_writer,
     read_json,
     require_writable,
@@ -207,11 +208,24 @@ def test_a_folder_has_one_writer_until_that_ends_or_dies(tmp_path: Path):
         assert other.stdout.readline() == b"locked\n"
         with pytest.raises(RunError, match="another process is writing to"), only_writer(folder):
             pytest.fail("the other process has it")
+        assert is_locked(folder)
         other.send_signal(signal.SIGKILL)
     assert sorted(os.listdir(folder)) == [LOCK_FILE, "x"]
+    assert not is_locked(folder)
     with only_writer(folder):
         assert (folder / LOCK_FILE).exists()
     assert os.listdir(folder) == ["x"]
+    assert not is_locked(folder)
+    assert not (folder / LOCK_FILE).exists(), "asking makes none"
+
+
+def test_a_lock_that_may_not_be_tried_counts_as_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object) -> bool:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    (tmp_path / LOCK_FILE).touch()
+    monkeypatch.setattr(Path, "open", refuse)
+    assert is_locked(tmp_path)
 
 
 def test_a_folder_that_was_only_locked_leaves_no_trace(tmp_path: Path):

@@ -212,6 +212,19 @@ def only_writer(folder: Path, wait_seconds: float = 0.0) -> Iterator[None]:
                 one.rmdir()
 
 
+def is_locked(folder: Path) -> bool:
+    """Whether a process writes to a folder under `only_writer`; one that was killed has left its lock file unlocked.
+
+    A lock that may not be tried, of another user's, counts as held.
+    """
+    path = folder / LOCK_FILE
+    try:
+        with path.open("rb+") as file:
+            return not _lock(file.fileno(), folder)
+    except OSError:
+        return os.path.exists(path)
+
+
 def _locked(path: Path) -> BinaryIO | None:
     """Open a lock file, in a folder that is made, and lock it; None where another process has it."""
     with writing_to(path):

@@ -6,6 +6,7 @@ them takes a GPU. They are the same every time, so they are recorded once, as a 
 
 from __future__ import annotations
 
+import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass, replace
@@ -21,6 +22,9 @@ WARM_UPS = 3
 """Times that something is computed before it is recorded: libraries choose their algorithms, and allocate, at first."""
 KEPT = 16
 """Recordings for inputs of different shapes; those that were not used for the longest time go first."""
+recording_lock = threading.Lock()
+"""Held while something is recorded, when no other thread of the process may use a GPU. A thread that computes beside
+one that records holds it as well; what is not recorded yet is then computed without."""
 
 
 def map_tensors(value: T, change: Callable[[Tensor], Tensor]) -> T:
@@ -74,11 +78,14 @@ class Recorder(Generic[T, R]):
         with torch.cuda.device(self._device):
             if key not in self._kept:
                 self._seen[key] += 1
-                if self._seen[key] <= self._after:
+                if self._seen[key] <= self._after or not recording_lock.acquire(blocking=False):
                     return self._compute(moved(inputs, self._device))
-                while len(self._kept) >= KEPT:
-                    self._kept.popitem(last=False)
-                self._kept[key] = _Recording(self._compute, inputs, self._device, self._pool)
+                try:
+                    while len(self._kept) >= KEPT:
+                        self._kept.popitem(last=False)
+                    self._kept[key] = _Recording(self._compute, inputs, self._device, self._pool)
+                finally:
+                    recording_lock.release()
             self._kept.move_to_end(key)
             return self._kept[key].replay(inputs)
 

@@ -13,7 +13,7 @@ from tidefield.commands.common import ZeroShot
 from tidefield.commands.view import View, view
 from tidefield.config import PRESETS
 from tidefield.errors import TidefieldError
-from tidefield.files import only_writer
+from tidefield.files import LOCK_FILE, only_writer
 from tidefield.train.checkpoint import Run, write_run
 
 QUIET = Console(quiet=True)
@@ -40,6 +40,15 @@ def test_a_run_that_is_being_trained_and_has_saved_nothing_is_one_clear_error(sc
     with only_writer(tmp_path / "run"):
         write_run(tmp_path / "run", Run(scene, None, 0, PRESETS["swift"]))
         refused("is being trained and has saved nothing yet: expected a first checkpoint", tmp_path / "run")
+
+
+def test_a_run_whose_training_was_killed_before_it_saved_is_one_clear_error(scene: Path, tmp_path: Path):
+    pytest.importorskip("viser")
+    run = tmp_path / "run"
+    run.mkdir()
+    write_run(run, Run(scene, None, 0, PRESETS["swift"]))
+    (run / LOCK_FILE).touch()
+    refused(r"run has no checkpoint\S*: .* train it with --resume", run)
 
 
 def test_a_scene_whose_photographs_went_is_one_clear_error(scene: Path):
@@ -72,7 +81,7 @@ def test_without_a_browser_the_address_is_still_there(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
     class Ended:
-        def wait(self) -> None:
+        def wait(self, seconds: float) -> None:  # without a timeout, Ctrl-C does nothing on Windows
             raise KeyboardInterrupt
 
     monkeypatch.setattr(view_command.threading, "Event", Ended)

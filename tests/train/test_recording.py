@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from tidefield.config import SWIFT, Budget, Config
 from tidefield.data.load import at_twice_the_size, load_scene
 from tidefield.data.scene import Scene
 from tidefield.evaluation.metrics import prepare_torchvision
-from tidefield.recording import WARM_UPS, Recorder, map_tensors
+from tidefield.recording import WARM_UPS, Recorder, map_tensors, recording_lock
 from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.loop import SceneTrainer
 
@@ -95,6 +96,27 @@ def test_recorded_steps_are_those_that_were_not(config: Config, scene: Scene) ->
     (errors, weights), (others, theirs) = (steps(config, scene, recorded, 12) for recorded in (True, False))
     torch.testing.assert_close(torch.tensor(errors), torch.tensor(others), rtol=0.02, atol=0)
     assert (weights - theirs).norm() < 0.02 * theirs.norm()
+
+
+def test_nothing_new_is_recorded_while_another_thread_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Recording:
+        def __init__(self, *_: Any) -> None:
+            assert recording_lock.locked()
+
+        def replay(self, inputs: Tensor) -> str:
+            return "replayed"
+
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device", nullcontext)
+    monkeypatch.setattr("tidefield.recording._Recording", Recording)
+    recorder = Recorder(lambda _: "computed", CPU)
+    with recording_lock:
+        assert recorder(torch.ones(3)) == "computed"
+    assert recorder(torch.ones(3)) == "replayed"
+    with recording_lock:
+        assert recorder(torch.ones(3)) == "replayed", "only what is new has to wait"
+        assert recorder(torch.ones(4)) == "computed"
+    assert not recording_lock.locked()
 
 
 @pytest.mark.gpu

@@ -5,9 +5,13 @@ import io
 import json
 import os
 import re
+import socket
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -19,7 +23,7 @@ pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
 from map_folders import SHAPE, corner, write_change, write_map
 
 from tidefield.viewer.atlas import Atlas
-from tidefield.viewer.map_page import MapPage
+from tidefield.viewer.map_page import MapPage, _Handler, _Server
 
 SCREENSHOTS = os.environ.get("TIDEFIELD_SCREENSHOTS")
 SIZE = {"width": 900, "height": 700}
@@ -149,6 +153,116 @@ def test_on_a_phone_nothing_leaves_the_screen(tmp_path: Path, browser):
             assert found["y"] + found["height"] <= 780
         tab.close()
         context.close()
+
+
+def test_the_address_keeps_a_detection_of_zero_and_a_new_one_shows_nothing_that_it_lacks(tmp_path: Path, browser):
+    change = write_change(tmp_path / "change", np.full(SHAPE, 0.03, np.float32))
+    with page_of(change) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(page.address)
+        place = tuple(map(round, pixel_of(tab, corner(50, 40))))
+        assert tuple(colours(tab, "hidden")[place[1], place[0]]) == (233, 237, 240)
+        tab.get_by_label("Detection").fill("0")
+        tab.wait_for_url(re.compile("detection=0&"))
+        plain = tab.evaluate("location.hash")
+        again = browser.new_page(viewport=SIZE)
+        again.goto(page.address + "/" + plain)
+        assert tuple(colours(again, "zero")[place[1], place[0]]) != (233, 237, 240)
+        assert again.get_by_label("Detection").input_value() == "0"
+        again.get_by_label("Swipe").check()
+        again.get_by_role("button", name="Ruler").click()
+        again.mouse.click(place[0] - 100, place[1])
+        again.wait_for_url(re.compile("swipe=.*points="))
+        again.evaluate(f"location.hash = {json.dumps(plain)}")
+        again.wait_for_function("!document.getElementById('swipe').checked")
+        assert again.evaluate("[state.swipe, state.points.length]") == [None, 0]
+        tab.close()
+        again.close()
+
+
+def test_tiles_that_fail_are_asked_for_again_and_those_not_shown_any_more_are_not_waited_for(tmp_path: Path, browser):
+    with page_of(write_map(tmp_path / "map", (200, 30, 30))) as page:
+        tab = browser.new_page(viewport=SIZE)
+        failed: list[str] = []
+        tab.on("requestfailed", lambda request: failed.append(f"{request.url} {request.failure}"))
+        tab.route("**/tile/0/orthophoto/**", lambda route: route.abort(), times=1)
+        tab.goto(page.address)
+        assert tuple(colours(tab, "again")[350, 450]) == (200, 30, 30)
+        assert len(failed) == 1
+        held: list[Any] = []
+        tab.route("**/tile/0/height/**", lambda route: held.append(route))
+        with tab.expect_request("**/tile/0/height/**"):
+            tab.get_by_label("Layer", exact=True).select_option("0.height")
+        with tab.expect_event("requestfailed"):
+            tab.get_by_label("Layer", exact=True).select_option("0.orthophoto")
+        assert "/tile/0/height/" in failed[1]
+        assert "ERR_ABORTED" in failed[1]
+        tab.unroute("**/tile/0/height/**")
+        tab.get_by_label("Layer", exact=True).select_option("0.height")
+        colours(tab, "height")
+        tab.close()
+
+
+def test_areas_are_asked_for_one_at_a_time_and_of_those_that_wait_the_last(tmp_path: Path, browser):
+    with page_of(write_change(tmp_path / "change", np.full(SHAPE, -0.5, np.float32))) as page:
+        tab = browser.new_page(viewport=SIZE)
+        held: list[Any] = []
+        asked: list[str] = []
+        tab.route("**/area?**", lambda route: held.append(route), times=1)
+        tab.on("request", lambda request: asked.append(request.url) if "/area?" in request.url else None)
+        points = ";".join("{:.3f},{:.3f}".format(*corner(*at)) for at in ((60, 30), (80, 30), (80, 50)))
+        tab.goto(f"{page.address}/#tool=area&points={points}")
+        tab.get_by_label("Detection").wait_for()
+        for level in ("0.1", "0.2", "0.3"):
+            tab.get_by_label("Detection").fill(level)
+        tab.wait_for_timeout(500)
+        assert len(asked) == 1
+        held[0].continue_()
+        tab.locator('#result[aria-busy="false"]').wait_for()
+        assert len(asked) == 2
+        assert "detection=0.3" in asked[1]
+        assert "net change" in tab.locator("#result").inner_text()
+        tab.close()
+
+
+def test_a_browser_keeps_the_tiles_of_each_server_apart(tmp_path: Path, browser):
+    versions = set()
+    for folder in two_dates(tmp_path):
+        with page_of(folder) as page:
+            tab = browser.new_page(viewport=SIZE)
+            with tab.expect_request("**/tile/**") as tile:
+                tab.goto(page.address)
+            versions.add(urlsplit(tile.value.url).query)
+            tab.close()
+    assert len(versions - {""}) == 2
+
+
+def test_a_page_of_an_ipv6_address_answers(tmp_path: Path):
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("needs IPv6, which this machine does not have")
+    page = MapPage(Atlas([write_map(tmp_path / "map", (1, 2, 3))]), "::1", 0)
+    try:
+        assert page.address.startswith("http://[::1]:")
+        with urllib.request.urlopen(page.address) as answer:
+            assert answer.status == 200
+    finally:
+        page.close()
+
+
+def test_a_browser_that_has_moved_on_is_no_defect(caplog: pytest.LogCaptureFixture):
+    handler = _Handler.__new__(_Handler)
+    handler.server = _Server.__new__(_Server)
+    handler.server.local, handler.path, handler.close_connection = False, "/", False
+
+    def refuse(*_: object) -> None:
+        raise ConnectionAbortedError
+
+    handler._answer = refuse
+    handler.do_GET()
+    assert handler.close_connection
+    assert caplog.text == ""
 
 
 def test_the_server_answers_nothing_but_its_page(tmp_path: Path):

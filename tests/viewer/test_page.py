@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +23,9 @@ from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
 from tidefield.render.camera_paths import make_trajectory
-from tidefield.viewer.page import ScenePage
-from tidefield.viewer.ports import require_port
+from tidefield.viewer.frames import FrameServer
+from tidefield.viewer.page import ScenePage, _Client
+from tidefield.viewer.ports import page_address, require_port
 
 pytest.importorskip("viser", reason="needs viser, which is not installed")
 SCREENSHOTS = os.environ.get("TIDEFIELD_SCREENSHOTS")
@@ -159,3 +161,32 @@ def test_a_port_in_use_is_one_clear_error():
         port = other.getsockname()[1]
         with pytest.raises(RunError, match=rf"port {port} of 127\.0\.0\.1 cannot be listened on .*choose another"):
             require_port("127.0.0.1", port)
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_a_browser_that_leaves_while_its_page_is_set_up_is_no_viewer(stays: bool, monkeypatch: pytest.MonkeyPatch):
+    camera = wall().cameras[0]
+    monkeypatch.setattr(_Client, "camera", lambda _: camera)
+    browser = SimpleNamespace(client_id=3, camera=SimpleNamespace(image_width=8, image_height=6, position=np.zeros(3)))
+    frames = FrameServer(lambda one, seen: render_wall(one), render_wall)
+    page, client = SimpleNamespace(frames=frames, server=SimpleNamespace()), _Client.__new__(_Client)
+    vars(client).update(page=page, client=browser, _show=lambda _: None, _positions=np.zeros((0, 3)), _each={})
+    page.server.get_clients = lambda: {3: browser} if stays else {}
+    client.moved()
+    assert frames.viewers == stays
+    frames.close()
+
+
+def test_a_host_of_either_family_has_an_address_that_browsers_read():
+    assert page_address("::1", 8080) == "http://[::1]:8080"
+    assert page_address("127.0.0.1", 8080) == "http://127.0.0.1:8080"
+    assert page_address("::", 1) == page_address("0.0.0.0", 1) == "http://localhost:1"
+
+
+def test_on_windows_a_port_in_use_is_not_shared(monkeypatch: pytest.MonkeyPatch):
+    asked: list[int] = []
+    monkeypatch.setattr("tidefield.viewer.ports.sys.platform", "win32")
+    monkeypatch.setattr(socket, "SO_EXCLUSIVEADDRUSE", -5, raising=False)
+    monkeypatch.setattr(socket.socket, "setsockopt", lambda _, level, option, value: asked.append(option))
+    require_port("127.0.0.1", 0)
+    assert asked == [-5]

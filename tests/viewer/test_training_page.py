@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import textured_wall
 import torch
+from networks import SMALL
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
@@ -13,6 +14,9 @@ from tidefield.commands.train import Train, train
 from tidefield.config import PRESETS, Budget
 from tidefield.device import choose_device
 from tidefield.errors import RunError
+from tidefield.geometry.cameras import Cameras
+from tidefield.model.rendering import Rendering
+from tidefield.recording import recording_lock
 from tidefield.train.checkpoint import CHECKPOINT_FILE
 from tidefield.train.loop import SceneTrainer
 from tidefield.viewer import training
@@ -51,6 +55,20 @@ def test_only_who_looks_is_shown_the_network_and_it_is_a_copy(monkeypatch: pytes
         assert before.rendering is not None
         assert not torch.allclose(after.rendering.colour, before.rendering.colour, atol=1e-3)
         assert trainer.network.training
+
+
+def test_nothing_is_recorded_while_a_picture_of_a_training_is_made(monkeypatch: pytest.MonkeyPatch):
+    scene = textured_wall.scene(textured_wall.cameras(5, 48, 36))
+    trainer, locked = SceneTrainer(SMALL, scene, 0, choose_device("cpu")), []
+
+    def method(camera: Cameras) -> Rendering:
+        locked.append(recording_lock.locked())
+        return Rendering(torch.zeros(36, 48, 3), torch.ones(36, 48), torch.ones(36, 48))
+
+    monkeypatch.setattr(trainer, "renderer", lambda sampling: method)
+    training._as_it_is(trainer)(scene.cameras[0])
+    assert locked == [True]
+    assert not recording_lock.locked()
 
 
 def test_a_training_that_is_looked_at_learns_the_same(tmp_path: Path):

@@ -123,8 +123,10 @@ def serve(address: str, host: str, no_browser: bool, console: Console) -> None:
         )
     if not no_browser and not _open_browser(address):
         log.warning(f"no browser could be opened: open {address} in one, on this machine")
+    ended = threading.Event()
     try:
-        threading.Event().wait()
+        while not ended.wait(1.0):  # on Windows, Ctrl-C does not interrupt a wait without a timeout
+            pass
     except KeyboardInterrupt as error:
         if type(error) is not KeyboardInterrupt:  # a signal of the system's, with its own exit status
             raise
@@ -140,11 +142,10 @@ def _open_browser(address: str) -> bool:
 
 def _require_trained(folder: Path) -> None:
     """Raises: RunError when a run is being trained and has saved nothing yet."""
-    from tidefield.files import LOCK_FILE
+    from tidefield.files import is_locked
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
-    being_trained = os.path.exists(folder / LOCK_FILE) and os.path.exists(folder / RUN_FILE)
-    if not being_trained:
+    if not (os.path.exists(folder / RUN_FILE) and is_locked(folder)):
         return
     if not os.path.exists(folder / CHECKPOINT_FILE):
         raise RunError(

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import re
+import secrets
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,7 +19,7 @@ from jaxtyping import Float64
 
 from tidefield.errors import RunError, TidefieldError
 from tidefield.viewer.atlas import MOST_POINTS, Atlas
-from tidefield.viewer.ports import LOCAL_HOSTS, require_port
+from tidefield.viewer.ports import LOCAL_HOSTS, page_address, require_port
 
 log = logging.getLogger(__name__)
 
@@ -37,10 +38,8 @@ class MapPage:
     """
 
     def __init__(self, atlas: Atlas, host: str, port: int) -> None:
-        require_port(host, port)
         self.atlas = atlas
-        self._server = _Server((host, port), _Handler)
-        self._server.atlas, self._server.local = atlas, host in LOCAL_HOSTS
+        self._server = _Server(atlas, host, port)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
@@ -48,7 +47,7 @@ class MapPage:
     def address(self) -> str:
         """Where the page is."""
         host, port = self._server.server_address[:2]
-        return f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{port}"
+        return page_address(str(host), port)
 
     def close(self) -> None:
         """End the server."""
@@ -58,9 +57,14 @@ class MapPage:
 
 
 class _Server(ThreadingHTTPServer):
-    atlas: Atlas
-    local: bool
     daemon_threads = True
+
+    def __init__(self, atlas: Atlas, host: str, port: int) -> None:
+        self.address_family = require_port(host, port)
+        super().__init__((host, port), _Handler)
+        self.atlas, self.local = atlas, host in LOCAL_HOSTS
+        # Other maps have the same addresses: browsers keep the tiles of each server apart by this.
+        self.version = secrets.token_hex(8)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -83,7 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(parts.path, parse_qs(parts.query))
         except TidefieldError as error:
             self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
-        except (BrokenPipeError, ConnectionResetError):
+        except ConnectionError:
             self.close_connection = True  # the browser has moved on
         except Exception:
             log.exception("a question of the page could not be answered")
@@ -94,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "/":
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", PAGE.read_bytes())
         elif path == "/atlas.json":
-            self._json(atlas.describe())
+            self._json({**atlas.describe(), "version": self._own.version})
         elif path == "/at":
             (point,) = _points(query, 1, 1)
             self._json(atlas.at(*point.tolist()))

@@ -26,7 +26,7 @@ from tidefield.render.camera_paths import layout_of, path_cameras
 from tidefield.render.stills import colour_picture, depth_picture, depth_range
 from tidefield.viewer.frames import Frame, FrameServer
 from tidefield.viewer.key_frames import KeyFrame, PathEditor
-from tidefield.viewer.ports import require_port
+from tidefield.viewer.ports import page_address, require_port
 from tidefield.viewer.preview import Preview
 
 if TYPE_CHECKING:
@@ -102,8 +102,7 @@ class ScenePage:
     @property
     def address(self) -> str:
         """Where the page is."""
-        host = self.server.get_host()
-        return f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
+        return page_address(self.server.get_host(), self.server.get_port())
 
     def close(self) -> None:
         """End the server and what it is rendering."""
@@ -168,6 +167,9 @@ class _Client:
         if not (self.client.camera.image_width and self.client.camera.image_height):
             return  # a window of no size
         self.page.frames.ask(self.client.client_id, self.camera(), self._show)
+        if self.client.client_id not in self.page.server.get_clients():  # it left before it asked
+            self.page.frames.leave(self.client.client_id)
+            return
         away = np.linalg.norm(self._positions - self.client.camera.position, axis=1)
         for i, handle in self._each.items():  # one around the camera would hide the picture
             if handle.visible != bool(away[i] > self._too_near):

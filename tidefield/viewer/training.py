@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
+from tidefield.recording import recording_lock
 from tidefield.viewer.frames import SAMPLING
 from tidefield.viewer.page import ScenePage
 
@@ -55,8 +56,9 @@ def _as_it_is(trainer: Trainer) -> Render:
     made: list[Render] = []
 
     def render(camera: Cameras) -> Rendering:
-        if not made:
-            made.append(still.renderer(SAMPLING))
-        return made[0](camera)
+        with recording_lock:  # the training goes on in another thread
+            if not made:
+                made.append(still.renderer(SAMPLING))
+            return made[0](camera)
 
     return render
