@@ -1,6 +1,7 @@
 """Processes: what signals end, and what ends with the process that started it."""
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -8,6 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+
+from tidefield import processes
+from tidefield.compare.run import run_measured
 
 ROOT = Path(__file__).parents[1]
 CHILD = """
@@ -90,6 +94,22 @@ def test_nohup_keeps_its_meaning():
     code = "import signal, os; from tidefield import cli; cli._run = lambda _: os.kill(os.getpid(), signal.SIGHUP)"
     ignore = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); {code}; cli.main()"
     assert subprocess.run([sys.executable, "-c", ignore], cwd=ROOT, check=False).returncode == 0
+
+
+def test_windows_is_given_no_function_to_call_before_a_program(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert runpy.run_path(processes.__file__)["end_with_parent"] is None
+
+
+def test_a_process_is_measured_without_its_memory_where_the_system_does_not_tell_that(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.delattr(os, "wait4", raising=False)
+    usage = run_measured([sys.executable, "-c", "pass"], {})
+    assert usage.seconds > 0
+    assert usage.peak_memory_bytes is None
+    with pytest.raises(SystemExit, match="3"):
+        run_measured([sys.executable, "-c", "raise SystemExit(3)"], {})
 
 
 INTERRUPTED = """

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -21,7 +22,11 @@ STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasa
 """The signals, other than Ctrl-C's SIGINT, that ask a process to end; Windows has no SIGHUP."""
 _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl.h."""
-_PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+end_with_parent: Callable[[], object] | None = None
+"""For `Popen(preexec_fn=...)`: has the kernel end the process (SIGTERM) when the thread that started it ends, by
+whatever; on Linux only. Windows refuses any function."""
+if sys.platform == "linux":
+    end_with_parent = partial(ctypes.CDLL(None).prctl, _SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 Handler = Callable[[int, FrameType | None], object]
 
 
@@ -78,15 +83,6 @@ def restore_sigterm() -> None:
     """Put back the handler that the import of pycolmap replaced by one that prints its stack."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
-
-
-def end_with_parent() -> None:
-    """Have the kernel end this process (SIGTERM) when the thread that started it ends, by whatever; Linux only.
-
-    For `Popen(preexec_fn=...)`.
-    """
-    if _PRCTL is not None:
-        _PRCTL(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def start_worker(*initializers: Callable[[], object]) -> None:

@@ -6,8 +6,8 @@ OUT/runs/SCENE/METHOD/ holds what `tidefield train` and `tidefield evaluate` wri
 memory that they used. What has an evaluation.json is not repeated; an interrupted training is started again, so that
 its figures are those of one process.
 
-Needs a Unix system. Imports nothing heavy: at its start, a process is charged with the peak memory of the one that
-started it, so the measuring process must stay small.
+Windows does not tell the memory. Imports nothing heavy: at its start, a process is charged with the peak memory of the
+one that started it, so the measuring process must stay small.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ quarter of the size outdoors and half of it indoors."""
 
 @dataclass(frozen=True)
 class Usage:
-    """Wall-clock seconds of a process, and the most memory that it held resident at once."""
+    """Wall-clock seconds of a process, and the most memory that it held resident at once, where the system tells it."""
 
     seconds: float
-    peak_memory_bytes: int
+    peak_memory_bytes: int | None
 
 
 Runner = Callable[[Sequence[str], Mapping[str, str]], Usage]
@@ -162,19 +162,24 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str], output:
         SystemExit: it failed, and has said why; with its status.
         RunError: a signal ended it.
     """
-    start = time.perf_counter()
+    start, peak = time.perf_counter(), None
     process = subprocess.Popen(
         command, env={**os.environ, **environment}, stdout=output, stderr=output, preexec_fn=end_with_parent
     )
     try:
-        # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
-        _, status, usage = os.wait4(process.pid, 0)
+        if hasattr(os, "wait4"):
+            # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            # Kilobytes on Linux, bytes on macOS.
+            peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        else:
+            process.wait()
     except KeyboardInterrupt as error:
         if isinstance(error, Ended):
             process.send_signal(error.number)
         process.wait()  # Ctrl-C has reached it, too; a training saves before it stops.
         raise
-    process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode > 0:
         sys.exit(process.returncode)
     if process.returncode < 0:
@@ -182,8 +187,7 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str], output:
             f"{signal.Signals(-process.returncode).name} ended `{shlex.join(command)}`: expected it to go on, with "
             "memory enough for it; repeat the command, which continues from there"
         )
-    # Kilobytes on Linux, bytes on macOS.
-    return Usage(time.perf_counter() - start, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+    return Usage(time.perf_counter() - start, peak)
 
 
 def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict[str, list[str]]:
