@@ -169,6 +169,7 @@ def test_users_mistakes_are_one_clear_message(
     assert "both" in fails(capsys, "train", scene, tmp_path / "new", "--steps", 1, "--minutes", 1)
     assert "holds no run" in fails(capsys, "evaluate", tmp_path)
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
+    assert "--opened-width belongs to --zero-shot" in fails(capsys, "evaluate", run, "--opened-width", 400)
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
     for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):

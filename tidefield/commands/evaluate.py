@@ -72,6 +72,8 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     settings = {"overwrite": options.overwrite, "console": console}
     if method is not None and zero_shot:
         raise RunError("both --method and --zero-shot are given: expected one of them; leave one out")
+    if options.opened_width is not None and not zero_shot:
+        raise RunError("--opened-width belongs to --zero-shot: others have one width; leave it out")
     if method is None and not zero_shot:
         if options.width is not None and out is None:
             raise RunError(
@@ -84,8 +86,6 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
             return evaluate_method(render, truth, out or source, configuration=record, **settings)
     if out is None:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
-    if options.opened_width is not None and not zero_shot:
-        raise RunError("--opened-width belongs to --zero-shot: others have one width; leave it out")
     scene = load(source, options.opened_width or options.width, options.allow_missing, console)
     if method is not None:
         side = sampling.rays_per_side or 1
