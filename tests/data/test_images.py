@@ -11,7 +11,7 @@ from PIL import Image
 
 from tidefield.data import cache as user_cache
 from tidefield.data import images
-from tidefield.data.cache import cache_folder
+from tidefield.data.cache import cache_folder, kept_arrays
 from tidefield.data.images import PhotographFile, open_photographs
 from tidefield.data.pictures import read_header
 from tidefield.errors import SceneError
@@ -153,7 +153,7 @@ def test_a_full_disk_is_one_error_and_leaves_no_files(
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(images.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(SceneError, match=r"disk of .* is full: 0 MB .*XDG_CACHE_HOME"):
         open_photographs(files, WHITE)
     assert list(cache.iterdir()) == []
@@ -270,3 +270,27 @@ def test_without_a_home_folder_photographs_are_held_in_memory(
         assert len(open_photographs(files, (1.0, 1.0, 1.0))) == len(files)
     assert ["no home folder" in record.message for record in caplog.records] == [True, True]
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_cache_that_can_only_be_read_is_read(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    first = open_photographs(files, WHITE)
+    kept = kept_arrays("one.points", cache, lambda: {"xyz": np.arange(3)})
+    monkeypatch.setattr(os, "utime", refuse)
+    monkeypatch.setattr(images, "_decode", refuse_to_decode)
+    assert all(torch.equal(first[i], colours) for i, colours in enumerate(open_photographs(files, WHITE).colours))
+    assert (kept_arrays("one.points", cache, dict)["xyz"] == kept["xyz"]).all()
+    assert not caplog.records
+
+
+def test_a_file_of_the_cache_that_vanishes_is_made_again(
+    cache: Path, files: tuple[PhotographFile, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "is_file", lambda path: True)  # another program deletes it afterwards
+    assert len(open_photographs(files, WHITE)) == 5
+    assert kept_arrays("one.points", cache, lambda: {"xyz": np.arange(3)})["xyz"].tolist() == [0, 1, 2]
+    assert len(list(cache.iterdir())) == 2

@@ -208,3 +208,13 @@ def test_control_that_does_not_fit_is_refused_if_it_was_asked_for_and_else_remar
     (remark,) = survey.remarks
     assert "--no-control" in remark
     assert read_survey(tmp_path, find_control=False).remarks == ()
+
+
+def test_control_is_at_the_site_of_photographs_on_both_sides_of_the_date_line(tmp_path: Path):
+    for k, longitude in enumerate((179.9996, 179.9998, -179.9998, -179.9996)):
+        photograph(tmp_path / f"{k}.jpg", table=exif(place=(-16.5, longitude)))
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32701", always_xy=True).transform(-179.9997, -16.5)
+    found, remarks = control(tmp_path, f"EPSG:32701\n{x} {y} 3 1 2 0.jpg A\n")
+    assert list(found.points) == ["A"]
+    assert remarks == []
+    assert "longitude -179.99990" in refusal("EPSG:32701", x + 1e4, y, (180.0001, -16.5))

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from camera_files import exif, photograph, texture
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
-from tidefield.errors import SurveyError
+from tidefield.data.readers.files import open_picture, quiet_pillow
+from tidefield.errors import SceneError, SurveyError
 from tidefield.survey.io import image_decoding
 from tidefield.survey.io.image_decoding import thumbnail, upright, upright_size, upright_uv
 from tidefield.survey.io.photographs import _read
@@ -122,13 +124,21 @@ def png_header(path: Path, width: int, height: int) -> Path:
 
 def test_a_small_file_that_claims_billions_of_pixels_is_refused_before_it_is_decoded(tmp_path):
     path = png_header(tmp_path / "bomb.png", 60_000, 60_000)
-    with pytest.raises(SurveyError, match="60000 x 60000 pixels, more than 300 million"):
+    with pytest.raises(SurveyError, match="60000 x 60000 pixels, more than 178 million"):
         upright(unread(path))
     found = _read(path, path.name)
     assert isinstance(found, str)
-    assert "more than 300 million" in found
+    assert "more than 178 million" in found
 
 
 def test_a_photograph_of_a_hundred_megapixels_is_opened(tmp_path):
     with image_decoding.open_image(png_header(tmp_path / "large.png", 11_648, 8_736)) as picture:
         assert picture.size == (11_648, 8_736)
+
+
+@pytest.mark.parametrize(("height", "opens"), [(15_979, True), (15_980, False)])
+def test_surveys_and_scenes_have_the_same_limit_of_pixels(tmp_path, height, opens):
+    path = png_header(tmp_path / "large.png", 11_199, height)
+    for reader, error in ((image_decoding.open_image, SurveyError), (open_picture, SceneError)):
+        with quiet_pillow(), nullcontext() if opens else pytest.raises(error), reader(path) as picture:
+            assert picture.size == (11_199, height)

@@ -67,9 +67,19 @@ def test_a_focal_length_without_prior_is_refined():
     choice = choose_lens(model, flight.survey.photographs, False, quiet)
     (found,) = model.cameras.values()
     assert choice.freed
-    assert "heights may be wrong" in lens_notes(choice)[0]
+    assert "heights may be wrong" in lens_notes(choice, flight.survey.photographs)[0]
     assert found.focal_length_x != pytest.approx(1.1 * FOCAL, rel=1e-3)
     assert model.compute_mean_reprojection_error() < 0.45
+
+
+def test_the_note_names_the_photographs_without_a_focal_length():
+    choice = LensChoice((LensTrial("RADIAL", 0.5, None, FOCAL),), known=False, freed=True, spread_deg=3.0)
+    lens = LensPrior(FOCAL, None, None, "EXIF 35 mm equivalent", False)
+    without = fly().survey.photographs[:4]
+    assert lens_notes(choice, without)[0].startswith("The photographs do not state the focal length, and matches")
+    (note,) = lens_notes(choice, [*without[:1], *(replace(one, lens=lens) for one in without[1:])])
+    assert note.startswith(f"1 of 4 photographs do not state the focal length ({without[0].name}), so that it was")
+    assert "leave them out" in note
 
 
 @pytest.mark.parametrize(
@@ -92,10 +102,10 @@ def test_notes_explain_why_positions_ruled_out_more_terms():
         LensTrial(*values, FOCAL)
         for values in (("SIMPLE_RADIAL", 0.46, 0.59), ("RADIAL", 0.43, 0.65), ("OPENCV", 0.42, 0.67))
     )
-    (sentence,) = lens_notes(LensChoice((radial, full, simple), known=True, freed=False, spread_deg=3.0))
+    (sentence,) = lens_notes(LensChoice((radial, full, simple), known=True, freed=False, spread_deg=3.0), ())
     assert "0.42 px instead of 0.46" in sentence
     assert "0.67 m instead of 0.59" in sentence
-    assert lens_notes(LensChoice((simple, radial, full), known=True, freed=False, spread_deg=3.0)) == ()
+    assert lens_notes(LensChoice((simple, radial, full), known=True, freed=False, spread_deg=3.0), ()) == ()
 
 
 def test_oblique_photographs_correct_a_wrong_focal_length():
@@ -105,7 +115,7 @@ def test_oblique_photographs_correct_a_wrong_focal_length():
     assert choice.spread_deg > MIN_SPREAD_DEG
     assert choice.freed
     assert model.cameras[1].focal_length_x == pytest.approx(FOCAL, rel=0.005)
-    assert f"refined from {1.04 * FOCAL:.1f} to" in lens_notes(choice)[0]
+    assert f"refined from {1.04 * FOCAL:.1f} to" in lens_notes(choice, flight.survey.photographs)[0]
 
 
 def test_vertical_photographs_keep_the_prior_focal_length():
@@ -145,7 +155,8 @@ def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_ch
     if design == 1.035:
         assert choice.heights is None
     else:
-        assert ("the design one was used" if true > design else "the calibrated one was used") in lens_notes(choice)[0]
+        chosen = "design" if true > design else "calibrated"
+        assert f"the {chosen} one was used" in lens_notes(choice, photographs)[0]
         assert choice.heights is not None
         assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)
 

@@ -46,6 +46,14 @@ def lawnmower(rows: int, columns: int) -> list[Photograph]:
     return made
 
 
+def apart_m(flight: list[Photograph]) -> dict[tuple[int, int], float]:
+    """Distance of each pair of photographs."""
+    position = np.array(
+        [[p.position.latitude_deg * 111_000, p.position.longitude_deg * 65_000] for p in flight if p.position]
+    )
+    return {(i, j): float(np.linalg.norm(position[i] - position[j])) for i, j in combinations(range(len(flight)), 2)}
+
+
 def test_few_photographs_are_all_paired():
     photographs = [unlocated_photograph(k, None) for k in range(EXHAUSTIVE)]
     assert candidate_pairs(photographs) == list(combinations(range(EXHAUSTIVE), 2))
@@ -60,15 +68,22 @@ def test_number_of_candidates_is_linear_with_positions():
 def test_near_photographs_are_paired_and_far_ones_are_not():
     flight = lawnmower(20, 20)
     pairs = set(candidate_pairs(flight))
-    position = np.array(
-        [[p.position.latitude_deg * 111_000, p.position.longitude_deg * 65_000] for p in flight if p.position]
-    )
-    for i, j in combinations(range(len(flight)), 2):
-        apart = np.linalg.norm(position[i] - position[j])
+    for (i, j), apart in apart_m(flight).items():
         if apart < 45:
             assert (i, j) in pairs
         if apart > 200 and j - i > SEQUENTIAL:
             assert (i, j) not in pairs
+
+
+def test_near_photographs_on_both_sides_of_the_date_line_are_paired():
+    there = lawnmower(8, 10)
+    flight = [
+        replace(p, position=replace(p.position, longitude_deg=(p.position.longitude_deg + 359.9985) % 360 - 180))
+        for p in there
+        if p.position
+    ]
+    assert len({p.position.longitude_deg > 0 for p in flight if p.position}) == 2
+    assert {pair for pair, apart in apart_m(there).items() if apart < 45} <= set(candidate_pairs(flight))
 
 
 def test_fields_far_apart_are_not_paired():

@@ -263,3 +263,26 @@ def test_a_damaged_heic_photograph_is_left_out(tmp_path: Path):
     survey = read_survey(tmp_path)
     assert [p.name for p in survey.photographs] == ["a.jpg", "b.jpg", "c.jpg"]
     assert any("d.heic cannot be read" in remark for remark in survey.remarks)
+
+
+def test_a_heic_photograph_by_another_suffix_is_left_out_and_to_be_renamed(tmp_path: Path):
+    survey_folder(tmp_path)
+    (tmp_path / "e.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    survey = read_survey(tmp_path)
+    assert len(survey.photographs) == 4
+    wrong = f"Left out: {tmp_path / 'e.jpg'} is an HEIC file: expected a name that ends in .heic; rename it"
+    assert wrong in survey.remarks
+
+
+@pytest.mark.parametrize(("without", "kept"), [(0, 18), (1, 18), (2, 18), (3, 21)])
+def test_few_photographs_without_a_focal_length_are_left_out(tmp_path: Path, without: int, kept: int):
+    for k in range(18):
+        photograph(tmp_path / f"{k:02d}.jpg", table=exif({Base.FocalLengthIn35mmFilm: 24}))
+    for k in range(without):
+        photograph(tmp_path / f"other {k}.jpg")
+    survey = read_survey(tmp_path)
+    assert len(survey.photographs) == kept
+    assert all(one.lens is not None for one in survey.photographs) == (kept == 18)
+    left_out = [remark for remark in survey.remarks if "do not state their focal length and are left out" in remark]
+    assert len(left_out) == (0 < without < 3)
+    assert all(f"{without} of {18 + without} photographs" in remark and "other 0.jpg" in remark for remark in left_out)

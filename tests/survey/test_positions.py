@@ -59,6 +59,33 @@ def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("title", "height_m"),
+    [
+        ("altitude (m)", 1000),
+        ("Altitude [ft]", 304.8),
+        ("Z/Altitude (feet above sea level)", 304.8),
+        ("height (US survey feet)", 1200e3 / 3937),
+        ("alt [usft]", 1200e3 / 3937),
+        ("alt [ftUS]", 1200e3 / 3937),
+        ("height (WGS84 ellipsoid)", 1000),
+    ],
+)
+def test_heights_have_the_unit_in_the_title(tmp_path, title, height_m):
+    text = f"name,Latitude [deg],lon,{title},accuracy vertical [mm]\nDJI_0001.JPG,54.5,-2.75,1000,20\n"
+    position = read_gps_file(written(tmp_path, text), NAMES)["DJI_0001.JPG"].position
+    assert position.height_m == pytest.approx(height_m, rel=1e-12)
+    assert (position.latitude_deg, position.vertical_m) == (54.5, pytest.approx(0.02))
+
+
+@pytest.mark.parametrize(("vertical", "metre"), [("5703", 1), ("6360", 1200 / 3937), ("8228", 0.3048)])
+def test_heights_of_a_geo_txt_have_the_unit_of_its_system(tmp_path, vertical, metre):
+    text = f"EPSG:6340+{vertical}\nDJI_0001.JPG 500000 4200000 1000\n"
+    position = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)["DJI_0001.JPG"].position
+    assert position.height_m == pytest.approx(1000 * metre, rel=1e-9)
+    assert position.datum == "mean sea level"
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "begins with 'nothing': expected a header such as image_name,lat,lon,gps_height"),

@@ -19,6 +19,7 @@ from rich.console import Console
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene, read_posed
 from tidefield.errors import RunError, SurveyError
+from tidefield.files import LOCK_FILE, only_writer
 from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
@@ -27,6 +28,7 @@ from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.blocks import cut
 from tidefield.survey.sfm.features import FeatureOptions
 from tidefield.survey.stages import Stages
+from tidefield.survey.survey import CHECK_FILE
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
 OPTIONS = FeatureOptions(count=1500)
@@ -249,6 +251,7 @@ def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
         for k in range(5)
         for name in flight.names[:6]
     ]
+    lines += [line.rpartition(" ")[0] + " CHK1" for line in lines[:6]]
     (folder / "gcp_list.txt").write_text("\n".join([ground_flight.FRAME.crs, *lines]))
     survey = read_survey(folder)
     assert survey.control is not None
@@ -258,6 +261,7 @@ def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
     prepared = prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
     assert prepared.georeference.source == "GPS"
     assert "--no-control" in prepared.georeference.notes[-1]
+    assert not (scene / CHECK_FILE).exists()  # maps would be compared with them
     assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 1
     with pytest.raises(SurveyError, match="control"):
         prepare(asked, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
@@ -329,6 +333,16 @@ def test_a_folder_with_other_content_is_left_alone(flight: Flight, tmp_path: Pat
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file"):
         run(flight.folder, tmp_path / "file")
+
+
+def test_a_scene_has_one_writer_and_no_lock_afterwards(made: tuple[Path, Prepared], flight: Flight, tmp_path: Path):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    for folder in (scene, tmp_path / "new"):
+        with only_writer(folder), pytest.raises(RunError, match=f"another process is writing to {folder}"):
+            run(flight.folder, folder)
+    (scene / LOCK_FILE).touch()  # of a process that was killed
+    run(flight.folder, scene)
+    assert LOCK_FILE not in os.listdir(scene)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can become another user")

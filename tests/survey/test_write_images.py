@@ -1,5 +1,6 @@
 """Photographs of a scene are copied where nothing changes, else turned upright and corrected."""
 
+import struct
 from pathlib import Path
 
 import camera_files
@@ -7,8 +8,9 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from PIL.ExifTags import Base
+from PIL.ExifTags import GPS, IFD, Base
 
+from tidefield.data.pictures import decode, read_header
 from tidefield.errors import RunError
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.export import reduced_folders, tangent_map, write_images, write_reduced_images
@@ -85,6 +87,77 @@ def test_tiffs_stay_tiffs(tmp_path: Path):
     with Image.open(tmp_path / "images" / "0.tif") as picture:
         assert picture.format == "TIFF"
         np.testing.assert_allclose(np.asarray(picture), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
+
+
+DESCRIBED = camera_files.exif({Base.Model: "M1", Base.ExposureTime: 0.01}, place=(54.5, -2.75), height_m=80)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_changed_tiff_keeps_what_its_exif_says_of_the_photograph(tmp_path: Path, orientation: int):
+    table = camera_files.exif(
+        {Base.Orientation: orientation, Base.Model: "M1", Base.ExposureTime: 0.01}, place=(54, -2)
+    )
+    for k in range(3):
+        camera_files.photograph(tmp_path / "card" / f"{k}.tif", SIZE, table)
+    photographs = read_survey(tmp_path / "card").photographs
+    write_images(photographs, tmp_path / "images", correction([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
+    written = tmp_path / "images" / "0.tif"
+    np.testing.assert_allclose(decode(written), np.clip(upright(photographs[0]) / 0.8, 0, 255), atol=0.51)
+    with Image.open(written) as picture:
+        found = picture.getexif()
+        assert (found[Base.Model], found[Base.Orientation]) == ("M1", 1)
+        assert found.get_ifd(IFD.Exif)[Base.ExposureTime] == pytest.approx(0.01)
+        assert found.get_ifd(IFD.GPSInfo)[GPS.GPSLatitude] == (54, 0, 0)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "CMYK"])
+def test_a_reduced_tiff_has_its_own_size_and_colours(tmp_path: Path, mode: str):
+    (tmp_path / "images").mkdir()
+    original = tmp_path / "images" / "a.tif"
+    Image.fromarray(camera_files.texture((64, 48))).convert(mode).save(original, exif=DESCRIBED.tobytes())
+    write_reduced_images(tmp_path, ["a.tif"], (4,), quiet)
+    pixels = decode(original)
+    means = pixels.reshape(12, 4, 16, 4, pixels.shape[2]).mean(axis=(1, 3))
+    np.testing.assert_allclose(decode(tmp_path / "images_4" / "a.tif"), means, atol=0.51)
+    with Image.open(tmp_path / "images_4" / "a.tif") as picture:
+        assert picture.getexif().get_ifd(IFD.GPSInfo)[GPS.GPSAltitude] == 80
+
+
+WITH_DIFFERENTIAL = camera_files.exif(gps={GPS.GPSDifferential: 1}).tobytes()
+SHORT, LONG = ">HHIHH", ">HHII"
+DAMAGED = {
+    "no header": b"Exif\0\0" + 40 * b"x",
+    "a number that Pillow reads and does not write": WITH_DIFFERENTIAL.replace(
+        struct.pack(SHORT, GPS.GPSDifferential, 3, 1, 1, 0), struct.pack(LONG, GPS.GPSDifferential, 4, 1, 1 << 20)
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_exif_is_left_out_with_a_warning(tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture):
+    (tmp_path / "card").mkdir()
+    for k in range(3):
+        picture = Image.fromarray(camera_files.texture(SIZE, k))
+        picture.save(tmp_path / "card" / f"{k}.jpg", dpi=(72, 72), exif=DAMAGED[damage] if k == 0 else b"")
+    photographs = read_survey(tmp_path / "card").photographs
+    write_images(photographs, tmp_path / "images", correction([0.8, 1.25, 1.0]), [LENS] * 3, quiet)
+    (warning,) = [record.message for record in caplog.records]
+    assert f"the EXIF of {tmp_path / 'card' / '0.jpg'} is damaged" in warning
+    with Image.open(tmp_path / "images" / "0.jpg") as picture:
+        assert dict(picture.getexif()) == {Base.Orientation: 1}
+        assert picture.size == SIZE
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_photographs_of_16_bits_are_written_with_8_which_scenes_have(tmp_path: Path, suffix: str):
+    (tmp_path / "card").mkdir()
+    levels = np.linspace(0, 65535, 64 * 48).reshape(48, 64).astype(np.uint16)
+    for k in range(3):
+        Image.fromarray(levels).save(tmp_path / "card" / f"{k}.{suffix}")
+    photographs = read_survey(tmp_path / "card").photographs
+    write_images(photographs, tmp_path / "images", None, [LENS] * 3, quiet)
+    assert read_header(tmp_path / "images" / f"0.{suffix}") == (64, 48, False)
+    np.testing.assert_array_equal(decode(tmp_path / "images" / f"0.{suffix}"), upright(photographs[0]))
 
 
 def test_reduced_photographs_are_means_of_whole_blocks_in_the_format_of_the_others(tmp_path: Path):

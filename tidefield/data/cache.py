@@ -128,11 +128,11 @@ def kept_arrays(name: str, folder: Path | None, make: Callable[[], Arrays]) -> A
     except OSError as error:  # `open_photographs` tells of it
         _log.debug("the cache folder %s cannot be used (%s)", folder, error.strerror)
     if store is not None and store.is_file():
-        # A damaged file is made anew.
-        with suppress(ValueError, KeyError, EOFError, BadZipFile):
+        # A damaged file is made anew, and one that another program has deleted meanwhile.
+        with suppress(ValueError, KeyError, EOFError, BadZipFile, OSError):
             with store.open("rb") as file, np.load(file, allow_pickle=False) as stored_arrays:
                 arrays = dict(stored_arrays)
-            os.utime(store)
+            touch(store)
             return arrays
     arrays = make()
     if store is not None:
@@ -143,6 +143,12 @@ def kept_arrays(name: str, folder: Path | None, make: Callable[[], Arrays]) -> A
         except (OSError, RunError) as error:
             _log.warning("what was estimated from photographs cannot be kept for the next time: %s", error)
     return arrays
+
+
+def touch(path: Path) -> None:
+    """Mark a file as used now, where that is possible: a folder may allow reading alone."""
+    with suppress(OSError):
+        os.utime(path)
 
 
 def limit_bytes() -> float:

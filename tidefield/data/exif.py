@@ -21,6 +21,8 @@ EXPOSURE_POWERS = {
     ExifTags.Base.FNumber: -2,
 }
 """The tags that determine the exposure, with the power that each has in the light that is recorded."""
+EXIF_DAMAGE = (OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
+"""What Pillow raises where it reads damaged EXIF, and where it writes values that it has read."""
 
 _MOST_BYTES = 1_000_000
 """Of EXIF that is parsed: a JPEG's has 64 kB; every tag of a longer one could refer to all of it."""
@@ -110,7 +112,7 @@ def read_exif(image: Image.Image) -> Exif:
         table = image.getexif()
         tags = {**table, **table.get_ifd(ExifTags.IFD.Exif)}
         gps = dict(table.get_ifd(ExifTags.IFD.GPSInfo))
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, struct.error):
+    except EXIF_DAMAGE:
         return Exif(tags, gps, damaged=True)
     return Exif(tags, gps)
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import errno
 import logging
 import mmap
-import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from tidefield.data.cache import SUFFIX, cache_folder, identity, key, make_room, open_folder
+from tidefield.data.cache import SUFFIX, cache_folder, identity, key, make_room, open_folder, touch
 from tidefield.data.pictures import decode, fill_masked, read_mask, rectify_mask
 from tidefield.data.readers.files import quiet_pillow
 from tidefield.errors import RunError, SceneError
@@ -165,15 +165,18 @@ def open_photographs(
     expected = sum(file.bytes for file in files)
     try:
         open_folder(store.parent)
-        if store.is_file() and store.stat().st_size == expected:
-            os.utime(store)
-        else:
+        mapped = None
+        with suppress(FileNotFoundError):  # another program may delete it meanwhile
+            if store.is_file() and store.stat().st_size == expected:
+                mapped = _mapped(store)
+                touch(store)
+        if mapped is None:
             make_room(store.parent, expected)
             with completed_file(store, overwrite=True) as partial, partial.open("wb") as file:
                 for picture in _decoded(files, background_rgb, progress):
                     file.write(picture.data)
-        # Copy-on-write: changes to a view do not reach the file.
-        return _views(np.memmap(store, dtype=np.uint8, mode="c"), files, background_rgb)
+            mapped = _mapped(store)
+        return _views(mapped, files, background_rgb)
     except (OSError, RunError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         assert isinstance(cause, OSError), "completed_file tells what failed"
@@ -192,6 +195,11 @@ def open_photographs(
             cause.strerror,
         )
     return _views(np.concatenate(list(_decoded(files, background_rgb, progress))), files, background_rgb)
+
+
+def _mapped(store: Path) -> UInt8[np.ndarray, " bytes"]:
+    """Map a file of the cache into memory. Copy-on-write: changes to a view do not reach the file."""
+    return np.memmap(store, dtype=np.uint8, mode="c")
 
 
 def photographs_key(files: Sequence[PhotographFile], background_rgb: tuple[float, float, float]) -> str:

@@ -20,7 +20,8 @@ from tidefield.files import completed_file
 from tidefield.geometry.lenses import LensModel, rectify
 
 _MODES_WITH_ALPHA = ("RGBA", "LA", "PA")
-_MODES = ("1", "L", "P", "RGB", "CMYK", "YCbCr", *_MODES_WITH_ALPHA)
+MODES = ("1", "L", "P", "RGB", "CMYK", "YCbCr", *_MODES_WITH_ALPHA)
+"""Pillow's names of the kinds of pixels that are read: 8 bits per colour."""
 
 
 @quiet_pillow()
@@ -31,7 +32,7 @@ def read_header(path: Path) -> tuple[int, int, bool]:
         SceneError: the file is not a supported picture.
     """
     with open_picture(path) as picture:
-        if picture.mode not in _MODES:
+        if picture.mode not in MODES:
             raise SceneError(f"{path} has pixels of the mode {picture.mode}: expected 8 bits per colour; convert it")
         return *picture.size, _has_alpha(picture)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import shutil
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,8 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
-from tidefield.data.pictures import decode, read_mask, write_mask
+from tidefield.data.exif import EXIF_DAMAGE, read_exif
+from tidefield.data.pictures import MODES, decode, read_mask, write_mask
 from tidefield.data.readers.files import quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
@@ -26,12 +30,19 @@ from tidefield.survey.colour import ExposureCorrection, to_common_exposure
 from tidefield.survey.io.image_decoding import HEIFS, open_image, upright
 from tidefield.survey.survey import Photograph, Progress
 
+log = logging.getLogger(__name__)
+
 GRID_PX = 8
 """Spacing of the pixels whose viewing angles are computed; between them they are interpolated."""
 JPEG_QUALITY = 95
 MOST_REDUCED = 64
 MAX_COORDINATE_M = 10_000.0
 """nerfstudio computes in float32, which resolves 1 mm up to this distance from the origin."""
+# The others of the first block describe how the original stores its pixels.
+_DESCRIPTION = (
+    *(ExifTags.Base.ImageDescription, ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Software),
+    *(ExifTags.Base.DateTime, ExifTags.Base.Artist, ExifTags.Base.Copyright),
+)
 
 
 def write_images(
@@ -43,7 +54,7 @@ def write_images(
 ) -> None:
     """Write photographs into a folder under their names.
 
-    A file that needs no change is copied byte for byte.
+    A file that needs no change, and that all other commands read, is copied byte for byte.
 
     Args:
         correction: of these photographs, in this order; None leaves their colours as they are.
@@ -58,9 +69,8 @@ def write_images(
     def write(index: int) -> None:
         photograph = photographs[index]
         target = folder / photograph.name
-        is_heif = photograph.path.suffix.casefold() in HEIFS  # written as JPEG, which others read
         same = correction is None or ((correction.gain[index] == 1).all() and not correction.falloff[index].any())
-        if same and photograph.orientation == 1 and not is_heif:
+        if same and photograph.orientation == 1 and _is_readable(photograph.path):
             with completed_file(target, overwrite=True) as partial:
                 shutil.copyfile(photograph.path, partial)
             return
@@ -70,19 +80,56 @@ def write_images(
             pixels = to_common_exposure(pixels, correction.gain[index], correction.falloff[index], tangent)
         write_image(pixels, target, photograph.path)
 
-    with ThreadPoolExecutor(cores()) as pool:
+    with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(write, range(len(photographs))), start=1):
             progress(done, len(photographs))
+
+
+def _is_readable(path: Path) -> bool:
+    """Whether the readers of scenes, ours and others', accept a photograph's format and kind of pixels."""
+    if path.suffix.casefold() in HEIFS:
+        return False
+    with open_image(path) as picture:
+        return picture.mode in MODES
 
 
 def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
     """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright."""
     with open_image(original) as picture:
-        exif, kind = picture.getexif(), "JPEG" if original.suffix.casefold() in HEIFS else picture.format
-    exif[ExifTags.Base.Orientation] = 1
-    quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind in ("JPEG", "MPO") else {}
+        kind = "JPEG" if original.suffix.casefold() in HEIFS else picture.format
+        assert kind is not None, "open_image knows the formats"
+        exif = _kept_exif(picture, kind, original)
+    quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind == "JPEG" else {}
     with completed_file(target, overwrite=True) as partial:
         Image.fromarray(pixels).save(partial, kind, exif=exif, **quality)
+
+
+def _kept_exif(picture: Image.Image, kind: str, original: Path) -> bytes:
+    """Collect the EXIF of an opened photograph that stays true of other pixels; none of it if a part is damaged.
+
+    Args:
+        kind: format that it is written in.
+        original: for the warning.
+    """
+    kept, upright = Image.Exif(), Image.Exif()
+    kept[ExifTags.Base.Orientation] = upright[ExifTags.Base.Orientation] = 1
+    if not read_exif(picture).damaged:
+        with suppress(*EXIF_DAMAGE):
+            found = picture.getexif()
+            for tag in _DESCRIPTION:
+                if tag in found:
+                    kept[tag] = found[tag]
+            for block in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+                # Interop is a third block, of which this has the position in the original file.
+                values = {tag: value for tag, value in found.get_ifd(block).items() if tag != ExifTags.IFD.Interop}
+                if values:
+                    kept[block] = values
+            exif = kept.tobytes()
+            # Pillow reads values that it does not write, or not in this format.
+            Image.new("RGB", (1, 1)).save(io.BytesIO(), kind, exif=exif)
+            return exif
+    log.warning(f"the EXIF of {original} is damaged, or cannot be written again: the photograph is written without it")
+    return upright.tobytes()
 
 
 def reduced_folders(factors: Sequence[int]) -> list[str]:

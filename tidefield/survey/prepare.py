@@ -20,7 +20,7 @@ from tidefield.data.holdout import Holdout
 from tidefield.data.load import load_scene
 from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError, SurveyError
-from tidefield.files import writing_to
+from tidefield.files import is_empty, only_writer, writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import reduced_folders, write_images, write_masks, write_reduced_images, write_transforms
@@ -109,118 +109,119 @@ def prepare(
         redo: a stage to repeat, with all that follow.
 
     Raises:
-        RunError: the scene's folder contains something else, or cannot be written to.
+        RunError: the scene's folder contains something else, cannot be written to, or another process writes to it.
         SurveyError: too few photographs are good, or fit together.
     """
     reduced = reduced_folders(downscale)
-    with writing_to(scene):
-        _refuse_foreign(scene, survey)
-    work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
-    database, model = work / "database.db", work / "model"
     if redo not in (None, *STAGES):
         raise RunError(f"there is no stage {redo!r}: expected one of {', '.join(STAGES)}; name one of these")
-    stages = Stages(work, _fingerprint(survey), redo)
-    everyone = [photograph.name for photograph in survey.photographs]
-    held_out = frozenset(everyone[i] for i in every_eighth(len(everyone))[1] if holdout)
+    with writing_to(scene):
+        _refuse_foreign(scene, survey)
+    with only_writer(scene):
+        work, sparse, images = scene / "prepare", scene / "sparse" / "0", scene / "images"
+        database, model = work / "database.db", work / "model"
+        stages = Stages(work, _fingerprint(survey), redo)
+        everyone = [photograph.name for photograph in survey.photographs]
+        held_out = frozenset(everyone[i] for i in every_eighth(len(everyone))[1] if holdout)
 
-    def judge_quality(_: bool) -> Facts:
-        with ProgressBar(console, "Judging photographs") as bar:
-            verdicts = list(assess_quality(without(survey, held_out), bar))
-        if held_out:  # of these, only whether they can be decoded
-            verdicts += [v for v in assess_quality(without(survey, {*everyone} - held_out)) if v.measures is None]
-        return {"verdicts": [_to_json(verdict) for verdict in verdicts]}
+        def judge_quality(_: bool) -> Facts:
+            with ProgressBar(console, "Judging photographs") as bar:
+                verdicts = list(assess_quality(without(survey, held_out), bar))
+            if held_out:  # of these, only whether they can be decoded
+                verdicts += [v for v in assess_quality(without(survey, {*everyone} - held_out)) if v.measures is None]
+            return {"verdicts": [_to_json(verdict) for verdict in verdicts]}
 
-    # No option is part of the key of scenes that do not have it, so that earlier ones are kept.
-    verdicts = stages.run("quality", {"holdout": True} if holdout else {}, [], judge_quality, _verdicts_from_json)
-    good = select_photographs(survey, verdicts, keep_all)
-    names = [photograph.name for photograph in good.photographs]
-    mapped = without(good, held_out)
+        # No option is part of the key of scenes that do not have it, so that earlier ones are kept.
+        verdicts = stages.run("quality", {"holdout": True} if holdout else {}, [], judge_quality, _verdicts_from_json)
+        good = select_photographs(survey, verdicts, keep_all)
+        names = [photograph.name for photograph in good.photographs]
+        mapped = without(good, held_out)
 
-    def extract_features(resume: bool) -> Facts:
-        if not resume or not is_database(database):
-            database.unlink(missing_ok=True)
-        with ProgressBar(console, "Extracting features") as bar:
-            return {"features": extract(good.photographs, database, features, device, bar, lens)}
+        def extract_features(resume: bool) -> Facts:
+            if not resume or not is_database(database):
+                database.unlink(missing_ok=True)
+            with ProgressBar(console, "Extracting features") as bar:
+                return {"features": extract(good.photographs, database, features, device, bar, lens)}
 
-    def refuse_damaged(facts: Facts) -> Facts:
-        if not is_database(database):
-            raise ValueError(f"{database.name} is no database of features")
-        return facts
+        def refuse_damaged(facts: Facts) -> Facts:
+            if not is_database(database):
+                raise ValueError(f"{database.name} is no database of features")
+            return facts
 
-    # Both are no part of the key of scenes that have neither.
-    masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
-    stages.run("features", [names, asdict(features), *masks, *kind], [database], extract_features, refuse_damaged)
-    pairs = stages.run(
-        "pairs",
-        {},
-        [],
-        lambda _: choose_pairs(good.photographs, held_out, database, console),
-        lambda facts: _pairs_from_json(facts, names),
-    )
+        # Both are no part of the key of scenes that have neither.
+        masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
+        stages.run("features", [names, asdict(features), *masks, *kind], [database], extract_features, refuse_damaged)
+        pairs = stages.run(
+            "pairs",
+            {},
+            [],
+            lambda _: choose_pairs(good.photographs, held_out, database, console),
+            lambda facts: _pairs_from_json(facts, names),
+        )
 
-    def match_pairs(resume: bool) -> Facts:
-        if not resume:
-            with pycolmap.Database.open(database) as db:
-                db.clear_matches()
-                db.clear_two_view_geometries()
-        with ProgressBar(console, "Matching") as bar:
-            agree, inliers = match(database, pairs, device, bar)
-        return {"agree": agree, "inliers": inliers}
+        def match_pairs(resume: bool) -> Facts:
+            if not resume:
+                with pycolmap.Database.open(database) as db:
+                    db.clear_matches()
+                    db.clear_two_view_geometries()
+            with ProgressBar(console, "Matching") as bar:
+                agree, inliers = match(database, pairs, device, bar)
+            return {"agree": agree, "inliers": inliers}
 
-    stages.run("matches", {}, [database], match_pairs)
+        stages.run("matches", {}, [database], match_pairs)
 
-    def read_poses(facts: Facts) -> tuple[list[list[str]], LensChoice]:
-        models = [[str(name) for name in model] for model in facts["models"]]
-        if registered_names(read_model(model)) != models[0] or not set(models[0]) <= set(names):
-            raise ValueError("the model has other photographs")
-        return models, _lens_from_json(facts["lens"])
+        def read_poses(facts: Facts) -> tuple[list[list[str]], LensChoice]:
+            models = [[str(name) for name in model] for model in facts["models"]]
+            if registered_names(read_model(model)) != models[0] or not set(models[0]) <= set(names):
+                raise ValueError("the model has other photographs")
+            return models, _lens_from_json(facts["lens"])
 
-    models, choice = stages.run(
-        "poses",
-        {"mapper": mapper} if mapper != "incremental" else {},
-        model_files(model),
-        lambda resume: estimate_poses(mapped, database, model, console, mapper, resume),
-        read_poses,
-    )
+        models, choice = stages.run(
+            "poses",
+            {"mapper": mapper} if mapper != "incremental" else {},
+            model_files(model),
+            lambda resume: estimate_poses(mapped, database, model, console, mapper, resume),
+            read_poses,
+        )
 
-    def read_located(facts: Facts) -> tuple[Georeference, list[str]]:
-        located, placed = read_georeference(scene), sorted([*models[0], *facts.get("placed", ())])
-        if located is None or registered_names(read_model(sparse)) != placed:
-            raise ValueError("the model has other photographs")
-        return located, placed
+        def read_located(facts: Facts) -> tuple[Georeference, list[str]]:
+            located, placed = read_georeference(scene), sorted([*models[0], *facts.get("placed", ())])
+            if located is None or registered_names(read_model(sparse)) != placed:
+                raise ValueError("the model has other photographs")
+            return located, placed
 
-    located, models[0] = stages.run(
-        "georeference",
-        {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
-        [*model_files(sparse), scene / "georeference.json"],
-        lambda _: georeference_model(mapped, model, sparse, console, database, held_out & {*names}),
-        read_located,
-    )
-    registered = set(models[0])
-    placed = [photograph for photograph in good.photographs if photograph.name in registered]
-    correction = stages.run(
-        "images",
-        {"colour": colour},
-        [
-            *(images / photograph.name for photograph in placed),
-            *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
-            *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
-            *([scene / HOLDOUT_FILE] if holdout else []),
-        ],
-        lambda _: write_scene(placed, scene, colour, console, held_out & registered),
-        lambda facts: _correction_from_json(facts["evening"], len(placed)),
-    )
+        located, models[0] = stages.run(
+            "georeference",
+            {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
+            [*model_files(sparse), scene / "georeference.json"],
+            lambda _: georeference_model(mapped, model, sparse, console, database, held_out & {*names}),
+            read_located,
+        )
+        registered = set(models[0])
+        placed = [photograph for photograph in good.photographs if photograph.name in registered]
+        correction = stages.run(
+            "images",
+            {"colour": colour},
+            [
+                *(images / photograph.name for photograph in placed),
+                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
+                *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
+                *([scene / HOLDOUT_FILE] if holdout else []),
+            ],
+            lambda _: write_scene(placed, scene, colour, console, held_out & registered),
+            lambda facts: _correction_from_json(facts["evening"], len(placed)),
+        )
 
-    def reduce(_: bool) -> Facts:
-        if downscale:
-            with ProgressBar(console, "Reducing photographs") as bar:
-                write_reduced_images(scene, models[0], downscale, bar)
-        return {}
+        def reduce(_: bool) -> Facts:
+            if downscale:
+                with ProgressBar(console, "Reducing photographs") as bar:
+                    write_reduced_images(scene, models[0], downscale, bar)
+            return {}
 
-    if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
-        files = [scene / folder / name for folder in reduced for name in models[0]]
-        stages.run("downscale", {"factors": list(downscale)}, files, reduce)
-    return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
+        if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
+            files = [scene / folder / name for folder in reduced for name in models[0]]
+            stages.run("downscale", {"factors": list(downscale)}, files, reduce)
+        return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
 
 
 def choose_pairs(
@@ -247,7 +248,7 @@ def estimate_poses(
 ) -> Facts:
     """Reconstruct poses and sparse points, choose the lens model, and write the largest model to a folder.
 
-    Large surveys are reconstructed in blocks, unless their focal lengths are unknown: each block would find its own.
+    Large surveys are reconstructed in blocks, unless some focal lengths are unknown: each block would find its own.
 
     Args:
         resume: keep the blocks of an interrupted run.
@@ -286,8 +287,8 @@ def georeference_model(
                 raise
             remark = control_remark(error)
             log.warning(remark)
-            reconstruction = read_model(model)
-            located = georeference(reconstruction, replace(good, control=None), bar)
+            reconstruction, good = read_model(model), replace(good, control=None)
+            located = georeference(reconstruction, good, bar)
             located = replace(located, notes=(*located.notes, remark))
     placed: list[str] = []
     if held_out:
@@ -358,7 +359,7 @@ def _refuse_foreign(scene: Path, survey: Survey) -> None:
         raise RunError(f"{scene} holds the photographs: expected another folder for the scene; name a new one")
     if scene.exists() and not scene.is_dir():
         raise RunError(f"{scene} is a file: expected a folder or a new name; choose another")
-    if scene.is_dir() and any(scene.iterdir()) and not (scene / "prepare" / "stages.json").exists():
+    if scene.is_dir() and not (scene / "prepare" / "stages.json").exists() and not is_empty(scene):
         raise RunError(
             f"{scene} holds something else: expected a new name, or a scene that `tidefield prepare` started; choose "
             "another"

@@ -27,6 +27,8 @@ from tidefield.errors import SceneError, list_names
 
 LARGEST = 1e15
 """Largest magnitude of a number of a scene: squares of such positions still fit into float32."""
+MAX_PIXELS = 178_956_970
+"""Of a photograph: Pillow opens no larger one, because a small file that states more would only fill the memory."""
 _JSON_MEGABYTES, _PICTURE_MEGABYTES = 256, 4_000
 _DAMAGE = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, MemoryError, RecursionError),

@@ -23,6 +23,7 @@ from tidefield.errors import SurveyError, list_names
 from tidefield.files import write_text
 from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
+from tidefield.survey.io.positions import degrees_of
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
 from tidefield.survey.survey import CHECK_FILE, Control, Mark, Photograph
 
@@ -102,10 +103,9 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
         )
     marked = {point for point, _ in marks}
     control = Control(crs, {name: xyz for name, xyz in points.items() if name in marked}, tuple(marks.values()))
-    positions = [photograph.position for photograph in photographs if photograph.position is not None]
-    if positions:
-        middle = np.median([(position.longitude_deg, position.latitude_deg) for position in positions], axis=0)
-        refuse_elsewhere(control, *middle.tolist())
+    degrees = degrees_of(photographs)
+    if np.isfinite(degrees).any():
+        refuse_elsewhere(control, *np.nanmedian(degrees, axis=0).tolist())
     remarks = []
     if missing:
         remarks.append(
@@ -155,13 +155,14 @@ def refuse_elsewhere(control: Control, longitude_deg: float, latitude_deg: float
 
     Args:
         control: the ground control.
-        longitude_deg, latitude_deg: median position of the photographs.
+        longitude_deg, latitude_deg: median position of the photographs; the longitude may be beyond 180.
 
     Raises:
         SurveyError: the median control point is `MAX_DISTANCE_M` or more away.
     """
     points = np.array(list(control.points.values()), dtype=np.float64)
     x, y = np.median(points[:, 0]), np.median(points[:, 1])
+    longitude_deg = (longitude_deg + 180) % 360 - 180
     site = longitude_deg, latitude_deg
     away = _distance_m(parse_crs(control.crs), x, y, site)
     if away < MAX_DISTANCE_M:

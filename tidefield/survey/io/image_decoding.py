@@ -14,14 +14,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
+from tidefield.data.readers.files import MAX_PIXELS
 from tidefield.errors import SurveyError
 from tidefield.survey.survey import Photograph
 
-MAX_PIXELS = 300_000_000
-"""More than any camera has; a small file whose header states more would only fill the memory."""
-
-# By the first bytes of the file. `Image.open` is not used: its limit of pixels is global, and of a file with several
-# images (MPO), the photograph is the first, which the plain JPEG reader returns.
+# By the first bytes of the file. `Image.open` is not used: of a file with several images (MPO), the photograph is the
+# first, which the plain JPEG reader returns.
 _READERS: dict[bytes, Callable[[str], Image.Image]] = {
     b"\xff\xd8\xff": JpegImagePlugin.JpegImageFile,
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
@@ -59,7 +57,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     """Open a photograph and read its header; errors of decoding inside the block are raised with the name of the file.
 
     Raises:
-        SurveyError: the file is empty, not a JPEG, PNG or TIFF, damaged, or has more than `MAX_PIXELS` pixels.
+        SurveyError: the file is empty, not a JPEG, PNG or TIFF, damaged, an HEIF file by another suffix, or has more
+            than `MAX_PIXELS` pixels.
     """
     try:
         if path.exists() and not path.is_file():  # a named pipe would be waited for
@@ -68,6 +67,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             start = file.read(12)
         reader = next((reader for magic, reader in _READERS.items() if start.startswith(magic)), None)
         if start[4:8] == b"ftyp" and start[8:] in _HEIF_BRANDS:
+            if path.suffix.casefold() not in HEIFS:  # it would be copied into the scene, where no program reads it
+                raise SurveyError(f"{path} is an HEIC file: expected a name that ends in .heic; rename it")
             reader = _open_heif
         if reader is None:
             raise ValueError("it is empty" if not start else "it is not a JPEG, PNG or TIFF, whatever its suffix")

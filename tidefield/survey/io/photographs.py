@@ -28,6 +28,8 @@ MASKS = "masks"
 """Folder of masks next to the photographs, and in a scene."""
 FEWEST = 3
 """Fewest photographs of a survey: with two, no third view verifies the poses."""
+MAX_WITHOUT_LENS = 0.1
+"""Photographs without a focal length are left out up to this share; of more, the focal lengths are estimated."""
 
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", *HEIFS)
 _RAWS = (
@@ -51,8 +53,9 @@ def read_survey(
     """Read all photographs (JPEG, PNG, TIFF, HEIC) in a folder and its sub-folders, with positions and ground control.
 
     Hidden folders, scenes (folders with a `sparse` folder or a `georeference.json`) and OpenDroneMap's results are
-    skipped. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose
-    EXIF has none, an ODM `gcp_list.txt` ground control.
+    skipped. Photographs without a focal length are left out if they are few: none is held to what is stated unless all
+    are. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose EXIF has none, an
+    ODM `gcp_list.txt` ground control.
 
     Args:
         folder: the photographs.
@@ -92,7 +95,8 @@ def read_survey(
         names = [photograph.name for photograph, damaged in photographs if block in damaged]
         if names:
             remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
-    located, about_positions = locate_photographs(folder, [photograph for photograph, _ in photographs], gps)
+    kept, about_lenses = _drop_without_lens([photograph for photograph, _ in photographs])
+    located, about_positions = locate_photographs(folder, kept, gps)
     found = None if control or not find_control else find_file(folder, CONTROL_FILES)
     survey = Survey(folder, tuple(sorted(located, key=lambda photograph: photograph.name)), None)
     ground, about_control = None, []
@@ -107,7 +111,7 @@ def read_survey(
         survey,
         control=ground,
         control_was_found=found is not None,
-        remarks=(*remarks, *about_positions, *about_control),
+        remarks=(*remarks, *about_lenses, *about_positions, *about_control),
     )
 
 
@@ -117,6 +121,19 @@ def control_remark(error: SurveyError) -> str:
         f"The ground control next to the photographs was not used: {error}. --no-control leaves it out without this "
         "remark."
     )
+
+
+def _drop_without_lens(photographs: Sequence[Photograph]) -> tuple[Sequence[Photograph], list[str]]:
+    """Leave out photographs without a focal length if they are few, with a remark."""
+    without = [photograph.name for photograph in photographs if photograph.lens is None]
+    if not 0 < len(without) <= MAX_WITHOUT_LENS * len(photographs):
+        return photographs, []
+    return [photograph for photograph in photographs if photograph.lens is not None], [
+        f"{len(without)} of {len(photographs)} photographs do not state their focal length and are left out "
+        f"({list_names(without)}): with them, the focal lengths of all would be estimated, and matches determine them "
+        "badly. If the camera is that of another photograph, copy what it states: exiftool -TagsFromFile OTHER -Make "
+        "-Model -FocalLength -FocalLengthIn35mmFormat FILE."
+    ]
 
 
 def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:

@@ -15,14 +15,15 @@ from jaxtyping import Float64
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import EARTH_RADIUS_M, WGS84, metres_per_degree, parse_crs
+from tidefield.geometry.geodesy import EARTH_RADIUS_M, WGS84, metres_per_degree, metres_per_height, parse_crs
 from tidefield.survey.io.text_files import PhotographNames, find_file, leading_numbers, read_lines, read_list
 from tidefield.survey.survey import Photograph, Position
 
 GPS_FILES = ("geo.txt", "gps.csv")
 """Looked for in the folder of the photographs, in this order."""
 
-# Column titles of tables of receivers, Pix4D and Metashape, in lower case, without units and punctuation.
+# Column titles of tables of receivers, Pix4D and Metashape, in lower case, without units, which are in brackets, and
+# punctuation.
 _COLUMNS = {
     "name": ("name", "imagename", "image", "filename", "file", "photo", "photograph", "label", "sourcefile"),
     "latitude": ("latitude", "lat", "y", "gpslatitude", "latitudedeg"),
@@ -31,6 +32,10 @@ _COLUMNS = {
     "horizontal": ("accuracyhorizontal", "horizontalaccuracy", "hacc", "accuracyxy", "xyaccuracy", "sigmaxy", "stdxy"),
     "vertical": ("accuracyvertical", "verticalaccuracy", "vacc", "accuracyz", "zaccuracy", "sigmaz", "stdz"),
 }
+_LENGTHS = ("height", "horizontal", "vertical")
+_BRACKETS = re.compile(r"[\[(](.*?)[\])]")
+_FOOT_M, _US_SURVEY_FOOT_M = 0.3048, 1200 / 3937
+_UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), _FOOT_M)}
 _MAX_TITLE = 100  # longer is no title; a search for units in megabytes of brackets would take hours
 _REQUIRED = ("name", "latitude", "longitude")
 _EXPECTED_TABLE = (
@@ -119,18 +124,25 @@ def read_gps_file(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
     return found
 
 
-def _columns(header: str) -> tuple[dict[str, int], str]:
-    """Column of a table by its meaning, and the separator of the columns."""
+def _columns(header: str) -> tuple[dict[str, tuple[int, float]], str]:
+    """Column of a table by its meaning, with the length of its unit in metres, and the separator of the columns."""
     separator = max(",;\t", key=header.count)
-    found: dict[str, int] = {}
-    for index, title in enumerate(header.split(separator)):
-        # Metashape has "X/Longitude"; units are in brackets.
-        parts = re.sub(r"[\[(].*?[\])]", "", title[:_MAX_TITLE].casefold()).split("/")
-        plain = [re.sub(r"[^a-z]", "", part) for part in parts]
+    found: dict[str, tuple[int, float]] = {}
+    for index, title in enumerate(header.casefold().split(separator)):
+        title = title[:_MAX_TITLE]
+        # Metashape has "X/Longitude".
+        plain = [re.sub(r"[^a-z]", "", part) for part in _BRACKETS.sub("", title).split("/")]
         meaning = next((key for key, titles in _COLUMNS.items() if any(part in titles for part in plain)), None)
         if meaning is not None:
-            found.setdefault(meaning, index)
+            found.setdefault(meaning, (index, _unit_m(title) if meaning in _LENGTHS else 1.0))
     return found, separator
+
+
+def _unit_m(title: str) -> float:
+    """Length of the unit in the brackets of a title; metres without one, also where they name a datum."""
+    words = re.findall("[a-z]+", " ".join(_BRACKETS.findall(title)).replace("us", " us "))  # of "usft" and "ftus", too
+    unit_m = next((_UNITS_M[word] for word in words if word in _UNITS_M), 1.0)
+    return _US_SURVEY_FOOT_M if unit_m == _FOOT_M and {"us", "survey"} & {*words} else unit_m
 
 
 def _read_table(path: Path, lines: Sequence[str], header: int, names: PhotographNames) -> dict[str, GpsRecord]:
@@ -139,18 +151,20 @@ def _read_table(path: Path, lines: Sequence[str], header: int, names: Photograph
     for number, row in _rows(path, lines, header, separator):
         if not any(cell.strip() for cell in row) or row[0].startswith("#"):
             continue
-        cells = {key: row[index].strip() if index < len(row) else "" for key, index in columns.items()}
+        cells = {key: row[index].strip() if index < len(row) else "" for key, (index, _) in columns.items()}
         name = names.find(cells["name"])
         if name is None:
             continue
         where = f"{path}, line {number}"
         numbers = {}
-        for key in [key for key in columns if key != "name"]:
+        for key, (_, unit_m) in columns.items():
+            if key == "name":
+                continue
             # A table separated by semicolons may have decimal commas. An empty cell is unknown.
             number = leading_numbers([cells[key].replace(",", ".") or "nan"])
             if not number:
                 raise SurveyError(f"{where} has {cells[key][:40]!r}: expected a number; correct it")
-            numbers[key] = number[0]
+            numbers[key] = number[0] * unit_m
         degrees = numbers["latitude"], numbers["longitude"]
         if not all(map(math.isfinite, degrees)):
             continue
@@ -202,7 +216,7 @@ def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
     for (name, where, values), (longitude, latitude) in zip(read, degrees.tolist(), strict=True):
         if not math.isfinite(latitude):
             raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {crs!r}; correct either")
-        height = values[2] if len(values) > 2 else math.nan
+        height = values[2] * metres_per_height(system) if len(values) > 2 else math.nan
         gimbal = None
         if len(values) >= _GEO_ACCURACIES and any(values[_GEO_ANGLES:_GEO_ACCURACIES]):
             yaw, pitch, roll = values[_GEO_ANGLES:_GEO_ACCURACIES]
@@ -254,7 +268,7 @@ def _drop_outliers(photographs: Sequence[Photograph]) -> tuple[list[Photograph],
     Far is 10 km from the median, or 20 times the median distance to it. Where more than a tenth of the photographs
     (and more than two) are far, they are a second site and keep their positions.
     """
-    degrees, kept, remarks = _degrees(photographs), list(photographs), []
+    degrees, kept, remarks = degrees_of(photographs), list(photographs), []
     located = np.flatnonzero(np.isfinite(degrees[:, 0]))
     if len(located) < 3:
         return kept, []
@@ -281,7 +295,7 @@ def _drop_outliers(photographs: Sequence[Photograph]) -> tuple[list[Photograph],
 
 
 def _remark(photographs: Sequence[Photograph], what: str) -> str:
-    longitude, latitude = _degrees(photographs[:1])[0]
+    longitude, latitude = degrees_of(photographs[:1])[0]
     example = f"latitude {latitude:.6g}, longitude {longitude:.6g}"
     return f"The position of {list_names([p.name for p in photographs])} ({example}) {what}."
 
@@ -291,20 +305,26 @@ def positions_m(photographs: Sequence[Photograph]) -> Float64[np.ndarray, "V 2"]
 
     On a sphere, exact to some per cent over tens of kilometres.
     """
-    degrees = _degrees(photographs)
-    known = degrees[np.isfinite(degrees[:, 0])]
-    if not len(known):
+    degrees = degrees_of(photographs)
+    if np.isnan(degrees).all():
         return degrees
-    east = (degrees[:, 0] - known[0, 0] + 180) % 360 - 180  # continuous across the date line
-    metres = np.column_stack([east, degrees[:, 1]]) * metres_per_degree(float(np.median(known[:, 1])))
+    metres = degrees * metres_per_degree(float(np.nanmedian(degrees[:, 1])))
     return metres - np.nanmedian(metres, axis=0)
 
 
-def _degrees(photographs: Sequence[Photograph]) -> Float64[np.ndarray, "V 2"]:
-    """Longitude and latitude; NaN where a position is unknown."""
+def degrees_of(photographs: Sequence[Photograph]) -> Float64[np.ndarray, "V 2"]:
+    """Longitude and latitude; NaN where a position is unknown.
+
+    Longitudes continue across the date line, within 180 degrees of the first, so that they have a median.
+    """
     positions = (photograph.position for photograph in photographs)
-    degrees = [(p.longitude_deg, p.latitude_deg) if p else (math.nan, math.nan) for p in positions]
-    return np.array(degrees, dtype=np.float64).reshape(-1, 2)
+    degrees = np.array(
+        [(p.longitude_deg, p.latitude_deg) if p else (math.nan, math.nan) for p in positions], dtype=np.float64
+    ).reshape(-1, 2)
+    known = degrees[np.isfinite(degrees[:, 0]), 0]
+    if len(known):
+        degrees[:, 0] = (degrees[:, 0] - known[0] + 180) % 360 - 180 + known[0]
+    return degrees
 
 
 def _geocentric_m(degrees: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 3"]:

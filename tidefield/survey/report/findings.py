@@ -174,7 +174,11 @@ def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]
         },
         remarks=tuple(
             _without_folder(remark, prepared.survey.folder)
-            for remark in (*prepared.georeference.notes, *lens_notes(prepared.lens), *prepared.survey.remarks)
+            for remark in (
+                *prepared.georeference.notes,
+                *lens_notes(prepared.lens, prepared.survey.photographs),
+                *prepared.survey.remarks,
+            )
         ),
     )
 

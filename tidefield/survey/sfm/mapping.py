@@ -25,7 +25,7 @@ from typing import Literal, TypeVar
 import numpy as np
 import pycolmap
 
-from tidefield.errors import SurveyError
+from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
@@ -99,7 +99,7 @@ class LensChoice:
 
     Attributes:
         trials: lens models that were tried; the last one was chosen.
-        known: whether the focal length has a prior.
+        known: whether all focal lengths have a prior.
         freed: whether it was refined.
         spread_deg: RMS angle of the optical axes from their mean.
         heights: comparison of two stated focal lengths; None if there are not two.
@@ -263,7 +263,7 @@ def choose_lens(
 
     Args:
         photographs: of the survey.
-        known: whether the model's focal length has a prior.
+        known: whether all focal lengths of the model have a prior.
         part: of the model, on which lenses are tried; all of it if not given.
     """
     axes = np.array([model.image(number).viewing_direction() for number in model.reg_image_ids()])
@@ -366,8 +366,12 @@ def _fit_to_positions(model: pycolmap.Reconstruction, photographs: Sequence[Phot
     return fit_positions(model, own, positions, positions.frame()) if len(positions.names) >= MIN_POSITIONS else None
 
 
-def lens_notes(choice: LensChoice) -> tuple[str, ...]:
-    """Describe a choice for the report, where the surveyor should know of it."""
+def lens_notes(choice: LensChoice, photographs: Sequence[Photograph]) -> tuple[str, ...]:
+    """Describe a choice for the report, where the surveyor should know of it.
+
+    Args:
+        photographs: of the survey.
+    """
     axes = f"the directions of the photographs differ by {choice.spread_deg:.0f} degrees"
     heights, (*others, best) = choice.heights, choice.trials
     notes = []
@@ -375,10 +379,15 @@ def lens_notes(choice: LensChoice) -> tuple[str, ...]:
         prior_px, refined_px = choice.trials[0].focal_px, best.focal_px
         notes.append(f"The focal length was refined from {prior_px:.1f} to {refined_px:.1f} px: {axes}.")
     elif not choice.known and choice.spread_deg < MIN_SPREAD_DEG:
+        without = [photograph.name for photograph in photographs if photograph.lens is None]
+        found, advice = "The photographs do not state the focal length", "Photographs with EXIF would help."
+        if len(without) < len(photographs):
+            found = f"{len(without)} of {len(photographs)} photographs do not state the focal length"
+            found += f" ({list_names(without)}), so that it was estimated for all"
+            advice = "Write it into the EXIF of these, or leave them out."
         notes.append(
-            f"The photographs do not state the focal length, and matches alone determine it badly ({axes}): unless "
-            "ground control or differential GPS correct it, heights may be wrong by tens of percent. Photographs with "
-            "EXIF would help."
+            f"{found}, and matches alone determine it badly ({axes}): unless ground control or differential GPS "
+            f"correct it, heights may be wrong by tens of percent. {advice}"
         )
     if heights is not None:
         calibrated = ("calibrated", heights.calibrated_px, heights.calibrated_share)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from tidefield.survey.io.positions import positions_m
 from tidefield.survey.survey import Photograph, Progress
 
 Pair = tuple[int, int]
@@ -50,9 +51,7 @@ def candidate_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
     located = [k for k, p in enumerate(photographs) if p.position is not None]
     pairs: set[Pair] = set()
     if len(located) > NEIGHBOURS:
-        # Metres per degree of the ellipsoid at the middle latitude are accurate enough for neighbours.
-        degrees = np.array([(p.position.longitude_deg, p.position.latitude_deg) for p in photographs if p.position])
-        xy_m = degrees * [111_320 * np.cos(np.radians(np.median(degrees[:, 1]))), 110_574]
+        xy_m = positions_m(photographs)[located]
         distances, nearest = map(np.asarray, KDTree(xy_m).query(xy_m, k=NEIGHBOURS + 1))
         # A field with fewer photographs than that has its next neighbours in another field, far away.
         limit = MAX_RELATIVE_DISTANCE * np.median(distances[:, NEIGHBOURS // 2])
