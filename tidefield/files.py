@@ -298,6 +298,11 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def plain_cell(value: Any) -> Any:
+    """A value of a table, of which no spreadsheet takes a text for a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+
+
 def write_json(path: Path, data: Any) -> None:
     """Replace a JSON file, likewise."""
     write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")

@@ -50,6 +50,27 @@ def test_white_noise_is_called_uncorrelated():
     assert fit_variogram(noise, 1.0).nugget > 0.97
 
 
+def test_the_correlation_of_small_places_of_a_large_survey_is_found():
+    rng = np.random.default_rng(0)
+    residuals = np.full((3000, 3500), np.nan, np.float32)
+    for row in (700, 1000, 2100):
+        for column in (700, 1200, 2300, 2700):
+            patch = correlated_field(rng, (200, 200), 4)[:60, :60]
+            residuals[row : row + 60, column : column + 60] = 0.6 * rng.normal(size=patch.shape) + 0.8 * patch
+    found = fit_variogram(residuals, 0.05)
+    sill, reach = max(zip(found.sills, found.ranges_m, strict=True))
+    assert sill == pytest.approx(0.64, abs=0.05)
+    assert reach == pytest.approx(0.4, rel=0.1)
+    assert sum(found.sills) - sill < 0.05
+
+
+def test_ground_that_is_too_small_to_show_a_correlation_says_so():
+    residuals = np.full((3000, 3000), np.nan, np.float32)
+    residuals[1000:3000:150, ::300] = np.random.default_rng(0).normal(size=(14, 10))
+    found = fit_variogram(residuals, 0.05)
+    assert (found.sills, found.reached) == ((), False)
+
+
 @pytest.mark.parametrize("varying", [False, True])
 def test_the_error_of_a_region_is_the_sum_over_all_pairs_of_its_cells(varying: bool):
     rng = np.random.default_rng(2)

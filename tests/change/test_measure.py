@@ -108,6 +108,34 @@ def test_the_comparison_is_limited_to_polygons(tmp_path: Path):
     assert found.errors.registration.stable_cells > 1000
 
 
+def test_parts_of_the_survey_share_what_the_choice_of_outlines_adds(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 4, 0.2)
+    halves = [
+        Region("west", shapely.box(WEST, NORTH - 100, WEST + 60, NORTH)),
+        Region("east", shapely.box(WEST + 60, NORTH - 100, WEST + 120, NORTH)),
+        Region("all of it", shapely.box(WEST, NORTH - 100, WEST + 120, NORTH)),
+    ]
+    found = measured(earlier, later, regions=lambda grid: halves)
+    assert found.cut.bias_m3 != 0
+    for k, whole in ((2, found.cut), (3, found.fill)):
+        west, east, both = (volumes[k] for volumes in found.per_region)
+        assert west.value_m3 + east.value_m3 == pytest.approx(whole.value_m3)
+        assert both == whole
+
+
+def test_a_part_that_only_one_survey_has_is_refused(tmp_path: Path):
+    import rasterio
+
+    earlier, later, _ = pair(tmp_path, 6, 0.1)
+    with rasterio.open(later, "r+") as file:
+        heights = file.read(1)
+        heights[:40, :40] = np.nan
+        file.write(heights, 1)
+    creek = Region("creek", shapely.box(WEST + 1, NORTH - 19, WEST + 19, NORTH - 1))
+    with pytest.raises(ChangeError, match="no cell with heights of both within the polygons"):
+        measured(earlier, later, within=lambda grid: [creek], stable=east)
+
+
 def test_too_little_stable_ground_is_refused(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 7, 0.1)
     spot = Region("spot", shapely.Point(WEST + 30, NORTH - 30).buffer(1))

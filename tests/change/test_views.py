@@ -20,6 +20,7 @@ from tidefield.change.surfaces import ChangeError, open_surface
 from tidefield.change.views import Site, carried, choose_camera, make_view
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.maps.grid import MapFrame
 from tidefield.model.rendering import Rendering
@@ -142,6 +143,34 @@ def test_a_camera_is_carried_into_another_system(scene: Scene):
     expected, _ = scene.cameras[0].project(point)
     found, _ = made.project(torch.from_numpy(there).float())
     assert found[0, 0].tolist() == pytest.approx(expected[0, 0].tolist(), abs=0.5)
+
+
+def test_a_camera_is_carried_between_heights_in_metres_and_in_feet(scene: Scene):
+    earlier, foot = georeferenced(scene, 0.0), 1200 / 3937
+    in_feet = LocalFrame.at("EPSG:32631+6360", (500_000.0, 5_800_000.0, -4.0 / foot))
+    later = replace(earlier, frame=replace(earlier.frame, frame=in_feet, metre_up=1 / foot))
+    camera = scene.cameras[0]
+    made = carried(camera, earlier, later, lift_m=0.5)
+    moved = (made.position_world - camera.position_world)[0].tolist()
+    assert moved == pytest.approx([0.0, 0.0, 4.5], abs=0.02)
+
+
+def test_the_later_camera_is_moved_by_the_tilt_at_what_it_shows(scene: Scene, change: Change):
+    registration = replace(change.errors.registration, model="tilt", coefficients=(0.1, 0.01, 0.0))
+    tilted = replace(change, errors=replace(change.errors, registration=registration))
+    asked: list[torch.Tensor] = []
+
+    def render(camera: Cameras) -> Rendering:
+        asked.append(camera.position_world[0])
+        depth = torch.full((camera.height, camera.width), float(camera.position_world[0, 2]))
+        return Rendering(torch.zeros(camera.height, camera.width, 3), depth, torch.ones_like(depth))
+
+    site = Site.of(scene, render)
+    name = scene.names[0]
+    make_view(tilted, None, site, site, name)
+    east = float(asked[0][0] + scene.origin_world[0]) - registration.centre_m[0]
+    assert abs(east) > 1
+    assert float(asked[1][2] - asked[0][2]) == pytest.approx(0.1 + 0.01 * east, abs=0.02)
 
 
 def _transform(points: np.ndarray) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """The waterline and areas under levels on a plane whose every contour is known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,21 @@ def test_areas_under_levels_have_intervals_that_contain_the_truth(tmp_path: Path
             inside += below.low_m2 < -0.1 / SLOPE * 80 < below.high_m2
             assert below.later_m2 - below.earlier_m2 == pytest.approx(below.change_m2)
     assert inside >= 10
+
+
+def test_levels_are_in_the_unit_of_the_surveys_heights(tmp_path: Path):
+    change, foot = surveyed(tmp_path, (0.0, 0.0)), 0.3048
+    metres = measure_water(change, (1.5, 1.4), (1.0,))
+    feet = measure_water(
+        replace(change, earlier=replace(change.earlier, metres=foot, scale=1 / foot)),
+        (1.5 / foot, 1.4 / foot),
+        (1 / foot,),
+    )
+    assert metres.waterline is not None
+    assert feet.waterline is not None
+    assert feet.waterline.levels_m == pytest.approx((1.5, 1.4))
+    assert feet.waterline.land_gained_m2 == pytest.approx(metres.waterline.land_gained_m2, rel=0.01)
+    assert feet.below[0].earlier_m2 == pytest.approx(metres.below[0].earlier_m2, rel=0.01)
 
 
 def test_dry_ground_has_no_waterline(tmp_path: Path):

@@ -30,10 +30,14 @@ NMAD = 1.4826
 """Deviation of a normal distribution over its median absolute deviation."""
 _WINDOW = 512
 """Rows and columns of the pieces that the variogram is computed from."""
+_SPREAD = 3
+"""Pieces along each side of a large raster."""
 _BLOCKS = 512
 """Rows and columns to which a region is reduced before its covariances are summed."""
 _BINS_PER_OCTAVE = 4
 _LEAST_PAIRS = 200
+_LEAST_SHARE = 0.1
+"""Of the pairs at a shorter distance in the same piece."""
 _LEAST_PATCHES = 12
 _WORTH = 6.0
 """A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
@@ -96,6 +100,8 @@ class Variogram:
 
 
 UNCORRELATED = Variogram((), ())
+UNMEASURED = Variogram((), (), reached=False)
+"""Of ground that is too small to show a correlation."""
 
 
 def anderson_terms(
@@ -151,10 +157,12 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     """
     finite = np.isfinite(residuals)
     if finite.sum() < 100:
-        return UNCORRELATED
+        return UNMEASURED
+    rows, columns = (np.flatnonzero(finite.any(axis)) for axis in (1, 0))
+    known_part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    residuals, finite = residuals[known_part], finite[known_part]
     # What one number is taken from needs no more than a million cells.
-    every = 1 + math.isqrt(residuals.size // 1_000_000)
-    some = residuals[::every, ::every][finite[::every, ::every]]
+    some = residuals[finite][:: 1 + int(finite.sum()) // 1_000_000]
     scale = nmad(some) or float(some.std())
     if scale == 0:
         return UNCORRELATED
@@ -173,9 +181,13 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
             # Distances of few steps are taken from the finer grids only, where there are more pairs.
             usable = (pairs > 0) & (distance > 0) & ((step == 1) | (distance > 8 * cell_m * step))
             bins = np.floor(_BINS_PER_OCTAVE * np.log2(distance[usable] / cell_m) + 1e-9).astype(int)
+            most = 0.0
             for number in np.unique(bins):
                 at = bins == number
                 n = pairs[usable][at]
+                most = max(most, n.sum())
+                if n.sum() < _LEAST_SHARE * most:
+                    continue  # of the corners of what is known, which are no sample of it
                 add = np.array([n.sum(), (n * gamma[usable][at]).sum(), (n * distance[usable][at]).sum()])
                 sums[int(number)] = sums.get(int(number), np.zeros(3)) + add
         if max(thin.shape) <= _WINDOW:
@@ -185,8 +197,9 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     # Pairs further apart than half of the longest distance are few and all of the same places.
     table = table[table[:, 2] / table[:, 0] <= longest / 2] if len(table) else table
     if len(table) < 4:
-        return UNCORRELATED
+        return UNMEASURED
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
+    every = 1 + math.isqrt(residuals.size // 1_000_000)
     thinned = residuals[::every, ::every] / np.float32(some.std())
     return _with_patches(_fitted(lags, gammas, pairs), thinned, every * cell_m)
 
@@ -228,14 +241,21 @@ def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Va
 
 
 def _pieces(values: np.ndarray) -> list[np.ndarray]:
-    """At most nine pieces of 512 x 512, spread over a raster."""
+    """At most nine pieces of 512 x 512: spread over a raster, or where it is known, if that is in few places."""
 
-    def starts(length: int) -> list[int]:
-        if length <= _WINDOW:
-            return [0]
-        return np.unique(np.linspace(0, length - _WINDOW, min(3, -(-length // _WINDOW))).astype(int)).tolist()
+    def pieces(most: int) -> list[np.ndarray]:
+        rows, columns = (
+            np.unique(np.linspace(0, max(0, length - _WINDOW), min(most, -(-length // _WINDOW))).astype(int))
+            for length in values.shape
+        )
+        return [values[r : r + _WINDOW, c : c + _WINDOW] for r in rows for c in columns]
 
-    return [values[r : r + _WINDOW, c : c + _WINDOW] for r in starts(values.shape[0]) for c in starts(values.shape[1])]
+    def known(piece: np.ndarray) -> int:
+        return int(np.isfinite(piece).sum())
+
+    spread = pieces(_SPREAD)
+    fullest = sorted(pieces(max(values.shape)), key=known, reverse=True)[: _SPREAD**2]
+    return spread if sum(map(known, spread)) >= sum(map(known, fullest)) / 2 else fullest
 
 
 def _semivariances(values: np.ndarray, known: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

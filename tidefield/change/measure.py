@@ -177,6 +177,11 @@ def measure(
     else:
         area = None
     known = int(np.isfinite(dz).sum())
+    if area is not None and not np.isfinite(dz[area]).any():
+        raise ChangeError(
+            f"{earlier.path.name} and {later.path.name} have no cell with heights of both within the polygons that the "
+            "comparison is limited to: expected some; check --within, and the surveys' nodata there"
+        )
     if known < LEAST_STABLE:
         raise ChangeError(
             f"{earlier.path.name} and {later.path.name} both have heights in {known} cells: expected at least "
@@ -374,13 +379,25 @@ def _summed(
         detection.append(sigma[known[rows]][:: max(1, grid.columns * grid.rows // _MOST_SAMPLED)])
     low, middle, high = (Z95 * np.quantile(np.concatenate(detection), (0.05, 0.5, 0.95))).tolist()
     lower, higher = outlines.cells(-1), outlines.cells(1)
-    cut, fill = errors.volume(dz, lower, -1.0), errors.volume(dz, higher)
+    choices = None
     if len(outlines.signs):
         systematic = errors.registration.systematic_m
-        of_lower, of_higher = repeat_choice(dz, errors.sigma, systematic, errors.variogram, grid.cell_m, outlines)
-        area = grid.cell_area_m2
-        cut = cut.chosen(-of_lower.bias * area, of_lower.deviation * area)
-        fill = fill.chosen(of_higher.bias * area, of_higher.deviation * area)
+        choices = repeat_choice(dz, errors.sigma, systematic, errors.variogram, grid.cell_m, outlines)
+
+    def chosen(inside: Bool[np.ndarray, "rows columns"]) -> tuple[Volume, Volume]:
+        """Cut and fill of the outlines' cells in a region, with its share of what their choice adds."""
+        volumes = []
+        for k, (outlined, sign) in enumerate(((lower, -1.0), (higher, 1.0))):
+            cells = inside & outlined
+            volume, count = errors.volume(dz, cells, sign), np.count_nonzero(cells)
+            if choices is not None and count:
+                share = count / np.count_nonzero(outlined)
+                bias, deviation = sign * choices[k].bias * share, choices[k].deviation * math.sqrt(share)
+                volume = volume.chosen(bias * grid.cell_area_m2, deviation * grid.cell_area_m2)
+            volumes.append(volume)
+        return volumes[0], volumes[1]
+
+    cut, fill = chosen(known)
     each = []
     for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
         each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
@@ -390,14 +407,7 @@ def _summed(
         if not inside.any():
             remarks.append(f"polygon {region.name}: no cell of both surveys is in it")
             continue
-        per_region.append(
-            (
-                region,
-                errors.volume(dz, inside),
-                errors.volume(dz, inside & lower, -1.0),
-                errors.volume(dz, inside & higher),
-            )
-        )
+        per_region.append((region, errors.volume(dz, inside), *chosen(inside)))
     return Change(
         earlier,
         later,

@@ -79,11 +79,15 @@ class Registration:
 
     def moved(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the later survey, in the grid's system, moved onto the earlier one."""
-        c, gx, gy = self.coefficients
         moved = xyz + np.array([*self.shift_m, 0.0])
-        x, y = (moved[:, :2] - self.centre_m).T
-        moved[:, 2] -= c + gx * x + gy * y
+        moved[:, 2] -= self.lift_at(moved[:, :2])
         return moved
+
+    def lift_at(self, xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, " N"]:
+        """What is taken from the later heights at places in the grid's system, metres."""
+        c, gx, gy = self.coefficients
+        x, y = (xy - self.centre_m).T
+        return c + gx * x + gy * y
 
     def _deviation(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         v = self.covariance

@@ -75,10 +75,13 @@ def _between(one: MapFrame, other: MapFrame) -> Callable[[Float64[np.ndarray, "N
             "one of the scenes is georeferenced, the other is not: expected both in one system; prepare both with "
             "positions or ground control"
         )
+    heights = np.array([1.0, 1.0, other.metre_up / one.metre_up])
     if one.frame is None or one.horizontal_wkt == other.horizontal_wkt:
-        return lambda points: points.copy()
+        return lambda points: points * heights
     to = Transformer.from_crs(CRS.from_wkt(one.horizontal_wkt), CRS.from_wkt(other.horizontal_wkt), always_xy=True)
-    return lambda points: np.column_stack([*to.transform(points[:, 0], points[:, 1], errcheck=True), points[:, 2]])
+    return lambda points: (
+        np.column_stack([*to.transform(points[:, 0], points[:, 1], errcheck=True), points[:, 2]]) * heights
+    )
 
 
 def choose_camera(change: Change, site: Site) -> str:
@@ -141,10 +144,12 @@ def make_view(
     if width is not None:
         camera = camera.resized(width, max(16, round(width * camera.height / camera.width)))
     camera = replace(camera, gain=torch.ones_like(camera.gain), shading=None)
-    registration = change.errors.registration
-    other = carried(camera, earlier, later, registration.shift_m, registration.vertical_m)
-    first, second = earlier.render(camera), later.render(other)
+    first, registration = earlier.render(camera), change.errors.registration
     place = _cells(camera, first, earlier.frame, change.grid)
+    known = place[np.isfinite(place).all(axis=1)]
+    middle = np.median(known, axis=0) if len(known) else np.array(registration.centre_m)
+    lift_m = float(registration.lift_at(middle[None])[0])  # a tilt over what one view shows is small
+    second = later.render(carried(camera, earlier, later, registration.shift_m, lift_m))
     return _compared(earlier.scene.names[index], first, second, place, change, cover)
 
 

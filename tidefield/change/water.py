@@ -110,15 +110,16 @@ def measure_water(change: Change, water: tuple[float, float] | None, levels: tup
     """Compare the ground at both dates with levels.
 
     Args:
-        water: heights of the water at both dates; None where they are not known.
-        levels: that areas are asked of.
+        water: heights of the water at both dates, in the earlier survey's unit; None where they are not known.
+        levels: that areas are asked of, in that unit.
     """
+    metres = change.earlier.metres
     earlier, later = _heights(change)
     below = []
-    for level in levels:
+    for level in (metres * level for level in levels):
         error = _level_error(change, earlier, later, (level, level))
         below.append(_below(earlier, later, level, Z95 * error, change.grid.cell_area_m2))
-    line = None if water is None else _waterline(change, earlier, later, water)
+    line = None if water is None else _waterline(change, earlier, later, (metres * water[0], metres * water[1]))
     return Water(line, below)
 
 

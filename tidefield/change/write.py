@@ -22,7 +22,7 @@ from tidefield.change.measure import Change
 from tidefield.change.surfaces import PLAIN, ChangeError, Grid, require_rasterio
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water, Waterline
-from tidefield.files import write_json, write_text
+from tidefield.files import plain_cell, write_json, write_text
 
 BLOCK = 512
 MOST_OUTLINES = 5000
@@ -175,13 +175,8 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            writer.writerow({k: round(v, 4) if isinstance(v, float) else _plain(v) for k, v in row.items()})
+            writer.writerow({k: round(v, 4) if isinstance(v, float) else plain_cell(v) for k, v in row.items()})
     write_text(path, text.getvalue())
-
-
-def _plain(value: Any) -> Any:
-    """A text that no spreadsheet takes for a formula."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
 def write_cover(cover: Cover, folder: Path) -> None:
