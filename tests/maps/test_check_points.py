@@ -114,6 +114,24 @@ def test_points_without_marks_have_a_height_only_and_those_outside_have_none(
     assert [one["up"] for one in found["each"]] == [pytest.approx(-0.1, abs=1e-4), None]
 
 
+def test_points_without_names_are_those_of_their_positions(scene: Scene, frame: MapFrame, tmp_path: Path):
+    one, two = scene.names[:2]
+    lines = (f"1 2 3 10 20 {one}", f"4 5 6 30 40 {one}", f"1 2 3 11 21 {two}", "1 2 3 5 6 gone photograph.jpg")
+    (tmp_path / "check.txt").write_text("\n".join(("EPSG:27700", *lines, "7 8 9 50 60 gone.jpg peg")))
+    points = read_check_points(tmp_path / "check.txt", scene, frame)
+    assert [(point.name, [index for index, _ in point.marks]) for point in points] == [
+        ("point 1", [0, 1]),
+        ("point 2", [0]),
+        ("peg", []),
+    ]
+
+
+def test_a_point_at_two_positions_is_refused(scene: Scene, frame: MapFrame, tmp_path: Path):
+    (tmp_path / "check.txt").write_text("EPSG:27700\n1 2 3 peg\n1 2 4 peg\n")
+    with pytest.raises(RunError, match="expected one position per point"):
+        read_check_points(tmp_path / "check.txt", scene, frame)
+
+
 @pytest.mark.parametrize(
     "text", ["", "EPSG:27700\n", "EPSG:27700\n1 2\n", "nowhere\n1 2 3 a\n", "EPSG:27700\nnan 1 2 a\n"]
 )

@@ -12,6 +12,7 @@ from pyproj import CRS
 from shapely.geometry import LineString
 
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
@@ -89,6 +90,18 @@ def test_the_terrain_of_a_long_coast_is_that_of_its_plane(tmp_path: Path):
     sigma = written(tmp_path / "sigma.tif", np.full(plane.shape, 0.02), coast)
     write_terrain(dsm, sigma, Raster(tmp_path / "dtm.tif", ("terrain",)), coast)
     np.testing.assert_allclose(read_raster(tmp_path / "dtm.tif")[0], plane, atol=0.01)
+
+
+@pytest.mark.parametrize(("cell", "scale"), [(0.05, 0.001), (0.0002, 1e-5)])
+def test_points_of_a_local_frame_are_as_fine_as_its_cells(tmp_path: Path, cell: float, scale: float):
+    laspy = pytest.importorskip("laspy")
+    small = replace(GRID, cell=cell, columns=30, rows=20)
+    values = {"height": np.full((20, 30), 2.0), "sigma": np.zeros((20, 30)), "views": np.full((20, 30), 3)}
+    with cloud_writer(tmp_path / "cloud.laz", small) as writer:
+        writer.write(0, **values, colour=np.zeros((3, 20, 30), np.uint8), classes=np.full((20, 30), 2))
+    cloud = laspy.read(tmp_path / "cloud.laz")
+    assert cloud.header.scales == pytest.approx(scale)
+    assert len(np.unique(np.asarray(cloud.x).round(9))) == 30
 
 
 def test_hillshade_is_that_of_a_plane():
@@ -178,4 +191,8 @@ def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path):
     assert first.startswith('"creek, mouth",0.000,20.030,70.010,')
     low, height, high = (float(first.rsplit(",", 4)[k]) for k in (3, 1, 4))
     assert (height - low, high - height) == (pytest.approx(0.98, abs=1e-3), pytest.approx(0.98, abs=1e-3))
+    assert plot.read_text().lstrip().startswith("<?xml")
+    # Names are texts: no formulas to spreadsheets, no mathematics to the plot.
+    table, plot = write_sections([replace(section, name='=HYPERLINK("a$^$b")')], tmp_path, "m", "m")
+    assert table.read_text().splitlines()[1].startswith("\"'=HYPERLINK(")
     assert plot.read_text().lstrip().startswith("<?xml")

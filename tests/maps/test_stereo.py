@@ -11,8 +11,9 @@ import torch
 
 from tidefield.data.load import load_scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.maps import surface
-from tidefield.maps.grid import Grid, Tile, map_frame
+from tidefield.maps.grid import Grid, MapFrame, Tile, map_frame
 from tidefield.maps.stereo import Pairs, Rectified, choose_pairs, fill_gaps
 from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
@@ -77,6 +78,22 @@ def test_heights_are_those_of_the_flat(scene):
     assert not choose_pairs(
         choice.views[:2], np.ones((2, 4), bool), np.zeros((2, 4)), choice.views[0].position[2] - 1e-3
     )
+
+
+def test_photographs_and_pairs_are_the_same_where_the_plan_is_in_feet(scene):
+    loaded, _ = scene
+    world, chosen = loaded.origin_world.double().numpy(), []
+    for system in ("EPSG:32118", "EPSG:2263"):  # New York's plane coordinates in metres, and in feet
+        metre = 1 / parse_crs(system).axis_info[0].unit_conversion_factor
+        frame = LocalFrame.at(system, (300_000.0 * metre, 60_000.0 * metre, 30.0))
+        own = MapFrame(frame, world, np.eye(3), "", "", "", metre)
+        west, north = own.to_map(np.array([[-6.4, 6.4, 0.0]]))[0, :2]
+        grid = Grid(own, west, north, CELL * metre, 64, 64, 30.0)
+        [tile] = grid.tiles(64, 0)
+        chosen.append(choose_views(tile, loaded, sparse_surface(loaded, grid.coarser(COARSEST))))
+    assert chosen[0].indices == chosen[1].indices
+    assert chosen[0].pairs == chosen[1].pairs
+    assert len(chosen[1].pairs) == 12
 
 
 def test_cells_are_projected_into_the_photographs_above_them_only(scene, monkeypatch: pytest.MonkeyPatch):

@@ -19,6 +19,7 @@ from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SurveyError
 from tidefield.maps.grid import Grid, MapFrame
 from tidefield.maps.rasters import sample
+from tidefield.survey.io.gcp_file import split_unknown
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
 from tidefield.survey.survey import CHECK_FILE
 
@@ -85,6 +86,7 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
         crs, lines = read_list(path)
         names = PhotographNames(scene.names)
         surveyed: dict[str, tuple[float, ...]] = {}
+        unnamed: dict[tuple[float, ...], str] = {}
         marks: dict[str, list[tuple[int, tuple[float, float]]]] = {}
         for where, line in lines:
             cells = line.split()
@@ -92,12 +94,18 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
             if len(numbers) < 3 or not all(map(math.isfinite, numbers)) or len(cells) < 4:
                 raise SurveyError(f"{where} is {line[:80]!r}: {_EXPECTED}; correct it")
             pixel = leading_numbers(cells[3:5])
-            photograph, point = None, cells[-1]
+            place, photograph, words = tuple(numbers), None, cells[-1:]
             if len(pixel) == 2 and len(cells) > 5:
-                # A photograph that the scene does not have still marks a point, by the last cell.
-                photograph, rest = names.split(line.split(maxsplit=5)[5])
-                point = rest[0].strip() if photograph is not None and rest else cells[-1]
-            surveyed.setdefault(point, tuple(numbers))
+                rest = line.split(maxsplit=5)[5]
+                photograph, words = names.split(rest)
+                if photograph is None:  # one that the scene does not have still marks a point
+                    _, words = split_unknown(rest)
+            point = words[0].strip() if words else unnamed.setdefault(place, f"point {len(unnamed) + 1}")
+            if surveyed.setdefault(point, place) != place:
+                raise SurveyError(
+                    f"{where} puts the point {point} at {place}, another line at {surveyed[point]}: expected one "
+                    "position per point; correct one, or give them different names"
+                )
             own = marks.setdefault(point, [])
             if photograph is not None:
                 own.append((scene.names.index(photograph), (pixel[0], pixel[1])))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from tidefield.maps.grid import Grid
 from tidefield.maps.rasters import need
 
 SCALE = 0.001
-"""Coordinates are rounded to so many units."""
+"""Coordinates are rounded to so many units, or, in local frames, whose unit may be any, to a twentieth of a cell."""
 
 
 class CloudWriter:
@@ -69,7 +70,8 @@ def cloud_writer(path: Path, grid: Grid) -> Iterator[CloudWriter]:
     """
     laspy = need("laspy")
     header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales = np.full(3, SCALE)
+    finest = SCALE if grid.frame.frame is not None else min(SCALE, 10.0 ** math.floor(math.log10(grid.cell / 20)))
+    header.scales = np.full(3, finest)
     header.offsets = np.floor([grid.west, grid.bounds[1], grid.height])
     header.generating_software = f"Tidefield {__version__}"[:32]
     header.system_identifier = "photographs"

@@ -83,6 +83,11 @@ class MapFrame:
         """Of heights, for people."""
         return self._unit(self.metre_up, -1)
 
+    @property
+    def up(self) -> float:
+        """Horizontal units in a vertical one."""
+        return self.metre / self.metre_up
+
     def _unit(self, metre: float, axis: int) -> str:
         if self.frame is None:
             return "units"
@@ -299,7 +304,7 @@ def _seen_bounds(frame: MapFrame, scene: Scene) -> tuple[float, float, float, fl
     height = float(np.median(xyz[:, 2]))
     position = frame.to_map(scene.cameras.position_world.double().numpy())
     above = float(np.median(position[:, 2])) - height
-    reach = max(above, 0.0) * math.tan(math.radians(STEEPEST_DEG))
+    reach = max(above, 0.0) * frame.up * math.tan(math.radians(STEEPEST_DEG))
     corners = np.stack([position[:, :2].min(0) - reach, position[:, :2].max(0) + reach])
     east, north = (corners[0, k] + (np.arange(SAMPLES) + 0.5) / SAMPLES * np.ptp(corners[:, k]) for k in (0, 1))
     places = np.stack([*np.meshgrid(east, north), np.full((SAMPLES, SAMPLES), height)], -1).reshape(-1, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.files import completed_file, write_text
+from tidefield.files import completed_file, plain_cell, write_text
 from tidefield.maps.grid import Grid
 from tidefield.maps.rasters import sample
 
@@ -67,7 +67,7 @@ def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up
     for one in sections:
         for d, (x, y), z, s in zip(one.distance, one.place, one.height, one.sigma, strict=True):
             numbers = ["" if np.isnan(value) else f"{value:.4f}" for value in (z, s, z - BAND * s, z + BAND * s)]
-            writer.writerow([one.name, f"{d:.3f}", f"{x:.3f}", f"{y:.3f}", *numbers])
+            writer.writerow([plain_cell(one.name), f"{d:.3f}", f"{x:.3f}", f"{y:.3f}", *numbers])
     write_text(folder / "sections.csv", text.getvalue())
     plot = draw(sections, unit, unit_up)
     with completed_file(folder / "sections.svg", overwrite=True) as partial:
@@ -86,7 +86,8 @@ def draw(sections: Sequence[Section], unit: str, unit_up: str) -> Any:
             one.distance, one.height - BAND * one.sigma, one.height + BAND * one.sigma, color="#97cfbd", label="95%"
         )
         plot.plot(one.distance, one.height, color="#1d3d68", linewidth=1, label="surface")
-        plot.set(title=one.name, xlabel=f"distance ({unit})", ylabel=f"height ({unit_up})")
+        plot.set_title(one.name, parse_math=False)
+        plot.set(xlabel=f"distance ({unit})", ylabel=f"height ({unit_up})")
         plot.grid(color="#d5dbdf", linewidth=0.6)
     axes[0].legend(frameon=False)
     return figure

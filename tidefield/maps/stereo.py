@@ -63,10 +63,10 @@ def choose_pairs(
     pairs, worth = [], []
     for i in range(len(views)):
         for j in range(i + 1, len(views)):
-            base = views[j].position - views[i].position
+            base, up = views[j].position - views[i].position, views[i].up
             across = float(np.linalg.norm(base[:2]))
-            above = max(float((views[i].position[2] + views[j].position[2]) / 2 - height), 1e-6)
-            if not SHORTEST <= across / above <= LONGEST or abs(base[2]) > STEEPEST * across:
+            above = max(float((views[i].position[2] + views[j].position[2]) / 2 - height) * up, 1e-6)
+            if not SHORTEST <= across / above <= LONGEST or abs(base[2]) * up > STEEPEST * across:
                 continue
             preferred = np.exp(-((np.log(across / above / BASE) / BASE_SPREAD) ** 2))
             gain = preferred * np.minimum(quality[i], quality[j]).ravel()

@@ -193,9 +193,15 @@ def positions_from(tile: Tile, cameras: Cameras) -> Float64[np.ndarray, "V 3"]:
     return away @ np.linalg.inv(affine[:, :3]).T
 
 
-def _above(position: np.ndarray, east: np.ndarray, north: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, "*shape"]:
-    """Whether a camera stands within `STEEPEST_DEG` from the vertical above cells; the shapes broadcast."""
-    above = position[2] - height
+def _above(
+    position: np.ndarray, east: np.ndarray, north: np.ndarray, height: np.ndarray, up: float
+) -> Bool[np.ndarray, "*shape"]:
+    """Whether a camera stands within `STEEPEST_DEG` from the vertical above cells; the shapes broadcast.
+
+    Args:
+        up: horizontal units in a vertical one.
+    """
+    above = (position[2] - height) * up
     across = (position[0] - east) ** 2 + (position[1] - north) ** 2
     return (above > 0) & (across <= (math.tan(math.radians(STEEPEST_DEG)) * above) ** 2)
 
@@ -222,6 +228,7 @@ class View:
         self.camera = camera
         self.position = positions_from(tile, camera)[0]
         """East, north and height above `Grid.height` of the photograph, from the middle of the tile."""
+        self.up = tile.grid.frame.up
 
     @cached_property
     def gain(self) -> float:
@@ -259,12 +266,12 @@ class View:
         width, tall = self.size
         b = BORDER_PX
         inside = (z > 0) & (u > b) & (v > b) & (u < width - b) & (v < tall - b)
-        return inside & _above(self.position, east, north, height)
+        return inside & _above(self.position, east, north, height, self.up)
 
     def rank(self, u: np.ndarray, v: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """How well cells are seen, as a network's neighbours of a view straight down are ranked (`data.neighbours`)."""
         across = np.hypot(self.position[0] - east, self.position[1] - north)
-        angle = np.arctan2(across, self.position[2] - height)
+        angle = np.arctan2(across, (self.position[2] - height) * self.up)
         inner = np.minimum(np.minimum(u, self.size[0] - u), np.minimum(v, self.size[1] - v))
         return np.exp(-angle / ANGLE_SCALE_RAD) * np.clip(inner / (BORDER * self.size[0]), 0, 1)
 
@@ -298,7 +305,8 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
     height = start.on(tile, 0)[np.ix_(at, at)] - np.float32(tile.grid.height)
     views, indices, seen, direction = [], [], [], []
     # Projecting the cells into each of thousands of photographs would take most of a tile's time.
-    near = _above(positions_from(tile, scene.cameras).T[..., None, None], east, north, height).any((1, 2))
+    up, positions = tile.grid.frame.up, positions_from(tile, scene.cameras)
+    near = _above(positions.T[..., None, None], east, north, height, up).any((1, 2))
     for index in np.flatnonzero(near).tolist():
         view = View(scene.cameras[index], tile)
         u, v, z = view.pixels(east, north, height)
@@ -308,6 +316,7 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
             indices.append(index)
             seen.append(sees)
             to = view.position[:, None, None] - np.stack([east, north, height])
+            to[2] *= up
             direction.append(to / np.linalg.norm(to, axis=0))
     if not views:
         return Choice([], [], [], [])

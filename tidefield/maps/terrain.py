@@ -123,8 +123,9 @@ def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
             rows_of = (np.arange(row - rim, row + count + rim) + 0.5) / factor - 0.5
             columns_of = (np.arange(grid.columns) + 0.5) / factor - 0.5
             below = _interpolated(_interpolated(ground, rows_of, 0), columns_of, 1)
-            rise = np.maximum(GROUND_SIGMAS * np.minimum(np.nan_to_num(error), LEAST_RISE_M), LEAST_RISE_M)
-            other = height - below > rise * grid.frame.metre_up
+            error_m = np.minimum(np.nan_to_num(error) / grid.frame.metre_up, LEAST_RISE_M)
+            rise_m = np.maximum(GROUND_SIGMAS * error_m, LEAST_RISE_M)
+            other = height - below > rise_m * grid.frame.metre_up
             near = cv2.dilate(other.astype(np.uint8), disk) > 0
             terrain = np.where(near, np.minimum(height, below), height)[rim : rim + count]
             writer.write(row, np.nan_to_num(terrain, nan=NODATA)[None])

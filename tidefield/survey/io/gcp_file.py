@@ -67,7 +67,7 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
         (x, y, z, u, v), rest = _parse_line(where, line)
         name, words = names.split(rest)
         if name is None:
-            image, words = _unknown_name(rest)
+            image, words = split_unknown(rest)
             missing[image] = None
         point = words[0].strip() if words else unnamed.setdefault((x, y, z), f"point {len(unnamed) + 1}")
         first_where, first = first_lines.setdefault(point, (where, (x, y, z)))
@@ -141,8 +141,8 @@ def _parse_line(where: str, line: str) -> tuple[list[float], str]:
     return numbers, rest
 
 
-def _unknown_name(rest: str) -> tuple[str, list[str]]:
-    """Split off the name, which may have spaces, of an image that does not exist."""
+def split_unknown(rest: str) -> tuple[str, list[str]]:
+    """Split the name, which may have spaces, of a photograph that does not exist from the words behind it."""
     if "\t" in rest:
         return rest.split("\t")[0], rest.split("\t")[1:]
     words = rest.split()
