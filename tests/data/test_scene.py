@@ -40,6 +40,15 @@ def test_an_unknown_name_is_an_error_with_some_names():
         wall.cameras(4)["a.jpg"]
 
 
+def test_a_name_of_several_photographs_is_an_error_unless_it_is_the_whole_name_of_one():
+    names = ("100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0002.JPG", "DJI_0002.JPG")
+    scene = replace(named(), names=names)
+    assert scene.index("DJI_0002.JPG") == 3
+    assert scene.index("101MEDIA/DJI_0001.JPG") == 1
+    with pytest.raises(SceneError, match=r"names 2 photographs in wall \(100MEDIA/DJI_0001\.JPG, 101MEDIA/DJI_0001"):
+        scene.index("DJI_0001")
+
+
 def test_names_follow_selections_except_those_by_tensors():
     cameras = named().cameras
     assert cameras[3].names == NAMES[3:]

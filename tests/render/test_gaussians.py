@@ -78,3 +78,10 @@ def test_views_of_nothing_and_other_names_are_one_clear_error(tmp_path: Path):
     (tmp_path / "wall.ply").touch()
     with pytest.raises(RunError, match="is there already"):
         export(Export(tmp_path, tmp_path / "wall.ply"), quiet)
+
+
+def test_views_that_do_not_fit_into_memory_are_refused_before_any_is_rendered(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tidefield.render.gaussians.memory_bytes", lambda: 2_000_000)
+    with pytest.raises(RunError, match="choose a smaller --width"):
+        make_gaussians(lambda camera: pytest.fail("a view was rendered"), textured_wall.cameras(4, 96, 72), 96)
+    assert len(make_gaussians(render_wall, textured_wall.cameras(4, 96, 72), 48).mean_world)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from tidefield.errors import SceneError
+from tidefield.errors import SceneError, list_names
 
 _PARALLEL = 0.02
 """Smallest eigenvalue of the mean projection across the axes (the mean squared sine of their angle to one direction)
@@ -274,11 +274,18 @@ def find_name(name: str, names: Sequence[str], where: str) -> int:
     """Find a photograph by its path in the scene, its file name, or its path without the folder and the suffix.
 
     Raises:
-        SceneError: none of the names matches.
+        SceneError: none of the names matches, or several match in part and none as a whole.
     """
-    for i, own in enumerate(names):
-        if name in (own, PurePath(own).stem, PurePath(own).name):
-            return i
+    if name in names:
+        return names.index(name)
+    found = [i for i, own in enumerate(names) if name in (PurePath(own).stem, PurePath(own).name)]
+    if len(found) > 1:
+        matching = list_names([names[i] for i in found])
+        raise SceneError(
+            f"{name!r} names {len(found)} photographs in {where} ({matching}): expected one; write the whole name"
+        )
+    if found:
+        return found[0]
     looks = (
         f"names look like {', '.join(names[:3])}; choose one of these" if names else "they have no names; use indices"
     )

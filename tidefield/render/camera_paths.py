@@ -247,7 +247,7 @@ def _distance(scene: Scene) -> float:
         camera = points.camera_index
         pose = scene.cameras.T_world_camera[camera]
         depth = ((points.xyz_world[points.point_index] - pose[:, :, 3]) * pose[:, :, 2]).sum(1)
-        depth = depth[(depth > 0) & (camera[:, None] == camera.new_tensor(train)).any(1)]
+        depth = depth[(depth > 0) & torch.isin(camera, camera.new_tensor(train))]
         if len(depth):
             return float(depth.median())
     near, far = scene.cameras.near_far[train].double().median(0).values.tolist()

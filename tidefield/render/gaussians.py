@@ -24,6 +24,7 @@ from tidefield import SOFTWARE
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.machine import memory_bytes
 from tidefield.model.rendering import Render, Rendering
 from tidefield.render.consistency import ViewPoints, choose_points
 from tidefield.render.stills import MIN_OPACITY
@@ -38,6 +39,8 @@ OPACITY = 0.95
 STEEPEST = 0.15
 """Least cosine between the surface and a ray: flatter pixels are edges between near and far."""
 MOST = 20_000_000
+PIXEL_BYTES = 120
+"""What is held of a view's pixel until all views are rendered and points are chosen."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +98,22 @@ def make_gaussians(
 def render_surfaces(
     render: Render, cameras: Cameras, width: int, progress: Callable[[int, int], None] | None = None
 ) -> list[SurfaceView]:
-    """Render the views of cameras, and find the surface in each; the arguments are those of `make_gaussians`."""
+    """Render the views of cameras, and find the surface in each; the arguments are those of `make_gaussians`.
+
+    Raises:
+        RunError: the points of all views do not fit into half of the memory.
+    """
+    scales = width / cameras.size_px.max(dim=1).values
+    sizes = (cameras.size_px * scales[:, None]).round().long().clamp(min=16).tolist()
+    needed = PIXEL_BYTES * sum(w * h for w, h in sizes)
+    if needed > memory_bytes() / 2:
+        raise RunError(
+            f"{len(cameras):,} views of {width} px hold {needed / 1e9:.0f} GB of points: expected at most half of the "
+            f"memory, {memory_bytes() / 2e9:.0f} GB; choose a smaller --width"
+        )
     views = []
-    for k in range(len(cameras)):
+    for k, size in enumerate(sizes):
         own = cameras[k]
-        scale = width / max(own.width, own.height)
-        size = (max(16, round(scale * own.width)), max(16, round(scale * own.height)))
         # Nameless, so that a photograph serves in its own view; and in the common light.
         camera = replace(own, names=(), gain=torch.ones_like(own.gain), shading=None).resized(*size)
         views.append(_of_view(render(camera), camera))
