@@ -55,7 +55,7 @@ def looking(
     """What `forward` is given for tiles of the scene's held-out photograph."""
     tiles = Tiles(at.cameras[[TARGET] * len(corners)], torch.tensor(corners).float(), side)
     prior = surface_prior(at.cameras[TARGET], at.points, at.cameras)
-    start = own.start_intervals(tiles, prior.expand(len(corners), -1, -1, -1))
+    start = own.start_intervals(tiles, [prior] * len(corners))
     neighbours = torch.tensor([2, 4, 1, 5, 0])[: own.config.views].expand(len(corners), -1)
     blend_weight, middle = torch.ones(*neighbours.shape, 4), torch.zeros(len(corners), 3)
     views = FeatureCache(own, at, CPU).views(at.cameras[TARGET], Neighbours(neighbours, blend_weight), middle)

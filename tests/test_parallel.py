@@ -14,7 +14,7 @@ from tidefield.config import SWIFT
 from tidefield.data.batches import draw_batch
 from tidefield.data.depth_prior import DepthPriors
 from tidefield.model.network import make_network
-from tidefield.parallel import SharedValues, differentiable_parts, in_parallel
+from tidefield.parallel import SharedValues, differentiable_parts, in_parallel, read_ahead
 from tidefield.train.losses import BatchLoss, Inputs
 
 CPU = torch.device("cpu")
@@ -46,6 +46,30 @@ def test_tasks_run_in_the_modes_of_their_caller(mode) -> None:
 
     with mode():
         assert in_parallel([modes] * 3, CPU) == [modes()] * 3
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_what_tasks_on_a_gpu_ask_for_in_turn_is_read_at_the_same_time() -> None:
+    both, reads = threading.Barrier(2), []
+
+    def read(key: int) -> int:
+        if key < 2:
+            both.wait(timeout=10)  # broken unless the other one is read meanwhile
+        reads.append(key)
+        return 10 * key
+
+    with read_ahead(read, [0, 1, 2], "cuda") as asked:
+        assert [asked(key) for key in (0, 1, 2, 3)] == [0, 10, 20, 30]
+    assert sorted(reads) == [0, 1, 2, 3], "each is read once"
+    with read_ahead(read, [0, 1], CPU) as asked:
+        assert asked is read
+
+
+def test_what_cannot_be_read_ahead_is_an_error_of_the_task_that_asks_for_it() -> None:
+    with read_ahead(lambda key: 1 // key, [0, 1], "cuda") as asked:
+        assert asked(1) == 1
+        with pytest.raises(ZeroDivisionError):
+            asked(0)
 
 
 @pytest.mark.usefixtures("two_threads")

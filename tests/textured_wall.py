@@ -82,6 +82,12 @@ def scene(own: Cameras, test: tuple[int, ...] = (1,)) -> Scene:
     )
 
 
+def mixed_scene() -> Scene:
+    """Photographs of two sizes, taking turns, one narrower than a tile."""
+    size = torch.tensor([[48, 36], [40, 6]]).repeat(3, 1)
+    return scene(replace(cameras(6), size_px=size, principal_px=size / 2))
+
+
 def with_left_halves_masked(own: Scene, which: tuple[int, ...]) -> Scene:
     """The same scene; what is left of the middle of some photographs is not to be used."""
     mask = torch.arange(own.cameras.width) >= own.cameras.width // 2

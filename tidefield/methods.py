@@ -156,7 +156,7 @@ def trained(
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver
 
-        with driver.renderer(folder) as render:
+        with driver.renderer(folder, device) as render:
             yield with_rays(render, sampling), driver.progress_of(folder)
         return
     if isinstance(run.config, OpensplatConfig):

@@ -57,6 +57,28 @@ def _checked(check: Callable[[], None], task: Callable[[], T]) -> T:
 
 
 @contextmanager
+def read_ahead(read: Callable[[K], T], keys: Sequence[K], device: torch.device | str) -> Iterator[Callable[[K], T]]:
+    """Read at the same time what tasks on a GPU, which run one after another (`in_parallel`), ask for in turn.
+
+    Tasks on a CPU read for themselves.
+
+    Args:
+        read: reads what belongs to a key; threads may call it at the same time.
+        keys: to read; each is asked for once.
+        device: of the tasks.
+
+    Returns:
+        What tasks call in place of `read` while the block lasts.
+    """
+    if torch.device(device).type == "cpu" or _SEQUENTIAL.get() or len(keys) < 2:
+        yield read
+        return
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        begun = {key: pool.submit(read, key) for key in keys}
+        yield lambda key: begun.pop(key).result() if key in begun else read(key)
+
+
+@contextmanager
 def interruptible(check: Callable[[], None]) -> Iterator[None]:
     """Have `in_parallel` call a function before each task, from the task's thread: what it raises ends the work."""
     token = _CHECK.set(check)
@@ -89,6 +111,9 @@ class SharedValues(Generic[K, T]):
         self._values: OrderedDict[K, Future[T]] = OrderedDict()
         self._bytes: dict[K, int] = {}
         self._changing = threading.Lock()
+
+    def __contains__(self, key: K) -> bool:
+        return key in self._values
 
     def get(self, key: K, make: Callable[[K], T]) -> T:
         """Return the value of a key, which is made if there is none; threads that ask for it meanwhile wait."""

@@ -108,13 +108,32 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
         grey = (0.5 / factor * camera.gain[0]).clamp(0, 1)
         expected.append(float(-10 * torch.log10((truth.float() / 255 - grey).square().mean())))
     assert psnr == pytest.approx(sum(expected) / len(expected), abs=0.05)
-    with driver.renderer(run) as render:
+    with driver.renderer(run, CPU) as render:
         for index in scene.test:
             view = render(scene.cameras[index])
             grey = (0.5 / factor * scene.cameras.gain[index]).clamp(0, 1)
             torch.testing.assert_close(view.colour, grey.expand(36, 48, 3))
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert driver.progress_of(run).step == 3
+
+
+@pytest.mark.parametrize(("visible", "expected"), [(None, "1"), ("4,7", "7")])
+def test_the_worker_sees_only_the_gpu_that_was_asked_for(
+    visible: str | None, expected: str, scene: Scene, tmp_path: Path, fake: None, monkeypatch: pytest.MonkeyPatch
+):
+    script = driver.WORKER
+    script.write_text(f"import os, sys\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), file=sys.stderr)\n{FAKE}")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    gpu = torch.device("cuda:1")
+    driver.train("nerfacto", scene, tmp_path, Budget(steps=3), 0, gpu, None, lambda step, seconds: None)
+    with driver.renderer(tmp_path, gpu):
+        pass
+    with driver.renderer(tmp_path, CPU):
+        pass
+    lines = (tmp_path / driver.LOG_FILE).read_text().splitlines()
+    assert lines[::2] == [expected, expected, str(visible)]
 
 
 @pytest.fixture
@@ -146,7 +165,7 @@ def test_what_nerfstudio_has_learned_comes_back_as_the_view_of_the_camera(tmp_pa
     scene = wall.scene(cameras, test=(2,))
     assert driver.export(scene, tmp_path / "data").factor.max() < 0.95, "a scene whose factor matters"
     driver.train("nerfacto", scene, tmp_path, Budget(steps=2), 0, CPU, None, lambda step, seconds: None)
-    with driver.renderer(tmp_path) as render:
+    with driver.renderer(tmp_path, CPU) as render:
         view = render(scene.cameras[2])
     looks_like(view, scene.photographs[2], scene.cameras[2])
     assert view.opacity.min() == 1
@@ -191,7 +210,7 @@ def test_the_background_of_a_scene_with_alpha_comes_back_without_gain(
     transparent: Scene, tmp_path: Path, standin: None
 ):
     driver.train("nerfacto", transparent, tmp_path, Budget(steps=2), 0, CPU, None, lambda step, seconds: None)
-    with driver.renderer(tmp_path) as render:
+    with driver.renderer(tmp_path, CPU) as render:
         view = render(transparent.cameras[2])
     looks_like(view, transparent.photographs[2], transparent.cameras[2])
     alpha = transparent.photographs.alpha(2)
@@ -429,7 +448,7 @@ def test_the_real_nerfacto_trains_and_renders(scene: Scene, tmp_path: Path):
     run.mkdir()
     plain = replace(scene, cameras=wall.cameras(5))
     driver.train("nerfacto", plain, run, Budget(steps=500), 0, CPU, None, lambda step, seconds: None)
-    with driver.renderer(run) as render:
+    with driver.renderer(run, CPU) as render:
         view = render(plain.cameras[2])
     assert view.colour.shape == (36, 48, 3)
     assert np.isfinite(view.depth.numpy()).all()

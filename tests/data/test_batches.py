@@ -9,7 +9,6 @@ from tidefield.config import PAPER, SWIFT, TrainConfig
 from tidefield.data.batches import Batch, draw_batch
 from tidefield.data.depth_prior import DepthPriors, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
-from tidefield.data.images import Photographs
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.recording import tensors_of
@@ -21,14 +20,6 @@ TEST = (1, 4)
 
 def scene() -> Scene:
     return wall.scene(wall.with_gains(wall.cameras(7)), TEST)
-
-
-def mixed_scene() -> Scene:
-    """Photographs of two sizes, taking turns, one narrower than a tile."""
-    own = wall.cameras(6)
-    size = torch.tensor([[48, 36], [40, 6]]).repeat(3, 1)
-    own = replace(own, size_px=size, principal_px=size / 2)
-    return replace(wall.scene(own), photographs=Photographs(tuple(wall.photograph(own[i]) for i in range(6))))
 
 
 def batch(own: Scene, config: TrainConfig, seed: int = 0) -> Batch:
@@ -76,7 +67,7 @@ def images(drawn: Batch) -> list[tuple[Tensor, Tensor]]:
 @pytest.mark.parametrize("config", [CROPS, WHOLE])
 @pytest.mark.parametrize("mixed", [False, True])
 def test_images_hold_the_neighbours_pixels_they_claim(config: TrainConfig, mixed: bool):
-    own = mixed_scene() if mixed else scene()
+    own = wall.mixed_scene() if mixed else scene()
     for drawn in seeds(own, config, 4):
         every = images(drawn)
         for neighbour, which in zip(drawn.neighbours.flatten().tolist(), drawn.which.flatten().tolist(), strict=True):
@@ -88,7 +79,7 @@ def test_images_hold_the_neighbours_pixels_they_claim(config: TrainConfig, mixed
 
 
 def test_whole_photographs_are_encoded_once_each():
-    for drawn in seeds(mixed_scene(), WHOLE, 4):
+    for drawn in seeds(wall.mixed_scene(), WHOLE, 4):
         assert sum(len(group) for group in drawn.images) == len(drawn.neighbours.unique())
         assert not any(corner.any() for corner in drawn.image_corner_px)
 
@@ -116,7 +107,7 @@ def test_tiles_cover_all_training_photographs():
 
 
 def test_pixels_outside_a_photograph_smaller_than_a_tile_have_weight_zero():
-    drawn = [b for b in seeds(mixed_scene(), CROPS) if (b.targets % 2 == 1).any()]
+    drawn = [b for b in seeds(wall.mixed_scene(), CROPS) if (b.targets % 2 == 1).any()]
     assert drawn
     for b in drawn:
         for t in (b.targets % 2 == 1).nonzero()[:, 0].tolist():

@@ -1,5 +1,6 @@
 """Matching finds the textured wall from a wrong start, leaves what it cannot see, and says how far to search."""
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,9 +15,13 @@ from torch import Tensor
 
 from tidefield.data import matching
 from tidefield.data.depth_prior import DepthPrior, DepthPriors, surface_prior
+from tidefield.data.images import Read
 from tidefield.data.matching import Matcher
+from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.model.sampling import intervals_from_prior
+from tidefield.parallel import read_ahead
 
 TARGET = 3
 STEP = 0.25
@@ -139,6 +144,33 @@ def test_the_interval_is_wider_where_the_depths_of_neighbouring_pixels_differ(mo
     assert (width[:, 4 : middle - 4] < 1.5 * before[:, 4 : middle - 4]).all()
 
 
+def test_no_surface_and_no_interval_reach_beyond_infinity(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    camera = at.cameras[TARGET]
+    level = Matcher._level
+
+    def silhouettes(self: Matcher, *arguments: Any) -> tuple[Tensor, Any]:
+        """As of trunks before the horizon, of which some pixels are matched even farther."""
+        found, fit = level(self, *arguments)
+        behind = torch.arange(found.shape[1]) % 8
+        return torch.where(behind < 4, found, torch.where(behind < 7, 1e-4, -1e-3)), fit
+
+    monkeypatch.setattr(Matcher, "_level", silhouettes)
+    prior = Matcher(at)(camera, surface_prior(camera, at.points, at.cameras))
+    expected, near, far = prior.cells
+    assert (near > expected).all()
+    assert (expected >= far).all()
+    least = matching.FARTHEST / camera.near_far[0, 1]
+    assert far.min() == least
+    assert inverse_depth(prior, camera).min() > 0.99 * least
+    corners = pixel_grid(8, 6)[:, None] * 16 - 8
+    uv = (corners + pixel_grid(16, 16)).reshape(1, -1, 2)
+    detail = prior.detail_of_tiles(corners[:, 0], 16).reshape(1, -1)
+    moved = intervals_from_prior([prior.cells], uv).moved(detail)
+    assert (moved.inv_near >= moved.inv_far).all()
+    assert moved.inv_far.min() > 0
+
+
 def test_rays_without_an_expected_depth_beside_others_keep_what_they_have():
     at = scene()
     camera = at.cameras[TARGET]
@@ -175,6 +207,22 @@ def test_a_cameras_own_photograph_takes_no_part():
     at = replace(at, photographs=replace(at.photographs, colours=tuple(other)))
     assert torch.equal(matched(at, cells), without)
     assert not torch.equal(matched(at, cells, names=False), without)
+
+
+def test_a_gpu_matches_photographs_that_were_read_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
+    at, readers = scene(), set[str]()
+    cells = 1.05 * surface_prior(at.cameras[TARGET], at.points, at.cameras)
+    expected, read = matched(at, cells), Pyramid.read
+
+    def noted(self: Pyramid, *key: int) -> Read:
+        readers.add(threading.current_thread().name)
+        return read(self, *key)
+
+    monkeypatch.setattr(Pyramid, "read", noted)
+    monkeypatch.setattr(matching, "read_ahead", lambda read, keys, _: read_ahead(read, keys, "cuda"))
+    assert torch.equal(matched(at, cells), expected)
+    assert len(readers) > 0
+    assert threading.current_thread().name not in readers
 
 
 def test_parts_of_a_large_picture_fit_together(monkeypatch: pytest.MonkeyPatch):

@@ -73,6 +73,16 @@ def test_the_report_holds_every_key_that_scripts_rely_on(scene, tmp_path):
     assert report["rays_per_second"] == pytest.approx(48 * 36 / report["seconds_per_frame"])
 
 
+def test_the_memory_is_that_of_the_gpu_that_was_used(scene, tmp_path, monkeypatch):
+    report = evaluate(perfect, scene, tmp_path / "cpu", configuration={}, console=quiet()).report
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device=0: [0, 7_000_000, 0][device])
+    gpus = evaluate(perfect, scene, tmp_path / "gpus", configuration={}, console=quiet()).report
+    found = [one["peak_cuda_memory_bytes"] for one in (report, gpus)]
+    assert found == [None, 7_000_000]
+
+
 @pytest.mark.parametrize("prepared_without", [True, False])
 def test_the_report_says_whether_poses_know_of_the_held_out_photographs(prepared_without, scene, tmp_path):
     scene = replace(scene, root=tmp_path)

@@ -1,5 +1,7 @@
 """Features kept in blocks: every tile finds what it shows, whatever is forgotten meanwhile."""
 
+import threading
+
 import pytest
 import textured_wall as wall
 import torch
@@ -7,9 +9,20 @@ import torch
 from tidefield.config import SWIFT
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.model import cache as feature_cache
-from tidefield.model.cache import CacheFull, FeatureCache, padded_channels
+from tidefield.model.cache import (
+    FREE_SHARE,
+    LEAST_BYTES,
+    MEMORY_SHARE,
+    Block,
+    BlockRead,
+    CacheFull,
+    FeatureCache,
+    memory_for_features,
+    padded_channels,
+)
 from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
+from tidefield.parallel import read_ahead
 
 CPU = torch.device("cpu")
 TARGET = 3
@@ -103,6 +116,51 @@ def test_masked_pixels_are_no_valid_samples(network: Network):
                 stride, middle[:, None], directions[:, None], torch.full((4, 1, 2), 0.5), torch.ones(4, 1), coarse
             )
             assert found.valid[:, 0, 0].tolist() == expected
+
+
+def test_workers_that_share_a_gpu_have_a_part_each_of_what_it_has_free(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(feature_cache, "cores", lambda: 16)
+    for total, free, threads, expected in (
+        (80e9, 79e9, 16, MEMORY_SHARE * 80e9),
+        (80e9, 79e9, 8, MEMORY_SHARE * 80e9),
+        (80e9, 79e9, 1, FREE_SHARE * 79e9 / 16),
+        (8e9, 7e9, 16, LEAST_BYTES),
+        (24e9, 20e9, 1, FREE_SHARE * 20e9 / 16),
+        (24e9, 2e9, 16, FREE_SHARE * 2e9),
+    ):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, found=(int(free), int(total)): found)
+        assert memory_for_features(torch.device("cuda:1")) == int(expected)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_maps_have_no_more_texels_than_are_counted_with_32_bits(network: Network, monkeypatch: pytest.MonkeyPatch):
+    roomy = FeatureCache(network, scene(), CPU)
+    monkeypatch.setattr(feature_cache, "MOST_TEXELS", 12 * 128**2)  # blocks of 64 pixels, a texel every half pixel
+    limited = FeatureCache(network, scene(), CPU)
+    assert limited.slots == 12 < roomy.slots
+    assert max(len(maps.rows) for maps in feature_cache._maps(limited._encoded)) == 12 * 128**2
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_gpu_encodes_photographs_that_were_read_at_the_same_time(network: Network, monkeypatch: pytest.MonkeyPatch):
+    at, readers = scene(), set[str]()
+    found = [Renderer(network, at, SWIFT, CPU)(at.cameras[TARGET]).colour]
+    read = FeatureCache._read
+
+    def noted(self: FeatureCache, block: Block) -> BlockRead:
+        readers.add(threading.current_thread().name)
+        return read(self, block)
+
+    monkeypatch.setattr(FeatureCache, "_read", noted)
+    monkeypatch.setattr(feature_cache, "in_parallel", lambda tasks, _: [task() for task in tasks])
+    for device in ("cpu", "cuda"):
+        monkeypatch.setattr(feature_cache, "read_ahead", lambda read, keys, _, on=device: read_ahead(read, keys, on))
+        readers.clear()
+        found.append(Renderer(network, at, SWIFT, CPU)(at.cameras[TARGET]).colour)
+        assert (threading.current_thread().name in readers) == (device == "cpu")
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
 
 
 @pytest.mark.parametrize("channels", range(1, 9))

@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tidefield.model.sampling import Intervals, histogram, refine, sample
+from tidefield.data.depth_prior import read_prior
+from tidefield.model.sampling import Intervals, histogram, intervals_from_prior, refine, sample
 
 DENSITY = torch.tensor([0.5, 0.0, 2.0, 4.0, 0.1, 0.0, 1.0, 0.4])
 
@@ -52,6 +53,27 @@ def test_the_densitys_scale_and_the_other_rays_do_not_matter(jittered: bool):
     rays = torch.rand(2, 3, 8, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(drawn(rays), drawn(rays * 37.0))
     torch.testing.assert_close(drawn(rays)[1:, 1:2], drawn(rays[[1, 1]])[1:, 1:2])
+
+
+def test_intervals_of_tiles_are_those_of_their_own_priors_whatever_the_sizes():
+    random = torch.Generator().manual_seed(0)
+    priors = [torch.rand(3, *size, generator=random) for size in ((9, 12), (12, 9), (9, 12))]
+    uv = 40 * torch.rand(3, 20, 2, generator=random)
+    found = intervals_from_prior(priors, uv)
+    for k, prior in enumerate(priors):
+        values = read_prior(prior[None], uv[k : k + 1])
+        alone = [found.inv_expected[k], found.inv_near[k], found.inv_far[k]]
+        assert torch.equal(torch.stack(alone), torch.cat(values))
+        shared = intervals_from_prior([prior], uv)
+        assert torch.equal(shared.inv_far[k], found.inv_far[k])
+
+
+def test_intervals_are_moved_as_asked_but_not_beyond_infinity():
+    near, far = torch.tensor([[0.2, 0.2, 0.2]]), torch.tensor([[0.1, 0.1, 0.1]])
+    found = Intervals(near, far, torch.tensor([[0.15, torch.nan, 0.15]])).moved(torch.tensor([[-0.05, -0.15, -0.5]]))
+    torch.testing.assert_close(found.inv_near[0], torch.tensor([0.15, 0.05, 0.002]))
+    torch.testing.assert_close(found.inv_far[0], torch.tensor([0.05, 0.001, 0.001]))
+    torch.testing.assert_close(found.inv_expected[0], torch.tensor([0.1, torch.nan, 0.0015]), equal_nan=True)
 
 
 def test_an_even_density_in_any_number_of_bins_gives_even_samples():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +45,7 @@ class Walls(Stream):
         self.drawn = Drawn(scene, DepthPriors(scene), scene.cameras)
         self.asked: list[int] = []
 
-    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+    def draw(self, step: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Drawn:
         self.asked.append(step)
         return self.drawn
 
@@ -71,6 +72,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(stream, "POOL_SIZE", 2)
     monkeypatch.setattr(stream, "STEPS_EACH", 4)
     generator = torch.Generator().manual_seed(0)
+    monkeypatch.setattr(stream, "cores", lambda: 1)
     with Stream(tmp_path / "scenes", [], 7, SMALL) as scenes:
         names = [[scenes.draw(step, generator).scene.root.name for _ in range(8)] for step in (0, 4)]
     assert set(names[0]) == {"7-000000", "7-000001"}
@@ -87,6 +89,48 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
         scenes.draw(16, again)
         left = {path.name for path in (tmp_path / "scenes").iterdir()}
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
+
+
+@pytest.mark.parametrize(("cores", "processes", "makers"), [(2, 1, 1), (16, 1, 4), (16, 4, 1), (128, 1, 8)])
+def test_processes_that_make_scenes_have_some_cores_each(
+    cores: int, processes: int, makers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "cores", lambda: cores)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
+    with Stream(tmp_path, [], 7, SMALL) as scenes:
+        assert scenes.makers == makers
+
+
+def test_several_processes_make_the_scenes_that_one_makes_but_a_few_ahead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "recipe", small_recipe)
+    monkeypatch.setattr(stream, "POOL_SIZE", 2)
+    monkeypatch.setattr(stream, "STEPS_EACH", 2)
+    monkeypatch.setattr(stream, "ProcessPoolExecutor", lambda makers, *_: ThreadPoolExecutor(makers))  # start sooner
+    found = []
+    for cores, last in ((4, 3), (8, 4)):
+        monkeypatch.setattr(stream, "cores", lambda cores=cores: cores)
+        generator = torch.Generator().manual_seed(0)
+        with Stream(tmp_path / str(cores), [], 7, SMALL) as scenes:
+            found.append([scenes.draw(step, generator) for step in range(4)])
+            assert max(*scenes.pending, *scenes.pool) == last
+    for one, other in zip(*found, strict=True):
+        assert one.scene.root.name == other.scene.root.name
+        assert all(map(torch.equal, one.scene.photographs.colours, other.scene.photographs.colours))
+        assert torch.equal(one.cameras.T_world_camera, other.cameras.T_world_camera)
+
+
+def test_scenes_are_matched_on_the_device_that_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    at, devices = wall.scene(wall.cameras(6)), []
+    monkeypatch.setattr(stream, "Matcher", lambda *_, device, **__: devices.append(torch.device(device)))
+    monkeypatch.setattr(Stream, "_made", lambda *_: at)
+    monkeypatch.setattr(Stream, "_order", lambda *_: None)
+    with Stream(tmp_path / "scenes", [], 1, SMALL) as scenes:
+        learner = Pretrainer(SMALL, scenes, at, 0, CPU)
+        learner.device = torch.device("cuda:1")
+        learner.draw()
+    assert devices == [torch.device("cuda:1")]
 
 
 def test_scenes_are_procedural_and_real_augmented_of_their_own() -> None:

@@ -42,6 +42,7 @@ from tidefield.data.areas import cut
 from tidefield.data.depth_prior import DepthPrior
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
+from tidefield.evaluation.evaluate import evaluate
 from tidefield.geometry.lenses import Lens
 from tidefield.model.network import make_network
 from tidefield.train import checkpoint
@@ -102,6 +103,16 @@ def test_encoders_whose_features_nothing_bounds_learn_more_slowly(
     for name, parameter in trainer.network.named_parameters():
         share = encoder if name.startswith("encoder.") else 1.0
         assert rates[parameter] == pytest.approx(share * rate / SMALL.train.warm_up, rel=0.01), name
+
+
+def test_photographs_of_two_sizes_are_learned_from_and_evaluated(tmp_path: Path) -> None:
+    mixed = wall.mixed_scene()
+    trainer = SceneTrainer(replace(SMALL, train=replace(SMALL.train, tiles=4)), mixed, seed=3, device=CPU)
+    assert len(trainer.draw().cameras.size_px.unique(dim=0)) == 2
+    errors = [trainer.step(Budget(steps=3)) for _ in range(3)]
+    assert all(0 < error < 1 for error in errors)
+    report = evaluate(trainer.renderer(), mixed, tmp_path, configuration={}, console=Console(quiet=True)).report
+    assert math.isfinite(report["mean"]["psnr"])
 
 
 def in_areas(monkeypatch: pytest.MonkeyPatch, each: int = 2) -> None:

@@ -12,6 +12,7 @@ Alphabet: V photographs, K depths that are tried, H W pixels of a camera, h w ce
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, product
@@ -22,12 +23,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.depth_prior import STRIDE, DepthPrior
+from tidefield.data.images import Read
 from tidefield.data.neighbours import BORDER, from_border
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
-from tidefield.parallel import SharedValues, in_parallel
+from tidefield.parallel import SharedValues, in_parallel, read_ahead
 
 COARSEST_PX, LEAST_LEVELS = 25, 4
 """The first level's longer side, about, and the least number of levels, each twice as fine as the one before."""
@@ -65,6 +67,9 @@ weight of a pixel is a quarter."""
 HALF_PX, SPREADS, SPREAD_PX = 1.0, 4.0, 9
 """Half of the interval that is left to search: pixels of parallax, and standard deviations of the matched depths in a
 window of this side."""
+FARTHEST = 0.01
+"""Least inverse depth of a surface and of its interval, as a share of that of the camera's far: where depths differ
+much, as at the edges of what stands before the horizon, the interval would reach beyond infinity."""
 FRAME_PX, OVERLAP_PX = 768, 32
 """Side of the parts of a level that are matched at once, and how far they overlap, which is more than what a pixel's
 windows reach; ..."""
@@ -126,8 +131,10 @@ class Matcher:
         finer = self.finer and fits and self.pyramid.files_show(twice.to("cpu"))
         matched = self._match(twice if finer else _smaller(camera, octaves), start, reach, finer)
         found, half = (_resized(image, camera) for image in matched)
+        farthest = FARTHEST / camera.near_far[0, 1]
+        found = found.clamp(min=farthest)
         middle, half = (_on_cells(cells, image) for image in (found, half))
-        ends = middle + half, torch.minimum(middle - half, middle)
+        ends = middle + half, torch.minimum(middle - half, middle).clamp(min=farthest)
         result = torch.where(known & (half > 0), torch.stack([middle, *ends]), cells)
         detail = found - _on_pixels(camera, torch.where(known, result[0], middle))
         seen = _on_pixels(camera, (known & (half > 0)).to(found)) == 1
@@ -311,15 +318,20 @@ class Matcher:
         keys = list(zip(views.tolist(), levels.tolist(), strict=True))
         used = [k for k, (rows, _) in enumerate(extents) if rows.stop > rows.start]
         looks = []
-        for k, image in zip(used, self._images.get_all([keys[k] for k in used], self._image), strict=True):
+        for k, image in zip(used, self._images_of([keys[k] for k in used]), strict=True):
             at = (..., *extents[k])
             source = self.pyramid.camera(*keys[k]).to(self.device)
             looks.append(_Look(image, source, *extents[k], weight[k][at], rays[at], origin, start[at]))
         return looks
 
-    def _image(self, key: tuple[int, int]) -> Float[Tensor, "1 1 H W"]:
-        """A photograph at a level of the pyramid without its local means and contrasts."""
-        colours, _ = self.pyramid.read(*key)
+    def _images_of(self, keys: Sequence[tuple[int, int]]) -> list[Float[Tensor, "1 1 _ _"]]:
+        """Photographs at levels of the pyramid, each without its local means and contrasts."""
+        missing = [key for key in keys if key not in self._images]
+        with read_ahead(lambda key: self.pyramid.read(*key), missing, self.device) as read:
+            return self._images.get_all(keys, lambda key: self._image(key, read(key)))
+
+    def _image(self, key: tuple[int, int], photograph: Read) -> Float[Tensor, "1 1 H W"]:
+        colours, _ = photograph
         camera = self.pyramid.camera(*key).to(self.device)
         grey = (colours.to(self.device).float() / 255 / camera.gain_of_rows()).mean(-1)
         mean = _box(grey, CONTRAST_PX)

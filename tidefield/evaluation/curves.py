@@ -41,9 +41,9 @@ class QualityCurve:
 
     cameras: tuple[Cameras, ...]
     """Of the first held-out photograph and of the middle one, at a smaller size."""
-    truths: tuple[UInt8[Tensor, "H W 3"], ...]
+    truths: tuple[UInt8[Tensor, "_ _ 3"], ...]
     """The photographs, as means over the pixels' areas."""
-    used: tuple[Bool[Tensor, "H W"], ...]
+    used: tuple[Bool[Tensor, "_ _"], ...]
     """Their pixels that hold no masked one."""
     points: list[tuple[float, float]] = field(default_factory=list)
     """(seconds of training, mean PSNR in dB)."""

@@ -146,7 +146,7 @@ def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
     with torch.no_grad():
         rendering = render(camera)
     if rendering.colour.is_cuda:
-        torch.cuda.synchronize()
+        torch.cuda.synchronize(rendering.colour.device)
     seconds = time.perf_counter() - start
     expected, got = (camera.height, camera.width, 3), tuple(rendering.colour.shape)
     assert got == expected, f"a rendering of {got} for a camera of {expected}"
@@ -159,15 +159,18 @@ def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
 
 
 def _peak_memory() -> dict[str, int | None]:
-    """This process's peak memory so far, in main memory and on a GPU."""
+    """This process's peak memory so far, in main memory and on the GPU that it uses."""
     peak = None
     if sys.platform != "win32":
         import resource
 
         # Kilobytes on Linux, bytes on macOS.
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    cuda = torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else None
-    return {"peak_memory_bytes": peak, "peak_cuda_memory_bytes": cuda}
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+    return {
+        "peak_memory_bytes": peak,
+        "peak_cuda_memory_bytes": max(map(torch.cuda.max_memory_allocated, gpus), default=None),
+    }
 
 
 def _mean(photographs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

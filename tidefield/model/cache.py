@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from tidefield.data.exposure import windows_in_common_light
+from tidefield.data.images import Read
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
@@ -23,7 +25,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.machine import cores, memory_bytes
 from tidefield.model.network import Network
 from tidefield.model.views import Encoded, FeatureMaps, Views
-from tidefield.parallel import in_parallel
+from tidefield.parallel import in_parallel, read_ahead
 from tidefield.recording import moved
 
 BLOCK_PX, WHOLE_PX = 512, 832
@@ -34,9 +36,16 @@ OVERLAP_PX = 160
 MEMORY_SHARE, LEAST_BYTES = 0.09, 1_500_000_000
 """Memory for features: this share of the device's, or this much. Views of large photographs need more than the latter:
 what does not fit is encoded again for every view."""
+FREE_SHARE = 0.5
+"""Share of a GPU's free memory that all processes of the machine may take for features: computing takes the rest."""
+MOST_TEXELS = 2**31 - 1
+"""Of a map: `views.gather` counts them with 32 bits."""
 ENCODED_AT_ONCE = 4
 """Blocks that are encoded at the same time, each on one core: several times as fast as one after the other on all
 cores. More would take more memory."""
+
+BlockRead = tuple[Read, UInt8[Tensor, "_ _ 3"] | None]
+"""The photograph of a block at its level, and at twice that size where that is read."""
 
 
 class Block(NamedTuple):
@@ -49,12 +58,13 @@ class Block(NamedTuple):
 
 
 def memory_for_features(device: torch.device) -> int:
-    """Bytes for the features that one process keeps: of a machine's memory, it has the part of its threads."""
-    if device.type == "cuda":
-        total = torch.cuda.get_device_properties(device).total_memory
-    else:
-        total = memory_bytes() * min(1.0, torch.get_num_threads() / cores())
-    return max(LEAST_BYTES, int(MEMORY_SHARE * total))
+    """Bytes for the features that one process keeps: of a machine's memory, or of what a GPU has free, it has the part
+    of its threads."""
+    part = min(1.0, torch.get_num_threads() / cores())
+    if device.type != "cuda":
+        return max(LEAST_BYTES, int(MEMORY_SHARE * (memory_bytes() * part)))
+    free, total = torch.cuda.mem_get_info(device)
+    return min(max(LEAST_BYTES, int(MEMORY_SHARE * total)), int(FREE_SHARE * (free * part)))
 
 
 class CacheFull(Exception):
@@ -102,7 +112,8 @@ class FeatureCache:
         self._side = side
         like = self._like
         texel_bytes = sum(2 * padded_channels(m.channels) * self._texels(m.stride) for m in _maps(like))
-        blocks = min(self._blocks, self.budget_bytes // texel_bytes)
+        most = MOST_TEXELS // max(self._texels(m.stride) for m in _maps(like))
+        blocks = min(self._blocks, self.budget_bytes // texel_bytes, most)
         self.slots = max(blocks, self.network.config.views + EXTRA_VIEWS)
         features = {stride: self._empty(m) for stride, m in like.features.items()}
         used = None if like.used is None else self._empty(like.used)
@@ -164,15 +175,20 @@ class FeatureCache:
             some = blocks[start : start + ENCODED_AT_ONCE]
             slots = [self._free.pop() if self._free else self._slots.popitem(last=False)[1] for _ in some]
             try:
-                in_parallel([partial(self._encode, *each) for each in zip(some, slots, strict=True)], self.device)
+                with read_ahead(self._read, some, self.device) as read:
+                    tasks = [partial(self._encode, *each, read) for each in zip(some, slots, strict=True)]
+                    in_parallel(tasks, self.device)
             finally:
                 self._free += [slot for block, slot in zip(some, slots, strict=True) if block not in self._slots]
 
-    def _encode(self, block: Block, slot: int) -> None:
-        colours, mask = self.pyramid.read(block.photograph, block.level)
-        doubled = None
+    def _read(self, block: Block) -> BlockRead:
+        own, doubled = self.pyramid.read(block.photograph, block.level), None
         if self._cones and self.network.config.has("doubled photographs"):
             doubled = self.pyramid.read_doubled(block.photograph, block.level)
+        return own, doubled
+
+    def _encode(self, block: Block, slot: int, read: Callable[[Block], BlockRead]) -> None:
+        (colours, mask), doubled = read(block)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
         last = (_block_counts(size, self._block_px) - 1).clamp(min=1)
         corner = ((size - self._block_px).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()

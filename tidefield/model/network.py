@@ -8,6 +8,7 @@ Alphabet: T tiles, R rays of a tile.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,7 +114,7 @@ class Network(nn.Module, ABC):
             jitter: of the samples of every pass, for training (`draw_jitter`); they lie evenly without.
         """
 
-    def start_intervals(self, tiles: Tiles, priors: Float[Tensor, "_ 3 h w"]) -> Intervals:
+    def start_intervals(self, tiles: Tiles, priors: Sequence[Float[Tensor, "3 _ _"]]) -> Intervals:
         """Intervals of the first pass's rays from the depth priors of the tiles' cameras, or the one of all tiles."""
         return intervals_from_prior(priors, tiles.rays_px(*self.grids[0]))
 

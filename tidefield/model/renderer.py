@@ -222,7 +222,7 @@ class Renderer:
         self, camera: Cameras, prior: DepthPrior, corners: Float[Tensor, "T 2"], views: Views
     ) -> Float[Tensor, "T R 6"]:
         tiles = Tiles(camera[torch.zeros(len(corners), dtype=torch.long)], corners, TILE_PX)
-        start = self.network.start_intervals(tiles, prior.cells[None])
+        start = self.network.start_intervals(tiles, [prior.cells])
         detail = prior.detail_of_tiles(corners, TILE_PX)
         piece = _Piece(tiles, views.cameras, views.which, views.blend_weight, start, detail)
         if self.device.type != "cuda":

@@ -9,6 +9,7 @@ Alphabet: T tiles of g x g rays, R = g^2 rays of a tile, M samples of a ray, P =
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,10 @@ from torch.nn import functional as F
 
 from tidefield.data.depth_prior import read_prior
 from tidefield.geometry.cameras import Cameras, pixel_grid
+
+LEAST_MOVED = 0.01
+"""Least inverse depth of an interval that is moved, as a share of what it was: beyond infinity lies what is behind the
+camera."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +70,19 @@ class Intervals:
         return (self.inv_near - self.inv_expected) / (self.inv_near - self.inv_far)
 
     def moved(self, inverse_depth: Float[Tensor, "T R"]) -> Intervals:
-        """Return these intervals, moved in inverse depth."""
-        return Intervals(*(end + inverse_depth for end in (self.inv_near, self.inv_far, self.inv_expected)))
+        """Return these intervals, moved in inverse depth, but not as far as infinity."""
+        ends = self.inv_near, self.inv_far, self.inv_expected
+        return Intervals(*(torch.maximum(end + inverse_depth, LEAST_MOVED * end) for end in ends))
 
     def inverse_depth(self, s: Float[Tensor, "T R M"]) -> Float[Tensor, "T R M"]:
         return self.inv_near[..., None] + (self.inv_far - self.inv_near)[..., None] * s
 
 
-def intervals_from_prior(priors: Float[Tensor, "_ 3 h w"], uv_px: Float[Tensor, "T R 2"]) -> Intervals:
-    """Intervals of rays from the depth priors of the tiles' cameras, or from the one prior of all tiles."""
-    read = read_prior(priors, uv_px.reshape(len(priors), -1, 2))
-    expected, near, far = (x.reshape(uv_px.shape[:2]) for x in read)
+def intervals_from_prior(priors: Sequence[Float[Tensor, "3 _ _"]], uv_px: Float[Tensor, "T R 2"]) -> Intervals:
+    """Intervals of rays from the depth priors of the tiles' cameras, of any sizes, or from the one of all tiles."""
+    uv_of_priors = uv_px.reshape(len(priors), 1, -1, 2)
+    read = [read_prior(prior[None], uv) for prior, uv in zip(priors, uv_of_priors, strict=True)]
+    expected, near, far = (torch.cat(x).reshape(uv_px.shape[:2]) for x in zip(*read, strict=True))
     return Intervals(inv_near=near, inv_far=far, inv_expected=expected)
 
 

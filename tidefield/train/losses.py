@@ -80,7 +80,7 @@ class Inputs:
         batch = draw_batch(scene, priors, config, views, generator, of, doubled)
         cameras = scene.cameras if cameras is None else cameras
         own = cameras[batch.targets]
-        cells = torch.stack([priors[i].cells for i in batch.targets.tolist()])
+        cells = [priors[i].cells for i in batch.targets.tolist()]
         return Inputs(
             batch=batch,
             cameras=own,

@@ -114,7 +114,7 @@ class Pretrainer(SceneTrainer):
         return world_size() * super().rays_per_step
 
     def draw(self) -> Inputs:
-        drawn = self.stream.draw(self.progress.step, self.generator)
+        drawn = self.stream.draw(self.progress.step, self.generator, self.device)
         shares = torch.tensor(list(VIEWS.values()))
         views = list(VIEWS)[int(torch.multinomial(shares, 1, generator=self.generator))]
         given = drawn.scene, drawn.priors, views, self.generator

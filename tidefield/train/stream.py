@@ -8,6 +8,7 @@ augmented: few sparse points, photographs that are a little misaligned, exposure
 from __future__ import annotations
 
 import math
+import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -29,6 +30,7 @@ from tidefield.data.matching import MATCHED_PX, Matcher
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
+from tidefield.machine import cores
 from tidefield.processes import start_worker
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_survey
 
@@ -36,6 +38,8 @@ POOL_SIZE = 8
 """Scenes that are drawn from at a time."""
 STEPS_EACH = 200
 """Steps after which the oldest scene is replaced."""
+CORES_PER_MAKER = 4
+"""Cores for each process that makes scenes, a few ahead: making one takes longer than a GPU's steps until the next."""
 REAL_SHARE = 0.5
 """Share of real scenes, where there are some."""
 WIDTHS = (200, 280, 400, 560, 800, 1600)
@@ -205,8 +209,10 @@ class Stream:
         self.network = config.network
         self.pool: dict[int, Drawn] = {}
         self.pending: dict[int, Future[None]] = {}
-        # A process, because making a scene keeps a core busy; spawned, because forking a process with threads may hang.
-        self.maker = ProcessPoolExecutor(1, get_context("spawn"), start_worker)
+        together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # processes of torchrun on this machine
+        self.makers = min(POOL_SIZE, max(1, cores() // (CORES_PER_MAKER * together)))
+        # Processes, because making a scene keeps a core busy; spawned, because forking one with threads may hang.
+        self.maker = ProcessPoolExecutor(self.makers, get_context("spawn"), start_worker)
         folder.mkdir(parents=True, exist_ok=True)
         # Of a training that was ended: some may never be drawn.
         self.left = {int(path.name.split("-")[1]) for path in folder.glob(f"{seed}-*") if path.name[-6:].isdigit()}
@@ -215,13 +221,14 @@ class Stream:
         return self
 
     def __exit__(self, *error: object) -> None:
-        # The scene that is being made is completed: ending a process that holds a lock of the pool's may hang.
+        # Scenes that are being made are completed: ending a process that holds a lock of the pool's may hang.
         self.maker.shutdown(cancel_futures=True)
 
-    def draw(self, step: int, generator: torch.Generator) -> Drawn:
+    def draw(self, step: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Drawn:
         """A scene for a step, the same for the same step, seed and state of the generator.
 
-        Its axes are rotated at random: directions are the world's, and north must mean nothing.
+        Its axes are rotated at random: directions are the world's, and north must mean nothing. Its photographs are
+        matched on the device.
         """
         first = step // STEPS_EACH
         number = first + int(torch.randint(POOL_SIZE, (), generator=generator))
@@ -231,12 +238,12 @@ class Stream:
             if gone in self.pending:  # made, but never drawn
                 self.pending.pop(gone).result()
             shutil.rmtree(self._path(gone), ignore_errors=True)
-        for soon in range(first, first + POOL_SIZE + 1):
+        for soon in range(first, first + POOL_SIZE + self.makers):
             self._order(soon)
         if number not in self.pool:
             own = self._describe(number)
             scene = self.real[int(own.choice * len(self.real))] if own.recipe is None else self._made(number)
-            self.pool[number] = self._augmented(scene, own)
+            self.pool[number] = self._augmented(scene, own, device)
         return rotate(self.pool[number], torch.randn(4, generator=generator))
 
     def _describe(self, number: int) -> Draw:
@@ -256,7 +263,7 @@ class Stream:
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.seed}-{number:06d}"
 
-    def _augmented(self, scene: Scene, own: Draw) -> Drawn:
+    def _augmented(self, scene: Scene, own: Draw, device: torch.device | str = "cpu") -> Drawn:
         """Augment a scene; the depth loss keeps all points that were observed."""
         random = np.random.default_rng(own.seed)
         shift = torch.from_numpy(random.normal(scale=own.shift_px, size=(len(scene.names), 2))).float()
@@ -272,7 +279,7 @@ class Stream:
         twice = at_twice_the_size(scene) if self.network.has("doubled photographs") else None
         match = None
         if self.network.has("matched surface"):  # as for one scene; on greys, which are those of any order of channels
-            match = Matcher(misaligned, Pyramid(misaligned, twice), most_px=MATCHED_PX, finer=True)
+            match = Matcher(misaligned, Pyramid(misaligned, twice), most_px=MATCHED_PX, finer=True, device=device)
         doubled = None if twice is None else recoloured(twice, own.channels)
         return Drawn(augmented, DepthPriors(augmented, observed, match), augmented.cameras, doubled)
 
@@ -283,7 +290,8 @@ def recoloured(scene: Scene, channels: tuple[int, ...]) -> Scene:
         return scene
     own, shading = scene.cameras, scene.cameras.shading
     shading = None if shading is None else shading[:, :, channels]
-    colours = tuple(c[..., channels] for c in scene.photographs.colours)
+    order = torch.tensor(channels)  # to index with it takes eight times as long
+    colours = tuple(c.index_select(-1, order) for c in scene.photographs.colours)
     return replace(
         scene,
         cameras=replace(own, gain=own.gain[:, channels], shading=shading),

@@ -117,7 +117,7 @@ def train(
     }
     write_json(folder / JOB_FILE, job)
     last: dict[str, Any] = {}
-    with _worker("train", folder) as worker:
+    with _worker("train", folder, device) as worker:
         for last in worker.lines():
             if "curve" in last and curve is not None:
                 files = [folder / name for name in last["curve"]]
@@ -151,14 +151,18 @@ def progress_of(folder: Path) -> TrainingProgress:
 
 
 @contextmanager
-def renderer(folder: Path) -> Iterator[Render]:
+def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
     """A trained run as a method, while the block lasts.
+
+    Args:
+        folder: of the run.
+        device: which GPU to render on, where it was trained on one.
 
     Raises:
         RunError: nerfstudio is not installed, or fails.
     """
     colours = _read_job(folder)[1]
-    with _worker("render", folder) as worker:
+    with _worker("render", folder, device) as worker:
         worker.answer()  # once it has loaded
 
         def render(camera: Cameras) -> Rendering:
@@ -205,7 +209,7 @@ class _Process:
 
 
 @contextmanager
-def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process]:
+def _worker(kind: Literal["train", "render"], folder: Path, device: torch.device) -> Iterator[_Process]:
     command = [str(python()), str(WORKER), kind, str(folder / JOB_FILE)]
     with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
         process = subprocess.Popen(
@@ -214,7 +218,7 @@ def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
-            env={**os.environ, **KEEP_LARGE_ALLOCATIONS},
+            env=_environment(device),
             preexec_fn=end_with_parent,
         )
         try:
@@ -229,6 +233,14 @@ def _worker(kind: Literal["train", "render"], folder: Path) -> Iterator[_Process
             except subprocess.TimeoutExpired:
                 process.terminate()
                 process.wait()
+
+
+def _environment(device: torch.device) -> dict[str, str]:
+    environment = {**os.environ, **KEEP_LARGE_ALLOCATIONS}
+    if device.index is not None:  # nerfstudio takes the first that it sees
+        visible = [one for one in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if one]
+        environment["CUDA_VISIBLE_DEVICES"] = visible[device.index] if visible else str(device.index)
+    return environment
 
 
 def _read_job(folder: Path) -> tuple[tuple[int, float], Colours]:
