@@ -389,9 +389,9 @@ def _summed(
         volumes = []
         for k, (outlined, sign) in enumerate(((lower, -1.0), (higher, 1.0))):
             cells = inside & outlined
-            volume, count = errors.volume(dz, cells, sign), np.count_nonzero(cells)
+            volume, count = errors.volume(dz, cells, sign), int(np.count_nonzero(cells))
             if choices is not None and count:
-                share = count / np.count_nonzero(outlined)
+                share = count / int(np.count_nonzero(outlined))
                 bias, deviation = sign * choices[k].bias * share, choices[k].deviation * math.sqrt(share)
                 volume = volume.chosen(bias * grid.cell_area_m2, deviation * grid.cell_area_m2)
             volumes.append(volume)
