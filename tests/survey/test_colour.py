@@ -1,5 +1,6 @@
 """Gains and falloff are estimated where they exist, and photographs without them stay unchanged."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +95,15 @@ def test_gains_without_falloff_see_no_falloff():
     np.testing.assert_allclose(correction.falloff, 0, atol=0.05)
 
 
+def test_corners_brighter_than_the_centre_are_no_falloff_and_do_not_make_the_correction_help():
+    """They are not the lens's, so that they would not be removed."""
+    correction = estimate_correction(shaded(np.ones((12, 3)), -FALLOFF / 2), [0] * 12)
+    assert correction.after < 0.9 * min(correction.before, correction.gains_alone)
+    assert not correction.sees_falloff
+    assert not correction.helps
+    np.testing.assert_array_equal(correction.gain, 1)
+
+
 def test_each_lens_has_its_own_falloff():
     light, dark = shaded(GAINS, np.zeros(3)), shaded(GAINS, FALLOFF)
     mixed = tuple((dark if k % 2 else light).photographs[k] for k in range(12))
@@ -130,3 +140,21 @@ def test_a_gain_is_divided_out_and_rounded():
     result = to_common_exposure(picture, np.array([2.0, 1.0, 0.3]), np.array([-0.1, 0.0, 0.0]), r)
     assert result[0, 0].tolist() == [50, 100, 255]
     assert result[1, 1, 1] == round(100 * np.exp(0.1))
+
+
+@pytest.mark.parametrize("has_falloff", [True, False])
+def test_a_photograph_is_corrected_with_little_memory_to_the_same_pixels(has_falloff: bool):
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (1000, 600, 3), dtype=np.uint8)
+    v, u = np.mgrid[:1000, :600] / 600
+    falloff = FALLOFF if has_falloff else np.zeros(3)
+    r = np.hypot(u - 0.5, v - 0.8).astype(np.float32) if has_falloff else np.zeros((1, 1), np.float32)
+    shade = np.exp(np.stack([r**2, r**4, r**6], -1) @ falloff)[..., None]
+    expected = np.clip(np.rint(picture / (shade * GAINS[0])), 0, 255).astype(np.uint8)
+    tracemalloc.start()
+    result = to_common_exposure(picture, GAINS[0], falloff, r)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * picture.nbytes
+    assert np.abs(result.astype(int) - expected).max() <= 1
+    assert (result != expected).mean() < 1e-4

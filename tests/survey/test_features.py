@@ -125,3 +125,36 @@ def test_masked_pixels_have_no_features(wall_photographs: list[Photograph], tmp_
             count.append(len(keypoints))
     assert left[0] == 0 < count[0]
     assert min(left[1:]) > 0
+
+
+@pytest.mark.parametrize("height", [102, 100])
+def test_features_of_reduced_photographs_are_where_they_are_in_the_photograph(tmp_path: Path, height: int):
+    rows, columns = np.mgrid[:height, :400] + 0.5
+    spots = [(100.0, 50.0), (200.0, 82.0), (300.0, 25.0)]
+    light = sum(200 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * 9**2)) for u, v in spots)
+    Image.fromarray(np.uint8(np.rint(20 + light))).save(tmp_path / "spots.png")
+    # Of 102 rows, 25.5 would be left: they are 26, and a row is 3.92 of the photograph's, a column 4.
+    spotted = replace(unlocated_photograph(0, None), path=tmp_path / "spots.png", width=400, height=height)
+    extract([spotted], tmp_path / "a.db", replace(OPTIONS, side_px=100), CPU, lambda done, whole: None)
+    with pycolmap.Database.open(tmp_path / "a.db") as db:
+        uv = np.asarray(db.read_keypoints(db.read_all_images()[0].image_id))[:, :2]
+    away = np.linalg.norm(uv[:, None] - np.array(spots), axis=2).min(axis=0)
+    assert away.max() < 0.5
+
+
+def test_photographs_of_twice_the_size_have_the_same_features_twice_as_far_apart(
+    wall_photographs: list[Photograph], tmp_path: Path
+):
+    """Bit for bit: the scales of both sides are equal."""
+    twice = []
+    for photograph in wall_photographs:
+        path = tmp_path / f"twice {photograph.path.name}"
+        Image.open(photograph.path).resize((480, 360), Image.Resampling.NEAREST).save(path)
+        twice.append(replace(photograph, path=path, width=480, height=360))
+    found = []
+    for k, photographs in enumerate((wall_photographs, twice)):
+        extract(photographs, tmp_path / f"{k}.db", replace(OPTIONS, side_px=240), CPU, lambda done, whole: None)
+        with pycolmap.Database.open(tmp_path / f"{k}.db") as db:
+            found.append([np.asarray(db.read_keypoints(image.image_id)) for image in db.read_all_images()])
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_array_equal(two, one * np.float32([2, 2, 2, 1]))

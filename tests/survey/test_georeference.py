@@ -2,16 +2,32 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from located_surveys import CONTROL, FOCAL, FRAME, HEIGHT, WIDTH, fly, located, name_of, quiet, with_control
+from located_surveys import (
+    CONTROL,
+    FOCAL,
+    FRAME,
+    HEIGHT,
+    WIDTH,
+    Flight,
+    fly,
+    ground_m,
+    located,
+    name_of,
+    photograph,
+    photographed,
+    quiet,
+    with_control,
+)
 
 from tidefield.errors import SurveyError
 from tidefield.survey.georeference import bundle_adjustment
 from tidefield.survey.georeference.georeference import georeference
-from tidefield.survey.georeference.gps_alignment import camera_centres, find_down
+from tidefield.survey.georeference.gps_alignment import camera_centres, find_down, given_positions
 from tidefield.survey.survey import Survey
 
 
@@ -95,6 +111,55 @@ def test_stated_accuracy_is_the_weight_of_a_position():
     assert np.abs(off_m(flight, model, found.frame)).max() < 0.1
 
 
+def partly_differential(flight, differential, common_m: float, noise_m: float) -> Survey:
+    """State accuracies of some positions, and move the others east by a common error, and each by one of its own."""
+    generator = np.random.default_rng(3)
+    states = {}
+    for i, each in enumerate(flight.survey.photographs):
+        east, north, up = generator.normal((common_m, 0, 0), noise_m)
+        at = each.position
+        states[each.name] = (
+            {"horizontal_m": 0.02, "vertical_m": 0.03}
+            if differential(i)
+            else {
+                "longitude_deg": at.longitude_deg + east / 64_500,
+                "latitude_deg": at.latitude_deg + north / 111_000,
+                "height_m": at.height_m + up,
+            }
+        )
+    return moved(flight.survey, states)
+
+
+@pytest.mark.parametrize("noise_m", [0.1, 2.0])
+def test_differential_positions_outweigh_a_majority_of_unknown_accuracy(noise_m):
+    flight = fly(lines=5, each=6, position_m=0.01)
+    survey = partly_differential(flight, lambda i: i % 5 < 2, common_m=2.0, noise_m=noise_m)
+    model, found = located(flight, survey)
+    assert found.left_out == ()
+    assert np.abs(off_m(flight, model, found.frame)).max() < 0.1
+
+
+def test_differential_positions_at_one_place_do_not_hide_gross_errors_of_the_others():
+    generator = np.random.default_rng(2)
+    x, y = np.meshgrid(np.arange(-2, 3) * 15.0, np.arange(-2, 3) * 25.0)
+    centres = np.c_[x.ravel(), y.ravel(), 75 + generator.normal(0, 1.5, 25)]
+    centres = np.concatenate([centres[:1] + generator.normal(0, 0.02, (8, 3)), centres])  # hovering, then flying
+    ground = generator.uniform((-75, -85), (75, 85), (450, 2))
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1
+    )
+    down = np.broadcast_to(np.diag([1.0, -1, -1]), (len(centres), 3, 3))
+    model = photographed(camera, down, centres, np.c_[ground, ground_m(ground)], 0.3, generator)
+    given = centres + generator.normal(0, 0.02, centres.shape)
+    photographs = tuple(map(photograph, range(len(centres)), FRAME.to_geographic(given)))
+    flight = Flight(model, Survey(Path("."), photographs, None), centres)
+    survey = partly_differential(flight, lambda i: i < 8, common_m=0.0, noise_m=0.5)
+    wrong = {name_of(i): {"latitude_deg": 54.51 + 0.0005 * i} for i in (12, 20, 28)}
+    model, found = located(flight, moved(survey, wrong))
+    assert [item.name for item in found.left_out] == list(wrong)
+    assert np.abs(off_m(flight, model, found.frame)).max() < 1.0
+
+
 def test_a_single_strip_is_levelled_by_its_photographs():
     flight = fly(lines=1, each=12, position_m=1.0)
     model, found = located(flight)
@@ -132,6 +197,31 @@ def test_missing_heights_are_relative_altitudes_or_level_flight():
     model, found = located(flight, replace(without, photographs=above))
     assert found.frame.vertical_datum == "the place of take-off"
     assert found.gps_used.vertical_rms_m < 1.0
+
+
+@pytest.mark.parametrize("of", ["heights", "relative altitudes"])
+def test_a_few_heights_do_not_put_the_other_positions_aside(of):
+    flight = fly(lines=3, each=6, position_m=0.5)
+    without = moved(flight.survey, {name_of(i): {"height_m": math.nan} for i in range(3 if of == "heights" else 0, 18)})
+    if of != "heights":
+        above = [replace(p, relative_altitude_m=75.0) if i < 3 else p for i, p in enumerate(without.photographs)]
+        without = replace(without, photographs=tuple(above))
+    without = all_moved(without, lambda position: {"vertical_m": 0.03})
+    assert np.isnan(given_positions(without.photographs).stated_m).all(), "the heights are not the receiver's"
+    model, found = located(flight, without)
+    assert "Only 3 of 18 positions have a height" in found.notes[0]
+    assert len(found.gps.names) == 18
+    assert "mean height of flight" in found.frame.vertical_datum
+    assert np.abs(off_m(flight, model, found.frame)[:, :2]).max() < 1.5
+
+
+def test_positions_without_the_height_that_most_have_are_not_used_and_counted():
+    flight = fly(lines=3, each=6, position_m=0.5)
+    model, found = located(flight, moved(flight.survey, {name_of(i): {"height_m": math.nan} for i in range(9)}))
+    assert found.gps.names == tuple(name_of(i) for i in range(9, 18))
+    assert found.frame.vertical_datum.startswith("mean sea level")
+    assert "9 of 18 positions are not used" in found.notes[0]
+    assert np.abs(off_m(flight, model, found.frame)).max() < 3.0
 
 
 @pytest.mark.parametrize("left", [0, 2])

@@ -18,6 +18,9 @@ from tidefield.survey.import_project import import_project
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
 from tidefield.survey.report import collect_findings, write_report
+from tidefield.survey.report.figures import draw_histogram
+from tidefield.survey.report.page import draw_charts
+from tidefield.survey.report.statistics import measure
 from tidefield.survey.sfm.features import FeatureOptions
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.1, (15, 1)) * np.ones(3))
@@ -142,5 +145,32 @@ def test_the_split_is_written_for_nerfstudio_and_the_report_counts_it(made: tupl
     written = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
     assert written["test_filenames"] == [f"images/{flight.names[k]}" for k in (0, 8)]
     assert len(written["train_filenames"]) == 13
-    page = write_report(collect_findings(prepared, scene, {"holdout": "yes"}), scene)
-    assert "2 photographs are held out" in page.read_text(encoding="utf-8")
+    page = write_report(collect_findings(prepared, scene, {"holdout": "yes"}), scene).read_text(encoding="utf-8")
+    assert "2 photographs are held out" in page
+    assert page.count('<td class="n">held out</td>') == 2
+
+
+def test_held_out_photographs_are_no_photographs_without_features_in_the_report(
+    made: tuple[Path, Prepared], flight: Flight
+):
+    scene, prepared = made
+    held_out = {flight.names[0], flight.names[8]}
+    found = collect_findings(prepared, scene, {})
+    assert found.held_out == held_out
+    write_report(found, scene)
+    table = json.loads((scene / "report.json").read_text(encoding="utf-8"))
+    for what in table["features_statistics"].values():
+        assert what["min"] > 30
+    for one in table["tidefield"]["photographs"]:
+        assert one["held_out"] == (one["name"] in held_out) == (one["points"] is None)
+    cameras = [
+        feature["properties"]
+        for feature in json.loads((scene / "survey.geojson").read_text(encoding="utf-8"))["features"]
+        if feature["properties"]["kind"] == "camera"
+    ]
+    assert {camera["photograph"] for camera in cameras if camera["points"] is None} == held_out
+    statistics = measure(found)
+    observed = statistics.observed[statistics.observed > 0]
+    assert len(observed) == 13
+    title = "Points per photograph"
+    assert dict(draw_charts(statistics, True))[title] == draw_histogram(title, "points", "photographs", observed, 0)

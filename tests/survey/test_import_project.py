@@ -143,6 +143,41 @@ def test_reduced_photographs_are_written_beside_the_others_on_request(tmp_path: 
         import_project(tmp_path / "theirs", tmp_path / "refused", downscale=(2, 1))
 
 
+def as_format(root: Path, truth: Truth, format: str) -> None:
+    """Write a scene whose photographs have another format, whatever their names."""
+    write_colmap(root, truth)
+    for name, pixels in zip(truth.names, truth.pictures, strict=True):
+        options = {"lossless": True} if format == "WEBP" else {}
+        Image.fromarray(pixels).save(root / "images" / name, format, **options)
+
+
+@pytest.mark.parametrize("format", ["WEBP", "BMP"])
+def test_scenes_of_other_formats_are_undistorted_and_reduced_without_loss(tmp_path: Path, format: str) -> None:
+    truth = survey(BARREL)
+    for kind in (format, "PNG"):
+        as_format(tmp_path / kind, truth, kind)
+        import_project(tmp_path / kind, tmp_path / f"{kind} ours", undistort=True, downscale=(2,))
+    for folder in ("images", "images_2"):
+        for name in truth.names:
+            with (
+                Image.open(tmp_path / f"{format} ours" / folder / name) as ours,
+                Image.open(tmp_path / "PNG ours" / folder / name) as expected,
+            ):
+                assert ours.format == format
+                np.testing.assert_array_equal(np.asarray(ours), np.asarray(expected))
+    load_scene(tmp_path / f"{format} ours")
+
+
+def test_formats_that_cannot_be_written_are_refused_before_anything_is(tmp_path: Path) -> None:
+    as_format(tmp_path / "theirs", survey(BARREL), "PPM")
+    calls: list[tuple[int, int]] = []
+    for options in ({"undistort": True}, {"downscale": (2,)}):
+        with pytest.raises(RunError, match=r"png is a PPM file.*expected one of JPEG, PNG, .*--downscale, --undistort"):
+            import_project(tmp_path / "theirs", tmp_path / "ours", progress=lambda *far: calls.append(far), **options)
+    assert calls == []
+    import_project(tmp_path / "theirs", tmp_path / "ours")
+
+
 def test_observations_of_undistorted_photographs_are_exact_and_inside(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     import_project(tmp_path / "project", tmp_path / "scene")

@@ -23,7 +23,7 @@ from tidefield.files import LOCK_FILE, only_writer
 from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.prepare import Prepared, prepare
+from tidefield.survey.prepare import Prepared, _is_rounded, prepare
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.blocks import cut
 from tidefield.survey.sfm.features import FeatureOptions
@@ -139,6 +139,14 @@ def test_complete_stages_are_kept_and_a_changed_option_repeats_only_what_depends
     name = flight.names[0]
     assert (scene / "images" / name).read_bytes() == (flight.folder / name).read_bytes()
     assert (made[0] / "images" / name).read_bytes() != (flight.folder / name).read_bytes()
+
+
+def test_features_are_extracted_again_only_if_earlier_versions_misplaced_them(flight: Flight):
+    """They did in photographs that are reduced to another aspect."""
+    survey = read_survey(flight.folder)
+    for size, misplaced in {(8192, 5460): True, (5472, 3648): False, (2000, 1501): False, (5460, 8192): True}.items():
+        one = replace(survey.photographs[0], width=size[0], height=size[1])
+        assert _is_rounded(replace(survey, photographs=(*survey.photographs, one)), 2400) == misplaced
 
 
 def test_reduced_photographs_are_written_on_request_and_removed_without(

@@ -289,6 +289,15 @@ def test_errors_count_only_what_was_used(tmp_path):
     assert table["tidefield"]["georeference"]["placed_by"] == "GPS of 2 photographs"
 
 
+@pytest.mark.parametrize(("sees_falloff", "after"), [(True, 6.0), (False, 7.0)])
+def test_the_difference_that_was_reached_is_reported_not_that_of_a_falloff_that_was_not_removed(
+    tmp_path, sees_falloff, after
+):
+    colour = ExposureCorrection(np.ones((18, 3)), np.zeros((18, 3)), 0.21, 0.07, 0.06, True, sees_falloff)
+    (change,) = report(findings(flight(), colour=colour), tmp_path)[1]["tidefield"]["colour"]["changes"]
+    assert (change["before"], change["after"]) == (pytest.approx(21), pytest.approx(after))
+
+
 def test_a_point_without_an_estimate_is_listed_but_not_drawn(tmp_path):
     errors = np.array([[0.01, 0.02, 0.03], [np.nan] * 3])
     check = residuals("check", error_m=errors)

@@ -23,6 +23,9 @@ HELPS = 0.97
 FALLOFF_HELPS = 0.99
 """... and the falloff if it reduces the rest to this share."""
 
+STRIP_ROWS = 64
+"""Rows that are corrected at once: in float64, a photograph of 45 megapixels would take a gigabyte several times."""
+
 
 @dataclass(frozen=True)
 class _Fit:
@@ -86,12 +89,13 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
         none = replace(gains, gains=nothing)
         scores[k] = [_spread(*other, fit, lens) for fit in (none, gains, both)]
     before, alone, after = scores.mean(0)
-    helps = always or bool(min(alone, after) < HELPS * before)
     fit = _fitted(seen, power, lens)
     # With real lenses, the corners are darker than the centre.
     corner = tangent >= np.quantile(tangent, 0.95)
     darkens = (fit.falloff[lens[seen.photograph]] * power).sum(1)[corner].mean() < 0
-    sees = helps and bool(after < FALLOFF_HELPS * alone and darkens)
+    sees = bool(after < FALLOFF_HELPS * alone and darkens)
+    helps = always or bool((after if sees else alone) < HELPS * before)
+    sees = helps and sees
     if not sees:
         fit = _fitted(seen, None, lens)
     gain = np.exp(fit.gains - fit.gains[list(scene.train)].mean(0)) if helps else np.exp(nothing)
@@ -111,8 +115,12 @@ def to_common_exposure(
         falloff: k1, k2, k3.
         tangent: of the angle between each pixel's ray and the optical axis, H x W; 1 x 1 without falloff.
     """
-    shade = np.exp(_polynomial(tangent) @ falloff)[..., None]
-    return np.clip(np.rint(photograph / (shade * gain)), 0, 255).astype(np.uint8)
+    corrected = np.empty_like(photograph)
+    for first in range(0, len(photograph), STRIP_ROWS):
+        rows = slice(first, first + STRIP_ROWS)
+        shade = np.exp(_polynomial(tangent[rows] if len(tangent) > 1 else tangent) @ falloff)[..., None]
+        corrected[rows] = np.clip(np.rint(photograph[rows] / (shade * gain)), 0, 255)
+    return corrected
 
 
 def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import logging
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from PIL import ExifTags, Image
 
 from tidefield.data.exif import EXIF_DAMAGE, read_exif
 from tidefield.data.pictures import MODES, decode, read_mask, write_mask
-from tidefield.data.readers.files import quiet_pillow
+from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError
@@ -35,6 +35,14 @@ log = logging.getLogger(__name__)
 GRID_PX = 8
 """Spacing of the pixels whose viewing angles are computed; between them they are interpolated."""
 JPEG_QUALITY = 95
+_WRITTEN: dict[str, dict[str, Any]] = {
+    "JPEG": {"quality": JPEG_QUALITY, "subsampling": 0},
+    "PNG": {},
+    "TIFF": {},
+    "WEBP": {"lossless": True},
+    "BMP": {},
+}
+"""Pillow's names of the formats that changed photographs are written in, and its options for them."""
 MOST_REDUCED = 64
 MAX_COORDINATE_M = 10_000.0
 """nerfstudio computes in float32, which resolves 1 mm up to this distance from the origin."""
@@ -94,14 +102,46 @@ def _is_readable(path: Path) -> bool:
 
 
 def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
-    """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright."""
-    with open_image(original) as picture:
-        kind = "JPEG" if original.suffix.casefold() in HEIFS else picture.format
-        assert kind is not None, "open_image knows the formats"
+    """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright.
+
+    HEIC becomes JPEG, and of a file with several pictures the first is written.
+
+    Raises:
+        RunError: the format cannot be written (see `refuse_unwritable`).
+    """
+    with _open_original(original) as picture:
+        kind = _written_kind(picture, original)
         exif = _kept_exif(picture, kind, original)
-    quality: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if kind == "JPEG" else {}
     with completed_file(target, overwrite=True) as partial:
-        Image.fromarray(pixels).save(partial, kind, exif=exif, **quality)
+        Image.fromarray(pixels).save(partial, kind, exif=exif, **_WRITTEN[kind])
+
+
+def refuse_unwritable(originals: Iterable[Path]) -> None:
+    """Check, without decoding them, that changed pixels of photographs can be written in the photographs' formats.
+
+    Raises:
+        RunError: one has another format than `write_image` writes.
+    """
+    for original in originals:
+        with _open_original(original) as picture:
+            _written_kind(picture, original)
+
+
+def _open_original(path: Path) -> AbstractContextManager[Image.Image]:
+    """Open a photograph of a survey or of a scene, which may have more formats."""
+    return open_image(path) if path.suffix.casefold() in HEIFS else open_picture(path)
+
+
+def _written_kind(picture: Image.Image, original: Path) -> str:
+    """Choose the format that changed pixels of an opened photograph are written in."""
+    if picture.format == "MPO" or original.suffix.casefold() in HEIFS:
+        return "JPEG"
+    if picture.format not in _WRITTEN:
+        raise RunError(
+            f"{original} is a {picture.format} file, and its pixels are to be changed: expected one of "
+            f"{', '.join(_WRITTEN)}; convert it, or do without what changes it (--downscale, --undistort)"
+        )
+    return picture.format
 
 
 def _kept_exif(picture: Image.Image, kind: str, original: Path) -> bytes:

@@ -31,7 +31,13 @@ from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import LensModel, colmap_parameters, rectify
 from tidefield.geometry.similarity import Similarity
 from tidefield.machine import cores
-from tidefield.survey.export import reduced_folders, write_image, write_reduced_images, write_transforms
+from tidefield.survey.export import (
+    reduced_folders,
+    refuse_unwritable,
+    write_image,
+    write_reduced_images,
+    write_transforms,
+)
 
 _GREY = 128
 _CANNOT_LINK = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -71,7 +77,8 @@ def import_project(
 
     Raises:
         SceneError: `source` is not a scene, or is damaged.
-        RunError: `out` exists already or cannot be written.
+        RunError: `out` exists already or cannot be written, or a photograph that is to be changed has a format that is
+            not written.
     """
     refuse_existing(out, replaceable=False)
     reduced_folders(downscale)
@@ -80,6 +87,9 @@ def import_project(
         found = find_points(original, range(len(original.names)), source)
         original = replace(original, points=found or original.points)
     posed = _undistorted(original, undistort)
+    each = zip(posed.paths, posed.lenses, original.lenses, strict=True)
+    with quiet_pillow():
+        refuse_unwritable(path for path, lens, own in each if downscale or lens != own)
     located = read_georeference(source)
     if located is None and posed.reference is not None:
         place = posed.reference

@@ -30,7 +30,7 @@ from tidefield.survey.io.photographs import control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs, without
 from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.blocks import cut, matched_pairs, merge, reconstruct_blocks, settle
-from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database
+from tidefield.survey.sfm.features import FeatureOptions, LensKind, decode_name, extract, is_database, reduced_size
 from tidefield.survey.sfm.mapping import (
     Heights,
     LensChoice,
@@ -65,6 +65,7 @@ class Prepared:
         verdicts: quality of every photograph.
         used: names of the photographs that were not left out for their quality.
         models: names of the photographs of every model, the largest first.
+        held_out: names of photographs of the largest model that were placed afterwards.
         lens: lens choice of the largest model.
         georeference: of the largest model.
         correction: of the photographs of the largest model, by name; None if it was switched off.
@@ -75,6 +76,7 @@ class Prepared:
     verdicts: tuple[QualityDecision, ...]
     used: frozenset[str]
     models: list[list[str]]
+    held_out: frozenset[str]
     lens: LensChoice
     georeference: Georeference
     correction: ExposureCorrection | None
@@ -148,9 +150,11 @@ def prepare(
                 raise ValueError(f"{database.name} is no database of features")
             return facts
 
-        # Both are no part of the key of scenes that have neither.
+        # None of these is part of the key of scenes that do not have it.
         masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
-        stages.run("features", [names, asdict(features), *masks, *kind], [database], extract_features, refuse_damaged)
+        scales = ["a scale of each side"] if _is_rounded(good, features.side_px) else []
+        options = [names, asdict(features), *masks, *kind, *scales]
+        stages.run("features", options, [database], extract_features, refuse_damaged)
         pairs = stages.run(
             "pairs",
             {},
@@ -221,7 +225,17 @@ def prepare(
         if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
             files = [scene / folder / name for folder in reduced for name in models[0]]
             stages.run("downscale", {"factors": list(downscale)}, files, reduce)
-        return Prepared(survey, verdicts, frozenset(names), models, choice, located, correction, stages.seconds)
+        return Prepared(
+            survey=survey,
+            verdicts=verdicts,
+            used=frozenset(names),
+            models=models,
+            held_out=held_out & registered,
+            lens=choice,
+            georeference=located,
+            correction=correction,
+            seconds=stages.seconds,
+        )
 
 
 def choose_pairs(
@@ -380,6 +394,13 @@ def _masks_fingerprint(survey: Survey) -> list:
     """Identify the masks of photographs; empty if no photograph has one."""
     masks = [(p.name, p.mask.stat()) for p in survey.photographs if p.mask is not None]
     return [[name, state.st_size, state.st_mtime_ns] for name, state in masks]
+
+
+def _is_rounded(survey: Survey, side_px: int) -> bool:
+    """Whether a photograph is reduced to another aspect; earlier versions scaled its features by its width alone."""
+    sizes = {(photograph.width, photograph.height) for photograph in survey.photographs}
+    reduced = [(*size, *reduced_size(*size, side_px)) for size in sizes]
+    return any(width * rows != height * columns for width, height, columns, rows in reduced)
 
 
 def _to_json(value: Any) -> Any:

@@ -18,15 +18,19 @@ from jaxtyping import Float64
 from tidefield.errors import list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
 from tidefield.geometry.similarity import outliers
-from tidefield.survey.georeference.gps_alignment import GivenPositions, PositionFit, camera_centres, metres, rms_m
+from tidefield.survey.georeference.gps_alignment import (
+    DIFFERENTIAL_M,
+    FEWEST_DIFFERENTIAL,
+    GivenPositions,
+    PositionFit,
+    camera_centres,
+    metres,
+    rms_m,
+)
 from tidefield.survey.survey import Progress
 
-DIFFERENTIAL_M = 0.3
-"""Positions with a stated standard deviation below this are from a differential receiver."""
 _LEAST_M = 0.01
 """Smallest standard deviation of a position, which keeps its weight finite."""
-_FEWEST = 8
-"""Positions that the adjustment needs, and at least half of the photographs must have one."""
 MANY = 400
 """From so many photographs on, positions of ordinary receivers hold a model, too."""
 _CORRELATED = 3.0
@@ -76,7 +80,7 @@ def adjust_to_positions(
     given = {fit.names[i]: fit.given_world[i] for i in good}
     sigma_m = {fit.names[i]: stated_m[i] for i in good}
     names = sorted(given)
-    if len(names) < max(_FEWEST, model.num_reg_images() / 2):
+    if len(names) < max(FEWEST_DIFFERENTIAL, model.num_reg_images() / 2):
         return ()
     priors = _priors(model, given, sigma_m)
     before = _residual_m(model, given, names)

@@ -56,7 +56,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         x, y, height = (float(round(value, n)) for value, n in zip(middle, (digits, digits, 0), strict=True))
         frame = LocalFrame.at(control.crs, (x, y, height))
 
-    world_from_model, notes = Similarity(1.0, np.eye(3), np.zeros(3)), ()
+    world_from_model, notes = Similarity(1.0, np.eye(3), np.zeros(3)), positions.notes
     fit = fit_positions(model, photographs, positions, frame)
     if fit is not None:
         _transform(model, fit.world_from_model)
@@ -64,7 +64,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         again = fit_positions(model, photographs, positions, frame)
         assert again is not None, "the model has just been aligned with them"
         _transform(model, again.world_from_model)
-        world_from_model, notes = again.world_from_model @ fit.world_from_model, (*again.notes, *adjusted)
+        world_from_model, notes = again.world_from_model @ fit.world_from_model, (*notes, *again.notes, *adjusted)
         fit = fit_positions(model, photographs, positions, frame)
     gross_errors = fit.left_out if fit else ()
 

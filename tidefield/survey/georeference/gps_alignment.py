@@ -17,6 +17,10 @@ from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
 from tidefield.survey.survey import Photograph
 
+DIFFERENTIAL_M = 0.3
+"""Positions with a stated standard deviation below this are from a differential receiver."""
+FEWEST_DIFFERENTIAL = 8
+"""Positions of differential receivers that are enough to go by."""
 _NOMINAL_M = 3.0
 """Standard deviation assumed for a receiver that states none: a good fix, so that only gross errors are rejected."""
 _LEAST_M = 0.01
@@ -39,14 +43,17 @@ class GivenPositions:
     Attributes:
         names: of the photographs.
         longitude_latitude_height: WGS 84, degrees and metres.
-        stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none.
+        stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none, or the
+            height is not theirs.
         vertical_datum: zero of the heights, as text.
+        notes: which positions or heights are not used, as whole sentences.
     """
 
     names: tuple[str, ...]
     longitude_latitude_height: Float64[np.ndarray, "N 3"]
     stated_m: Float64[np.ndarray, "N 2"]
     vertical_datum: str
+    notes: tuple[str, ...] = ()
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -60,21 +67,33 @@ class GivenPositions:
 
 
 def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
-    """Collect positions with heights: absolute ones, else above take-off, else all at one height."""
+    """Collect positions with heights: absolute ones, else above take-off, else all at one height.
+
+    Heights are used if at least half of the positions have them; positions without are then left out.
+    """
     located = [(photograph, photograph.position) for photograph in photographs if photograph.position is not None]
     absolute = [pair for pair in located if math.isfinite(pair[1].height_m)]
     relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
-    if len(absolute) >= 3:
+    enough, count, notes = max(3, len(located) / 2), len(located), ()
+    if len(absolute) >= enough:
         located, heights = absolute, [position.height_m for _, position in absolute]
         datum = _DATUMS[Counter(position.datum for _, position in absolute).most_common(1)[0][0]]
-    elif len(relative) >= 3:
+    elif len(relative) >= enough:
         located, heights = relative, [photograph.relative_altitude_m for photograph, _ in relative]
         datum = "the place of take-off"
     else:
-        heights = [0.0] * len(located)
-        datum = "the mean height of flight, since the photographs have no heights"
+        heights = [0.0] * count
+        datum = "the mean height of flight, since too few photographs have heights"
+        if absolute or relative:
+            notes = (
+                f"Only {max(len(absolute), len(relative))} of {count} positions have a height: all are taken to be at "
+                "one height. To have these heights used, add those of the others, or remove the others' positions.",
+            )
+    if len(located) < count:
+        notes = (f"{count - len(located)} of {count} positions are not used: they have no height, unlike the others.",)
     degrees = np.array([(p.longitude_deg, p.latitude_deg) for _, p in located], dtype=np.float64).reshape(-1, 2)
-    stated = [(position.horizontal_m, position.vertical_m) for _, position in located]
+    vertical_m = [position.vertical_m if located is absolute else math.nan for _, position in located]
+    stated = [(position.horizontal_m, vertical) for (_, position), vertical in zip(located, vertical_m, strict=True)]
     if len(degrees):  # all on one side of the date line
         degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180 + degrees[0, 0]
     return GivenPositions(
@@ -82,6 +101,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
         stated_m=np.array(stated, dtype=np.float64).reshape(-1, 2),
         vertical_datum=datum,
+        notes=notes,
     )
 
 
@@ -178,14 +198,18 @@ def fit_positions(
     given = frame.from_geographic(positions.longitude_latitude_height)
     stated = positions.stated_m[:, [0, 0, 1]]
     nominal = np.where(np.isfinite(stated), stated, _NOMINAL_M)
-    similarity, median = _robust_start(centres, given, down)
+    # The least median has no weights: it would follow the receiver of most photographs, not the accurate one.
+    differential = np.all(stated < DIFFERENTIAL_M, axis=1)
+    enough = np.count_nonzero(differential) >= FEWEST_DIFFERENTIAL
+    first = differential if enough else np.ones(len(given), dtype=bool)
+    similarity, median = _robust_start(centres[first], given[first], down)
     if median > _NOMINAL_M:
         _refuse_mirrored(centres, positions, down, median)
     sigma, notes, used = nominal, (), np.ones(len(given), dtype=bool)
     for _ in range(3):
         error = similarity(centres) - given
         used = ~outliers(np.linalg.norm(error, axis=1), 5 * np.linalg.norm(nominal, axis=1))
-        sigma = _observed_sigma(error, used, stated)
+        sigma = _observed_sigma(error, used, nominal)
         refined, notes = refine_similarity(similarity, centres[used], given[used], sigma[used]), ()
         if refined.tilt_rad >= _MAX_TILT_RAD:
             prior = down.direction_model, down.sigma_rad
@@ -229,16 +253,14 @@ def metres(length_m: float) -> str:
 
 
 def _observed_sigma(
-    error: Float64[np.ndarray, "N 3"], used: Bool[np.ndarray, " N"], stated: Float64[np.ndarray, "N 3"]
+    error: Float64[np.ndarray, "N 3"], used: Bool[np.ndarray, " N"], nominal: Float64[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Estimate robust standard deviations, horizontal and vertical, from residuals; stated ones are relative weights.
+    """Estimate robust standard deviations, horizontal and vertical, from residuals; nominal ones are relative weights.
 
     A model bends by more than a differential receiver errs, so a stated accuracy separates good fixes from poor ones,
     but does not predict the residuals.
     """
-    known = np.isfinite(stated)
-    typical = np.nanmedian(stated, axis=0) if known.any(axis=0).all() else np.ones(3)
-    relative = np.where(known, np.maximum(stated, _LEAST_M) / np.maximum(typical, _LEAST_M), 1.0)
+    relative = np.maximum(nominal, _LEAST_M) / np.maximum(np.median(nominal, axis=0), _LEAST_M)
     scaled = np.abs(error[used]) / relative[used]
     horizontal = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, :2])))
     vertical = max(_LEAST_M, 1.4826 * float(np.median(scaled[:, 2])))

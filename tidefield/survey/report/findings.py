@@ -85,6 +85,7 @@ class Findings:
         georeference: position of the world on the Earth, and its accuracy.
         left_out: photographs that are not in the model.
         models: number of photographs of each model that was found; the reconstruction is the first.
+        held_out: names of photographs of the reconstruction that were placed afterwards, and observe no points.
         colour: the colour correction, or None if it was not tried, or could not be measured.
         examples: name and small pictures before and after the correction, the most changed first.
         seconds: wall time by stage, in order.
@@ -100,6 +101,7 @@ class Findings:
     georeference: Georeference
     left_out: tuple[UnusedPhotograph, ...] = ()
     models: tuple[int, ...] = ()
+    held_out: frozenset[str] = frozenset()
     colour: ExposureCorrection | None = None
     examples: tuple[tuple[str, Picture, Picture], ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
@@ -163,6 +165,7 @@ def collect_findings(prepared: Prepared, scene: Path, options: Mapping[str, str]
             for lost in (*_rejected(prepared), *_unregistered(prepared, scene))
         ),
         models=tuple(len(names) for names in prepared.models),
+        held_out=prepared.held_out,
         colour=correction,
         examples=_examples(prepared, scene, correction) if correction and correction.helps else (),
         seconds=prepared.seconds,

@@ -53,6 +53,7 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
     times = [p.time_s for p in findings.survey.photographs if math.isfinite(p.time_s)]
     captured = [datetime.fromtimestamp(at, UTC) for at in (min(times), max(times))] if times else []  # camera's clock
     start, end = [at.strftime(_OPENSFM_TIME) for at in captured] or ["unknown", "unknown"]
+    observed = _observed(statistics)
     reduction = np.array([block.camera(i).width / p.width for i, p in enumerate(statistics.photographs)])
     seconds = sum(findings.seconds.values(), 0.0)
     lengths, counts = np.unique(statistics.track_length, return_counts=True)
@@ -67,8 +68,8 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
             "area": statistics.coverage.area(1),  # as on the page; OpenSfM's is that of the cameras' bounding box
         },
         "features_statistics": {
-            "detected_features": _spread(block.detected),
-            "reconstructed_features": _spread(statistics.observed),
+            "detected_features": _spread(block.detected[~statistics.held_out]),
+            "reconstructed_features": _spread(statistics.observed[~statistics.held_out]),
         },
         "reconstruction_statistics": {
             "components": max(len(findings.models), 1),
@@ -132,7 +133,8 @@ def numbers(findings: Findings, statistics: Statistics) -> Numbers:
                     "position": block.position[i],
                     "height_above_ground": statistics.height[i],
                     "gsd": statistics.gsd[i],
-                    "points": statistics.observed[i],
+                    "held_out": statistics.held_out[i],
+                    "points": observed[i],
                     "reprojection_mean_px": statistics.mean_px[i],
                     "reprojection_rms_px": statistics.rms_px[i],
                     "forward_overlap": statistics.forward_overlap[i],
@@ -155,7 +157,7 @@ def layers(findings: Findings, statistics: Statistics) -> list[Layer]:
     frame, block = findings.frame, statistics.block
     assert frame is not None, "a model without a georeference has no map"
     height_m = frame.to_geographic(block.position)[:, 2]
-    rank = np.argsort(statistics.order)
+    rank, observed = np.argsort(statistics.order), _observed(statistics)
     outlines = zip(block.names, statistics.footprints, statistics.gsd, strict=True)
     cameras = [
         {
@@ -164,7 +166,7 @@ def layers(findings: Findings, statistics: Statistics) -> list[Layer]:
             "height_m": height_m[i],
             "height_above_ground_m": statistics.height[i],
             "gsd_m": statistics.gsd[i],
-            "points": statistics.observed[i],
+            "points": observed[i],
             "reprojection_error_px": statistics.mean_px[i],
         }
         for i, name in enumerate(block.names)
@@ -286,6 +288,12 @@ def _spread(values: np.ndarray) -> Numbers:
     return {"min": known.min(), "max": known.max(), "mean": known.mean(), "median": np.median(known)}
 
 
+def _observed(statistics: Statistics) -> list[int | None]:
+    """Points that every photograph observes; None for those that are held out."""
+    each = zip(statistics.observed.tolist(), statistics.held_out, strict=True)
+    return [None if held_out else count for count, held_out in each]
+
+
 def _coverage(statistics: Statistics) -> Numbers:
     coverage = statistics.coverage
     total = coverage.area(1)
@@ -344,7 +352,7 @@ def _colour(correction: ExposureCorrection) -> Numbers:
     change = {
         "what": "difference between photographs at points that took no part in the estimate",
         "before": 100 * correction.before,
-        "after": 100 * min(correction.gains_alone, correction.after),
+        "after": 100 * (correction.after if correction.sees_falloff else correction.gains_alone),
         "unit": "% of a pixel's value",
     }
     return {"applied": correction.helps, "verdict": verdict, "changes": [change]}

@@ -46,7 +46,7 @@ def page(findings: Findings, statistics: Statistics, numbers: Numbers) -> str:
         located=located,
         map=draw_map(findings, statistics),
         classes=list(zip(COLOURS, numbers["tidefield"]["coverage"]["classes"], strict=True)),
-        charts=_charts(statistics, located),
+        charts=draw_charts(statistics, located),
         scatters=[(title, chart) for title, chart in scatters if chart],
         lost=lost,
         most_rows=MOST_ROWS,
@@ -93,8 +93,12 @@ def _significant(value: float) -> str:
     return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}" if value else "0"
 
 
-def _charts(statistics: Statistics, located: bool) -> list[tuple[str, Markup]]:
-    """Titles and charts; those without values are left out."""
+def draw_charts(statistics: Statistics, located: bool) -> list[tuple[str, Markup]]:
+    """Draw the charts of a model, by title; those without values are left out.
+
+    Args:
+        located: whether lengths are in metres.
+    """
     scale, unit, digits = (100, "cm/px", 2) if located else (1, "units/px", 4)
     tracks = np.minimum(statistics.track_length, LONGEST_TRACK)
     beyond = f" ({LONGEST_TRACK}: or more)" if tracks.max() == LONGEST_TRACK else ""
@@ -103,7 +107,7 @@ def _charts(statistics: Statistics, located: bool) -> list[tuple[str, Markup]]:
         ("Reprojection errors", "error (px)", "observations", statistics.error_px, 2),
         ("Track lengths", f"photographs that see a point{beyond}", "points", tracks, None),
         ("Ground sampling distances", f"of each photograph ({unit})", "photographs", scale * statistics.gsd, digits),
-        ("Points per photograph", "points", "photographs", statistics.observed, 0),
+        ("Points per photograph", "points", "photographs", statistics.observed[~statistics.held_out], 0),
         ("Forward overlap", share, "photographs", 100 * statistics.forward_overlap, 0),
         ("Side overlap", share, "photographs", 100 * statistics.side_overlap, 0),
     ]

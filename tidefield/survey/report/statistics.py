@@ -62,7 +62,8 @@ class Statistics:
         side_overlap: the same of the nearest to the side, on a parallel line.
         error_px: reprojection error of every observation.
         mean_px, rms_px: per photograph.
-        observed: points that every photograph observes.
+        held_out: whether each photograph was placed afterwards.
+        observed: points that every photograph observes; held-out ones have none.
         track_length: photographs that observe each point.
     """
 
@@ -78,6 +79,7 @@ class Statistics:
     error_px: Float64[np.ndarray, " O"]
     mean_px: Float64[np.ndarray, " N"]
     rms_px: Float64[np.ndarray, " N"]
+    held_out: Bool[np.ndarray, " N"]
     observed: Int[np.ndarray, " N"]
     track_length: Int[np.ndarray, " P"]
 
@@ -113,6 +115,7 @@ def measure(findings: Findings) -> Statistics:
         error_px=error_px,
         mean_px=mean_px,
         rms_px=rms_px,
+        held_out=np.array([name in findings.held_out for name in block.names]),
         observed=np.bincount(block.photograph, minlength=len(block)),
         track_length=track_length,
     )

@@ -185,6 +185,12 @@ def extract(
         return db.num_keypoints()
 
 
+def reduced_size(width: int, height: int, side_px: int) -> tuple[int, int]:
+    """Compute the width and height in which features are extracted: each is rounded by itself."""
+    scale = min(1.0, side_px / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def copy_photographs(db: pycolmap.Database, part: pycolmap.Database, numbers: Iterable[int]) -> None:
     """Write cameras, and some photographs with their keypoints, to a database of their own, under the same numbers.
 
@@ -211,14 +217,14 @@ def _features(
 ) -> tuple[Keypoints, Descriptors]:
     """Extract keypoints (u, v, scale, orientation; pixels of the upright photograph) and descriptors, largest first."""
     grey = cv2.cvtColor(upright(photograph), cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, options.side_px / max(grey.shape))
-    if scale < 1:
-        size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     size = photograph.width, photograph.height
+    reduced = reduced_size(*size, options.side_px)
+    if reduced != size:
+        grey = cv2.resize(grey, reduced, interpolation=cv2.INTER_AREA)
     used = None if photograph.mask is None else read_mask(photograph.mask, size, photograph.path)
     keypoints, descriptors = find_features(grey, options.count, device, used)
-    keypoints[:, :3] *= photograph.width / grey.shape[1]
+    u, v = size[0] / reduced[0], size[1] / reduced[1]
+    keypoints[:, :3] *= np.array([u, v, u], dtype=np.float32)
     return keypoints, descriptors
 
 
