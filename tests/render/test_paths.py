@@ -9,7 +9,18 @@ from captures import SCENES, TILT, UP, angle, object_scene, oblique, scene_of, s
 from torch import Tensor
 
 from tidefield.data.scene import Scene
-from tidefield.render.camera_paths import AHEAD, GENTLE, SHAPES, Shape, among_cameras, layout_of, orbit, strip
+from tidefield.geometry.lenses import Lens
+from tidefield.render.camera_paths import (
+    AHEAD,
+    GENTLE,
+    SHAPES,
+    Shape,
+    among_cameras,
+    free_camera,
+    layout_of,
+    orbit,
+    strip,
+)
 
 
 def poses(shape: Shape, scene: Scene, frames: int, reach: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -167,3 +178,23 @@ def test_a_strip_looks_straight_down_along_the_long_axis():
     assert angle(-rotation[1:, :, 1], travel) < 0.5
     assert torch.allclose(position @ UP, torch.full((50,), 40.0), atol=0.2)
     assert torch.allclose(position @ TILT[:, 1], torch.full((50,), 12.0), atol=0.5)
+
+
+def test_a_free_camera_always_has_a_range():
+    scene, lens = survey(), Lens(400, 300, 300.0, 300.0, 200.0, 150.0)
+    points = scene.points
+    assert points is not None
+    pose = scene.cameras.T_world_camera[5].double().numpy()
+    level = free_camera(scene, pose, lens).near_far[0].tolist()
+    assert 15 < level[0] < 40 < level[1] < 60
+    # Looking up, no point is seen; a few of many points are seen from close above the ground.
+    up = pose.copy()
+    up[:, 1:3] *= -1
+    assert free_camera(scene, up, lens).near_far[0].tolist() == pytest.approx([20.0, 56.0])
+    many = points.xyz_world.repeat(400, 1)
+    moved = many + 0.1 * torch.randn(many.shape, generator=torch.Generator().manual_seed(0))
+    dense = replace(scene, points=replace(points, xyz_world=moved, error_px=torch.ones(len(many))))
+    close = pose.copy()
+    close[:, 3] += 36 * pose[:, 2]
+    near, far = free_camera(dense, close, lens).near_far[0].tolist()
+    assert near < 4 < far < 10

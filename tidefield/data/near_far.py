@@ -26,6 +26,18 @@ def estimate_near_far(
     """
     if points is None:
         return _from_cameras(T_world_camera)
+    ranges = ranges_of_points(T_world_camera, pinholes, points)
+    valid = np.isfinite(ranges[:, 0])
+    if not valid.any():
+        return _from_cameras(T_world_camera)
+    ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
+    return ranges
+
+
+def ranges_of_points(
+    T_world_camera: Float64[np.ndarray, "V 3 4"], pinholes: tuple[Lens, ...], points: Observations
+) -> Float64[np.ndarray, "V 2"]:
+    """Estimate ranges from the points that each camera observed, or has in its frustum; NaN where these are too few."""
     ranges = np.full((len(T_world_camera), 2), np.nan)
     observations = points.by_photograph(len(ranges))
     for i, (pose, pinhole) in enumerate(zip(T_world_camera, pinholes, strict=True)):
@@ -36,10 +48,6 @@ def estimate_near_far(
         if len(depth) >= _FEWEST_POINTS:
             nearest, farthest = np.percentile(depth, [1, 99])
             ranges[i] = _NEAREST * nearest, _FARTHEST * farthest
-    valid = np.isfinite(ranges[:, 0])
-    if not valid.any():
-        return _from_cameras(T_world_camera)
-    ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
     return ranges
 
 

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import softmax
 
-from tidefield.data.near_far import estimate_near_far
+from tidefield.data.near_far import ranges_of_points
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
@@ -61,8 +61,8 @@ ENOUGH = 0.95
 """Share of doubly seen pixels that every frame must have, relative to a path of the shortest reach."""
 CHECKED_FRAMES, CHECKED_PX = 9, 24
 """Number of frames in which doubly seen pixels are counted, and the side of the small images for that."""
-MAX_RANGE_POINTS = 20_000
-"""Sparse points that the near and far of a frame are taken from, at most."""
+RANGE_POINTS = (20_000, 1_000_000)
+"""Sparse points that the near and far of a frame are taken from, at most: first, and where these are too few."""
 
 
 @dataclass(frozen=True)
@@ -435,11 +435,22 @@ def free_camera(scene: Scene, T_world_camera: Float64[np.ndarray, "3 4"], lens: 
 
 
 def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Lens, ...]) -> Float64[np.ndarray, "N 2"]:
-    """Return the depth ranges of the sparse points, smoothed over the frames; without points, the photographs'."""
-    if scene.points is None:
+    """Return the depth ranges of the sparse points, smoothed over the frames.
+
+    Frames that show few of them have the widest range of any frame; where all do, that of the photographs.
+    """
+    ranges = np.full((len(pose), 2), np.nan)
+    xyz = np.zeros((0, 3)) if scene.points is None else scene.points.xyz_world.double().cpu().numpy()
+    for most in RANGE_POINTS:
+        few = np.flatnonzero(np.isnan(ranges[:, 0]))
+        if len(few) and len(xyz):
+            some = Observations(xyz[:: len(xyz) // most + 1])
+            ranges[few] = ranges_of_points(pose[few], tuple(lenses[i] for i in few), some)
+    valid = np.isfinite(ranges[:, 0])
+    if valid.any():
+        ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
+    else:
         near, far = scene.cameras.near_far[list(scene.train)].double().cpu().numpy().T
-        return np.tile([np.quantile(near, 0.05), np.quantile(far, 0.95)], (len(pose), 1))
-    xyz = scene.points.xyz_world.double().cpu().numpy()
-    ranges = estimate_near_far(pose, lenses, Observations(xyz[:: len(xyz) // MAX_RANGE_POINTS + 1]))
+        ranges[:] = np.quantile(near, 0.05), np.quantile(far, 0.95)
     # A jump of the range would be a jump in the picture: samples lie elsewhere.
     return np.exp(gaussian_filter1d(np.log(ranges), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))
