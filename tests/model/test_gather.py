@@ -161,6 +161,17 @@ def test_meaningless_pixels_are_off_the_map_and_give_finite_values():
     assert values.isfinite().all()
 
 
+def test_beyond_a_coarse_map_its_border_is_read():
+    image = images(1)
+    maps = maps_from_images(image, torch.zeros(1, 2), 4)
+    # 36 x 28 pixels; the map of 9 x 7 texels ends half a texel beyond the last one's centre, at 34.5 and 26.5.
+    beyond = torch.tensor([[[[35.5, 12.5], [16.5, 27.9], [35.9, 27.9], [1e30, -1e30]]]], dtype=torch.float64)
+    values, inside = gather(maps, torch.zeros(1, 1, dtype=torch.long), beyond)
+    assert not inside.any()
+    expected = torch.stack([image[0, :, 3, 8], image[0, :, 6, 4], image[0, :, 6, 8], image[0, :, 0, 8]])
+    torch.testing.assert_close(values[0, 0], expected)
+
+
 def test_weighted_rows_are_sums_with_the_right_gradient():
     generator = torch.Generator().manual_seed(0)
     rows = torch.randn(6, 3, generator=generator, dtype=torch.float64)

@@ -169,3 +169,20 @@ def test_a_scene_with_masks_is_learned_from_where_it_is_not_masked(preset: Netwo
     loss.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in learner.parameters())
     assert (float(error.detach()) > 0) != everything
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.25])
+def test_what_lies_behind_the_scene_is_not_learned_as_a_surface(gain: float):
+    config = replace(SMALL.train, crop_px=48, tiles=4)
+    cameras = wall.cameras(6)
+    own = wall.scene(replace(cameras, gain=torch.full_like(cameras.gain, gain)))
+    nothing = tuple(torch.full_like(colours, 255) for colours in own.photographs.colours)
+    clear = tuple(torch.zeros(36, 48, dtype=torch.uint8) for _ in nothing)
+    own = replace(own, photographs=replace(own.photographs, colours=nothing, alphas=clear))
+    learner = BatchLoss(network(SMALL.network), config)
+    inputs = Inputs.draw(learner.network, config, own, DepthPriors(own), 3, torch.Generator().manual_seed(3))
+    loss, error = learner(inputs)
+    # However much light the network lets through, white is behind it.
+    assert float(error.detach()) < 1e-8
+    loss.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in learner.parameters())

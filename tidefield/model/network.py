@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -39,6 +39,7 @@ class TileRendering:
         visibility: probability that a view sees the surface.
         inverse_depths: per pass, the mean inverse depth of its rays, margin included.
         coarse_colours: per pass but the last, the neighbours' mean colours under its weights, margin included.
+        coarse_opacities: of these.
     """
 
     colour: Float[Tensor, "T R 3"]
@@ -47,17 +48,33 @@ class TileRendering:
     visibility: Float[Tensor, "T R"]
     inverse_depths: tuple[Float[Tensor, "T _"], ...]
     coarse_colours: tuple[Float[Tensor, "T _ 3"], ...] = ()
+    coarse_opacities: tuple[Float[Tensor, "T _"], ...] = ()
 
     def tensors(self) -> tuple[Tensor, ...]:
         """All tensors, one after the other; `from_tensors` is the inverse."""
-        return (self.colour, self.depth, self.opacity, self.visibility, *self.inverse_depths, *self.coarse_colours)
+        coarse = *self.coarse_colours, *self.coarse_opacities
+        return (self.colour, self.depth, self.opacity, self.visibility, *self.inverse_depths, *coarse)
 
     @staticmethod
     def from_tensors(tensors: tuple[Tensor, ...]) -> TileRendering:
-        passes = (len(tensors) - 3) // 2
+        passes = (len(tensors) - 2) // 3
         colour, depth, opacity, visibility = tensors[:4]
-        rest = tensors[4 : 4 + passes], tensors[4 + passes :]
+        first, second = 4 + passes, 3 + 2 * passes
+        rest = tensors[4:first], tensors[first:second], tensors[second:]
         return TileRendering(colour, depth, opacity, visibility, *rest)
+
+    def over(self, behind: Float[Tensor, "T 1 3"]) -> TileRendering:
+        """The rendering over a background at the common exposure."""
+
+        def composited(colour: Float[Tensor, "T _ 3"], opacity: Float[Tensor, "T _"]) -> Float[Tensor, "T _ 3"]:
+            return colour + (1 - opacity[..., None]) * behind
+
+        coarse = zip(self.coarse_colours, self.coarse_opacities, strict=True)
+        return replace(
+            self,
+            colour=composited(self.colour, self.opacity),
+            coarse_colours=tuple(composited(*one) for one in coarse),
+        )
 
 
 class Network(nn.Module, ABC):

@@ -94,7 +94,7 @@ class SwiftNetwork(Network):
         jitter: tuple[Float[Tensor, "T _ _"], ...] = (),
     ) -> TileRendering:
         intervals, pdf = start, torch.ones_like(start.inv_near)[..., None]
-        inverse_depths, coarse_colours = [], []
+        inverse_depths, coarse_colours, coarse_opacities = [], [], []
         for k, one in enumerate(self.config.passes):
             uv = tiles.rays_px(*self.grids[k])
             s = sample(pdf, one.samples, jitter[k] if jitter else None)
@@ -124,9 +124,11 @@ class SwiftNetwork(Network):
                     visibility=weight.visibility,
                     inverse_depths=tuple(inverse_depths),
                     coarse_colours=tuple(coarse_colours),
+                    coarse_opacities=tuple(coarse_opacities),
                 )
             mean_colour = mean_colours(evidence, gathered)
             coarse_colours.append(composite(weight.colour, mean_colour.unflatten(1, samples.s.shape[1:])))
+            coarse_opacities.append(weight.colour.sum(-1))
             following = self.grids[k + 1]
             pdf = histogram(weight.surface.detach(), samples.s, one.samples, self.config.uniform_fraction)
             intervals, pdf = refine(intervals, pdf, one.stride // following.stride, following.margin)

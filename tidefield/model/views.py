@@ -278,8 +278,9 @@ def gather(
     position = (uv_px - maps.origin_px[which][:, :, None]) / maps.stride
     reach = max(0.5, 0.5 / maps.stride)
     inside = ((position >= -reach) & (position <= size - reach)).all(-1)
-    # NaN or huge positions of invalid points must still index something.
-    position = torch.where(inside[..., None], position, torch.zeros_like(position))
+    # NaN or huge positions of invalid points must still index something. What is off a coarse map may be on a fine one,
+    # and is read from both.
+    position = torch.minimum(position.nan_to_num(0.0).clamp(min=-reach), size - reach)
     corner = position.floor()
     later = position - corner
     low = corner.int()

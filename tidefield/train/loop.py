@@ -271,7 +271,7 @@ class SceneTrainer(Trainer):
         if self._recorder is None:
             error, gradients = self._gradients(moved(inputs, self.device))
         else:
-            error, gradients = self._recorder(inputs, inputs.opaque)
+            error, gradients = self._recorder(inputs, inputs.behind is None)
         for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
             parameter.grad = gradient
         return error

@@ -42,7 +42,7 @@ class Inputs:
         neighbours: of the tiles' neighbours, tile by tile.
         start: intervals of the first pass's rays.
         jitter: of the samples of every pass.
-        opaque: whether the last sample of a ray stops all light.
+        behind: background of the tiles at the common exposure; None where the last sample of a ray stops all light.
     """
 
     batch: Batch
@@ -50,7 +50,7 @@ class Inputs:
     neighbours: Cameras
     start: Intervals
     jitter: tuple[Float[Tensor, "T _ _"], ...]
-    opaque: bool
+    behind: Float[Tensor, "T 1 3"] | None
 
     @staticmethod
     def draw(
@@ -81,13 +81,17 @@ class Inputs:
         cameras = scene.cameras if cameras is None else cameras
         own = cameras[batch.targets]
         cells = [priors[i].cells for i in batch.targets.tolist()]
+        behind = None
+        if scene.background_rgb is not None:
+            middle = (batch.corner_px + config.tile_px / 2)[:, None]
+            behind = torch.tensor(scene.background_rgb) / own.gain_at(middle)
         return Inputs(
             batch=batch,
             cameras=own,
             neighbours=cameras[batch.neighbours.reshape(-1)],
             start=network.start_intervals(Tiles(own, batch.corner_px, config.tile_px), cells),
             jitter=network.draw_jitter(len(batch.targets), config.tile_px, generator),
-            opaque=scene.background_rgb is None,
+            behind=behind,
         )
 
     def parts(self, count: int) -> list[Inputs]:
@@ -98,7 +102,8 @@ class Inputs:
             tiles = slice(first, last)
             start, jitter = map_tensors((self.start, self.jitter), itemgetter(tiles))
             neighbours = self.neighbours[slice(first * views, last * views)]
-            parts.append(Inputs(batch, self.cameras[tiles], neighbours, start, jitter, self.opaque))
+            behind = None if self.behind is None else self.behind[tiles]
+            parts.append(Inputs(batch, self.cameras[tiles], neighbours, start, jitter, behind))
             first = last
         return parts
 
@@ -137,6 +142,8 @@ class BatchLoss(nn.Module):
             tasks = [partial(self._render_tensors, part, precision) for part in parts]
             trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
             rendering = TileRendering.from_tensors(differentiable_parts(tasks, trained, device))
+        if inputs.behind is not None:
+            rendering = rendering.over(inputs.behind)
         loss, error = photometric(rendering, batch, network.grids, side)
         if config.structure_weight:
             loss = loss + config.structure_weight * structural(rendering, batch, side)
@@ -155,7 +162,7 @@ class BatchLoss(nn.Module):
             encoded = [one.masked(*used) for one, *used in zip(encoded, batch.image_used, corners, strict=True)]
         views = Views(inputs.neighbours, batch.which, batch.blend_weight, Encoded.concatenate(encoded))
         tiles = Tiles(inputs.cameras, batch.corner_px, self.config.tile_px)
-        return network(tiles, views, inputs.start, inputs.opaque, batch.detail, inputs.jitter)
+        return network(tiles, views, inputs.start, inputs.behind is None, batch.detail, inputs.jitter)
 
     def _render_tensors(self, *arguments: Any) -> tuple[Tensor, ...]:
         return self._render(*arguments).tensors()
