@@ -11,6 +11,7 @@ from tidefield.data.depth_prior import DepthPriors, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
 from tidefield.data.scene import Scene
+from tidefield.errors import SceneError
 from tidefield.recording import tensors_of
 
 CROPS = replace(SWIFT.train, tile_px=8, tiles=6, crop_px=20)
@@ -175,6 +176,14 @@ def test_adjacent_tiles_share_the_blend_weights_of_their_common_corners():
     down = (grid[:-1, :, :, [2, 3]] - grid[1:, :, :, [0, 1]]).abs()
     assert len({tuple(sorted(index)) for index in found.index.tolist()}) > 2, "neighbours change"
     assert max(across.max(), down.max()) < 0.1, "and have hardly any weight where they change"
+
+
+@pytest.mark.parametrize("config", [CROPS, WHOLE, replace(CROPS, neighbours="direction")])
+def test_a_single_training_photograph_has_no_neighbours_to_learn_from(config: TrainConfig):
+    own = wall.scene(wall.cameras(3), test=(0, 2))
+    with pytest.raises(SceneError, match="no training photograph besides the target's own: expected another"):
+        batch(own, config)
+    assert len(draw_batch(own, DepthPriors(own), config, 0, torch.Generator()).targets) == 6
 
 
 def test_a_batch_for_a_network_without_views_has_nothing_to_encode():

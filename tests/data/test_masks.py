@@ -1,10 +1,11 @@
 """Masked pixels of photographs: read from where others keep masks, and used by nothing."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import textured_wall as wall
 import torch
@@ -37,6 +38,13 @@ def write_masks(root: Path, truth: Truth, which: range = range(9)) -> None:
         Image.fromarray(left_half(truth.lenses[i].width, truth.lenses[i].height)).save(file)
 
 
+def renamed(root: Path, truth: Truth, suffix: str) -> Truth:
+    """A COLMAP model in which every photograph has another suffix."""
+    truth = replace(truth, names=tuple(str(Path(name).with_suffix(suffix)) for name in truth.names))
+    write_colmap(root, truth)
+    return truth
+
+
 def with_noise_under_the_masks(truth: Truth) -> Truth:
     random = np.random.default_rng(3)
     pictures = [p.copy() for p in truth.pictures]
@@ -44,6 +52,16 @@ def with_noise_under_the_masks(truth: Truth) -> Truth:
         half = picture[:, : picture.shape[1] // 2]
         half[:] = random.integers(0, 256, half.shape)
     return replace(truth, pictures=tuple(pictures))
+
+
+def disturb_left_halves(model: Path) -> None:
+    """Move all observations in the left halves of the photographs to another place there."""
+    random, read = np.random.default_rng(4), pycolmap.Reconstruction(str(model))
+    for image in read.images.values():
+        for point in image.points2D:
+            if point.xy[0] < 27:
+                point.xy = point.xy + random.uniform(-4, 4, 2)
+    read.write_binary(str(model))
 
 
 def load(root: Path, **options: object) -> Scene:
@@ -88,6 +106,58 @@ def test_a_mask_that_changes_is_read_again(tmp_path: Path) -> None:
     assert load(tmp_path / "a").photographs.used(0).all()
 
 
+def test_a_mask_may_have_the_stem_of_its_photograph(tmp_path: Path) -> None:
+    truth = renamed(tmp_path / "a", survey(PINHOLE), ".jpg")
+    write_masks(tmp_path / "a", replace(truth, names=tuple(name.removesuffix(".jpg") for name in truth.names)))
+    scene = load(tmp_path / "a")
+    assert all(torch.equal(scene.photographs.used(i), torch.from_numpy(left_half() > 0)) for i in range(9))
+    Image.new("L", (64, 48), 255).save(tmp_path / "a" / "masks" / f"{scene.names[0]}.png")
+    assert load(tmp_path / "a").photographs.used(0).all(), "the whole name is the better one"
+
+
+def test_a_stem_that_fits_two_photographs_names_no_mask(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    truth = renamed(tmp_path / "a", survey(PINHOLE), ".jpg")
+    write_masks(tmp_path / "a", replace(truth, names=tuple(name.removesuffix(".jpg") for name in truth.names)))
+    other = Path(truth.names[0]).with_suffix(".png")
+    Image.new("RGB", (64, 48)).save(tmp_path / "a" / "images" / other)
+    scene = load(tmp_path / "a")
+    assert [scene.photographs.masks[scene.index(name)] is None for name in truth.names] == [True] + [False] * 8
+    assert f"1 of the 9 pictures in {tmp_path / 'a' / 'masks'} belong to no photograph" in caplog.text
+    assert f"{other}; expected names such as strip_0/photo_8.jpg.png" in caplog.text
+
+
+def test_masks_of_no_photograph_are_refused_and_some_are_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_colmap(tmp_path / "a", truth := survey(PINHOLE))
+    write_masks(tmp_path / "a", replace(truth, names=tuple(f"{name}_mask" for name in truth.names)))
+    with pytest.raises(
+        SceneError, match=r"no mask of any photograph \(found: strip_0/photo_6.png_mask.png, .* and 4 more"
+    ):
+        load(tmp_path / "a")
+    write_masks(tmp_path / "a", truth, range(3))
+    assert sum(mask is not None for mask in load(tmp_path / "a").photographs.masks) == 3
+    assert "9 of the 12 pictures" in caplog.text
+
+
+def test_masks_of_photographs_without_a_pose_are_not_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_colmap(tmp_path / "a", truth := survey(PINHOLE))
+    for name in ("left_out.jpg", "strip_9/left_out.png"):
+        file = tmp_path / "a" / "images" / name
+        file.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (64, 48)).save(file)
+    for name in ("left_out.jpg.png", "strip_9/left_out.png"):
+        file = tmp_path / "a" / "masks" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (64, 48)).save(file)
+    (tmp_path / "a" / "masks" / "README.txt").touch()
+    assert load(tmp_path / "a").photographs.masks == ()
+    write_masks(tmp_path / "a", truth)
+    (tmp_path / "a" / "images" / truth.names[0]).unlink()
+    assert len(load(tmp_path / "a", allow_missing=True).photographs.masks) == 8
+    assert "masks" not in caplog.text
+
+
 def test_masked_pixels_get_the_colour_of_the_nearest_used_one() -> None:
     random = np.random.default_rng(0)
     pixels, mask = random.integers(0, 256, (12, 15, 3), dtype=np.uint8), random.random((12, 15)) < 0.2
@@ -126,7 +196,7 @@ def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
         load(tmp_path / "a")
 
 
-def test_points_lose_the_observations_in_masked_pixels(tmp_path: Path) -> None:
+def test_points_lose_the_observations_in_masked_pixels_and_need_two_others(tmp_path: Path) -> None:
     write_colmap(tmp_path / "plain", truth := survey(PINHOLE))
     write_colmap(tmp_path / "masked", truth)
     write_masks(tmp_path / "masked", truth)
@@ -134,9 +204,29 @@ def test_points_lose_the_observations_in_masked_pixels(tmp_path: Path) -> None:
     assert plain is not None
     assert masked is not None
     kept = plain.uv_px[:, 0] >= 32
+    count = plain.point_index[kept].bincount(minlength=len(plain.xyz_world))
+    assert (count == 1).any()
+    kept &= (count >= 2)[plain.point_index]
     assert torch.equal(masked.uv_px, plain.uv_px[kept])
-    assert torch.equal(masked.xyz_world[masked.point_index], plain.xyz_world[plain.point_index[kept]])
+    xyz, placed_by_all = masked.xyz_world[masked.point_index], plain.xyz_world[plain.point_index[kept]]
+    torch.testing.assert_close(xyz, placed_by_all, rtol=0, atol=2e-5)
     assert len(masked.xyz_world) == len(masked.point_index.unique())
+
+
+def test_points_are_placed_by_the_observations_that_are_not_masked(tmp_path: Path) -> None:
+    """Masked observations are moved by up to 5 px in one of two scenes that are the same otherwise."""
+    truth, found = survey(BARREL), []
+    for name in ("right", "wrong"):
+        model = write_colmap(tmp_path / name, truth)
+        write_masks(tmp_path / name, truth)
+        if name == "wrong":
+            disturb_left_halves(model)
+        found.append(load(tmp_path / name).points)
+    right, wrong = found
+    assert right is not None
+    assert wrong is not None
+    for field in fields(right):
+        assert torch.equal(getattr(right, field.name), getattr(wrong, field.name)), field.name
 
 
 def masked_wall(count: int = 7, masked: tuple[int, ...] = (2,)) -> Scene:

@@ -101,6 +101,22 @@ def test_outliers_of_opensfm_are_left_out(tmp_path: Path) -> None:
     assert len(points.uv_px) == len(seen) - len(seen[::10])
 
 
+@pytest.mark.parametrize("home", ["", "opensfm"])
+def test_masks_lie_next_to_the_photographs_or_the_reconstruction(
+    tmp_path: Path, home: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    top = reconstruction()
+    write_opensfm(tmp_path / "opensfm", top, photographs=False)
+    write_photographs(tmp_path / "images", top)
+    masks = tmp_path / home / "masks"
+    masks.mkdir()
+    first, second, *_ = top["shots"]
+    for name in (f"{first}.png", second, "unknown.png"):
+        (masks / name).touch()
+    assert read(tmp_path).masks == (masks / f"{first}.png", masks / second, *[None] * 7)
+    assert caplog.text.count("1 of the 3 pictures") == 1
+
+
 def test_a_project_loads_as_an_undistorted_scene(tmp_path: Path) -> None:
     top = reconstruction()
     write_opensfm(tmp_path, top)

@@ -69,6 +69,18 @@ def test_kept_points_that_are_damaged_are_found_again(hills: Path, tmp_path: Pat
     assert torch.equal(again.xyz_world, first.xyz_world)
 
 
+def test_points_are_found_again_where_a_mask_becomes_that_of_another_photograph(
+    hills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(triangulate, "triangulate", lambda *_: None)
+    posed = read_posed(hills, False)
+    mask = tmp_path / "mask.png"
+    mask.touch()
+    for masks in ((mask, *[None] * 8), (*[None] * 8, mask)):
+        triangulate.find_points(replace(posed, masks=masks), range(9), hills, cache=tmp_path / "cache")
+    assert len(list((tmp_path / "cache").glob("*.points"))) == 2
+
+
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no such permissions")
 def test_points_of_a_cache_that_others_can_write_to_are_not_used(
     hills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -83,6 +95,11 @@ def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, ca
     disk.write_transforms(tmp_path / "scene", disk.survey(disk.PINHOLE))
     assert load_scene(tmp_path / "scene", cache=tmp_path).points is None
     assert "views may be blurred or torn" in caplog.text
+
+
+@pytest.mark.parametrize("used", [(), (4,)])
+def test_fewer_than_two_photographs_give_no_points(hills: Path, used: tuple[int, ...]):
+    assert triangulate.triangulate(read_posed(hills, False), used) is None
 
 
 def test_points_are_placed_by_the_observations_of_the_photographs_used_alone(tmp_path: Path):

@@ -19,6 +19,7 @@ from tidefield.data.images import Masks
 from tidefield.data.neighbours import choose_neighbours
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame
+from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
 
@@ -146,7 +147,15 @@ def draw_batch(
         views: neighbouring views at each corner of a tile; 0 encodes nothing.
         of: training photographs to draw from; all of them if not given.
         doubled: the scene at twice the size, where crops are read from it, too.
+
+    Raises:
+        SceneError: views are asked for, and there is no training photograph besides the target.
     """
+    if views and len(scene.train) < 2:
+        raise SceneError(
+            f"{scene.root} has no training photograph besides the target's own: expected another to render its view "
+            "from; add photographs"
+        )
     side = config.tile_px
     train = torch.tensor(scene.train)
     drawn_from = train if of is None else torch.tensor(of)

@@ -192,13 +192,10 @@ def _estimate(
     """
     points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
     if points is not None and len(points.uv_px):
+        if photographs.masks:
+            points = _of_used_pixels(points, posed.lenses, pinholes, photographs)
         points = triangulate_again(points, T_world_camera, posed.lenses, train)
     sparse = points and _sparse_points(points, T_world_camera, posed.lenses, pinholes)
-    if sparse is not None and photographs.masks:
-        sparse = _of_used_pixels(sparse, photographs)
-        points = sparse and Observations(
-            sparse.xyz_world.double().numpy(), sparse.point_index.numpy(), sparse.camera_index.numpy()
-        )
     near_far = posed.near_far
     if near_far is None or points is not None:
         near_far = estimate_near_far(T_world_camera, pinholes, points)
@@ -436,16 +433,23 @@ def _sparse_points(
     )
 
 
-def _of_used_pixels(points: SparsePoints, photographs: Photographs) -> SparsePoints | None:
-    """Leave out observations in masked pixels, and points that then have none."""
-    kept = torch.ones(len(points.uv_px), dtype=torch.bool)
-    for index, mask in enumerate(photographs.masks):
+def _of_used_pixels(
+    points: Observations, lenses: tuple[LensModel, ...], pinholes: tuple[Lens, ...], photographs: Photographs
+) -> Observations:
+    """Leave out observations in masked pixels; all points stay."""
+    kept = np.ones(len(points.uv_px), dtype=bool)
+    observations = points.by_photograph(len(pinholes))
+    for lens, pinhole, mask, mine in zip(lenses, pinholes, photographs.masks, observations, strict=True):
         if mask is not None:
-            mine = points.camera_index == index
-            kept[mine] = is_used(mask, points.uv_px[mine])
-    seen = torch.zeros(len(points.xyz_world), dtype=torch.bool)
-    seen[points.point_index[kept]] = True
-    return points.observed(kept).subset(seen) if kept.any() else None
+            # NaN where the lens images nothing, whatever the mask says there: `triangulate_again` leaves these out.
+            uv = lens.unproject(points.uv_px[mine]) * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+            kept[mine] = is_used(mask, torch.from_numpy(uv)).numpy()
+    return replace(
+        points,
+        point_index=points.point_index[kept],
+        photograph_index=points.photograph_index[kept],
+        uv_px=points.uv_px[kept],
+    )
 
 
 def _float32(values: np.ndarray | Sequence[tuple[float, float]]) -> Tensor:

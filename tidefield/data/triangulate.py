@@ -157,6 +157,8 @@ def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress
     Returns:
         The points, observed by the photographs used; None where there are fewer than `FEWEST`.
     """
+    if len(used) < 2:
+        return None
     with _quiet_pycolmap():
         features = _find_features(posed, used, progress)
         return _triangulate(posed, used, features)
@@ -259,7 +261,8 @@ def _found(posed: PosedPhotographs, used: Sequence[int], root: Path, progress: P
 
 def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:
     """What the points depend on, as a file's name."""
-    files = [identity(path) for path in (*posed.paths, *posed.masks) if path is not None]
+    # Nones tell which photographs the masks belong to.
+    files = [None if path is None else identity(path) for path in (*posed.paths, *posed.masks)]
     lenses = [asdict(lens) for lens in posed.lenses]
     return key([_VERSION, files, lenses, posed.T_world_camera.tolist(), list(used)])
 

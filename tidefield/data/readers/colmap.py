@@ -16,7 +16,8 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float64, Int
 
-from tidefield.data.readers.files import in_range, inside, keep_present, masks_beside, naming, opened
+from tidefield.data.readers.files import in_range, inside, keep_present, naming, opened
+from tidefield.data.readers.masks import masks_beside
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, LensModel, lens_from_colmap
@@ -68,15 +69,15 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
         )
     paths = [inside(root / "images", image.name, images_file) for image in images]
     present = keep_present(paths, images_file, allow_missing)
+    masks = masks_beside((root,), [image.name for image in images], paths, present, images_file)
     images = [images[i] for i in present]
-    names = tuple(image.name for image in images)
     return PosedPhotographs(
-        names=names,
+        names=tuple(image.name for image in images),
         paths=tuple(paths[i] for i in present),
         lenses=tuple(lenses[image.camera] for image in images),
         T_world_camera=_poses(images),
         points=_observations(images, points),
-        masks=masks_beside(root, names, images_file),
+        masks=masks,
     )
 
 

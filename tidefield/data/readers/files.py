@@ -130,6 +130,11 @@ def quiet_pillow() -> Iterator[None]:
         yield
 
 
+def relative_path(name: str) -> Path:
+    """Resolve the steps of a file name from a scene's description, which may be written as on Windows."""
+    return Path(posixpath.normpath(name.replace("\\", "/")))
+
+
 def inside(root: Path, name: str, named_by: Path) -> Path:
     """Resolve a file name from a scene's description to a path inside the scene.
 
@@ -139,7 +144,7 @@ def inside(root: Path, name: str, named_by: Path) -> Path:
     Raises:
         SceneError: the path is outside.
     """
-    relative = Path(posixpath.normpath(name.replace("\\", "/")))
+    relative = relative_path(name)
     path = root / relative
     within = bool(relative.parts) and not relative.anchor and ".." not in relative.parts and "\0" not in name
     if within:
@@ -171,15 +176,6 @@ def keep_present(paths: Sequence[Path], named_by: Path, allow_missing: bool) -> 
             f"{list_names(missing)}; add them, or use --allow-missing to leave them out"
         )
     return present
-
-
-def masks_beside(root: Path, names: Sequence[str], named_by: Path) -> tuple[Path | None, ...]:
-    """Find the masks of photographs where COLMAP and OpenSfM look for them: masks/NAME.png; empty if there is none."""
-    if not (root / "masks").is_dir():
-        return ()
-    masks = [inside(root / "masks", f"{name}.png", named_by) for name in names]
-    found = tuple(mask if mask.is_file() else None for mask in masks)
-    return found if any(found) else ()
 
 
 def read_json(file: Path, kind: type[T] = dict, megabytes: int = _JSON_MEGABYTES) -> T:

@@ -37,7 +37,6 @@ from tidefield.data.readers.files import (
     in_range,
     inside,
     keep_present,
-    masks_beside,
     naming,
     number,
     numbers,
@@ -45,6 +44,7 @@ from tidefield.data.readers.files import (
     parsing,
     read_json,
 )
+from tidefield.data.readers.masks import masks_beside
 from tidefield.data.readers.posed import Observations, PosedPhotographs, Reference
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
@@ -89,6 +89,7 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
     shots, cameras = _objects(reconstruction, "shots", file), _objects(reconstruction, "cameras", file)
     paths = _photographs(root, file, list(shots))
     present = keep_present(paths, file, allow_missing)
+    masks = masks_beside((root, file.parent), list(shots), paths, present, file)
     names, paths = [list(shots)[i] for i in present], [paths[i] for i in present]
     lenses = tuple(_lens(name, shots[name], cameras, path, file) for name, path in zip(names, paths, strict=True))
     T_world_camera = _poses([shots[name] for name in names], names, file)
@@ -104,7 +105,7 @@ def read_opensfm(root: Path, file: Path, allow_missing: bool) -> PosedPhotograph
         T_world_camera=T_world_camera,
         points=points,
         reference=_reference(file, reconstruction),
-        masks=masks_beside(root, names, file) or masks_beside(file.parent, names, file),
+        masks=masks,
     )
 
 
