@@ -1,5 +1,6 @@
 """The Python interface, as README shows it."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,13 +13,16 @@ from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
 import tidefield
+from tidefield.addresses import copy_of
 from tidefield.commands.train import Train, train
 from tidefield.config import Budget
 from tidefield.data.images import Photographs
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SceneError
+from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.methods import untrained
+from tidefield.train.checkpoint import RUN_FILE
 
 
 @pytest.fixture
@@ -67,6 +71,16 @@ def test_a_run_is_opened_with_its_scene_and_renders_as_it_was_trained(folder: Pa
         assert repr(run) == "OpenRun('run', swift, 2 steps)"
     untrained = tidefield.zero_shot(run.scene, device="cpu")(run.scene.cameras[0])
     assert not torch.equal(view.colour, untrained.colour)
+
+
+def test_a_run_is_opened_with_a_scene_at_an_address(folder: Path) -> None:
+    options = Train(folder / "flats", folder / "run", budget=Budget(steps=1), width=48, device="cpu")
+    train(options, Console(quiet=True))
+    at = f"local://{folder}/flats"
+    record = json.loads((folder / "run" / RUN_FILE).read_text())
+    write_json(folder / "run" / RUN_FILE, {**record, "scene": at})
+    with tidefield.open_run(folder / "run", device="cpu") as run:
+        assert run.scene.root == copy_of(at)
 
 
 def test_all_names_exist_and_importing_the_package_is_light() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tidefield import methods
+from tidefield.addresses import pull
 from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
@@ -52,6 +53,7 @@ class OpenRun:
     def __init__(self, folder: Path, device: str) -> None:
         run = read_run(folder)
         self.folder, self.config = folder, run.config
+        pull(run.scene)
         self.scene: Scene = load_scene(run.scene, width=run.width)
         self._stack = ExitStack()
         trained = methods.trained(folder, run, self.scene, choose_device(device))

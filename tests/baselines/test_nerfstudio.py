@@ -35,7 +35,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 kind, job = sys.argv[1], json.loads(Path(sys.argv[2]).read_text())
-out = Path(job["out"])
+out = Path(sys.argv[2]).parent
 def answer(**values): print(json.dumps(values), flush=True)
 def picture(camera, file):
     width, height = camera["size_px"]
@@ -114,6 +114,7 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
             grey = (0.5 / factor * scene.cameras.gain[index]).clamp(0, 1)
             torch.testing.assert_close(view.colour, grey.expand(36, 48, 3))
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
+    assert not (run / "rendering.npz").exists()
     assert driver.progress_of(run).step == 3
 
 
@@ -121,8 +122,9 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
 def test_the_worker_sees_only_the_gpu_that_was_asked_for(
     visible: str | None, expected: str, scene: Scene, tmp_path: Path, fake: None, monkeypatch: pytest.MonkeyPatch
 ):
-    script = driver.WORKER
-    script.write_text(f"import os, sys\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), file=sys.stderr)\n{FAKE}")
+    script, seen = driver.WORKER, tmp_path / "seen"
+    write = f"print(os.environ.get('CUDA_VISIBLE_DEVICES'), file=open({str(seen)!r}, 'a'))"
+    script.write_text(f"import os\n{write}\n{FAKE}")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if visible is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
@@ -132,8 +134,7 @@ def test_the_worker_sees_only_the_gpu_that_was_asked_for(
         pass
     with driver.renderer(tmp_path, CPU):
         pass
-    lines = (tmp_path / driver.LOG_FILE).read_text().splitlines()
-    assert lines[::2] == [expected, expected, str(visible)]
+    assert seen.read_text().splitlines() == [expected, expected, str(visible)]
 
 
 @pytest.fixture
@@ -169,6 +170,43 @@ def test_what_nerfstudio_has_learned_comes_back_as_the_view_of_the_camera(tmp_pa
         view = render(scene.cameras[2])
     looks_like(view, scene.photographs[2], scene.cameras[2])
     assert view.opacity.min() == 1
+
+
+def test_a_run_that_was_moved_is_rendered_and_nothing_in_it_changes(tmp_path: Path, standin: None):
+    scene, run = wall.scene(wall.cameras(5, 96, 72), test=(1, 3)), tmp_path / "run"
+    run.mkdir()
+    driver.train("nerfacto", scene, run, Budget(steps=2), 0, CPU, None, lambda step, seconds: None)
+    moved = run.rename(tmp_path / "moved")
+    before = {path: path.stat().st_mtime_ns for path in moved.rglob("*")}
+    with driver.renderer(moved, CPU) as one, driver.renderer(moved, CPU) as other:
+        for render, index in ((one, 1), (other, 3), (one, 3), (other, 1)):
+            looks_like(render(scene.cameras[index]), scene.photographs[index], scene.cameras[index])
+        assert {path: path.stat().st_mtime_ns for path in moved.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in moved.rglob("*")} == before
+    assert not run.exists()
+
+
+def test_two_commands_render_one_run_in_files_of_their_own(scene: Scene, tmp_path: Path, fake: None):
+    driver.train("nerfacto", scene, tmp_path, Budget(steps=3), 0, CPU, None, lambda step, seconds: None)
+    asked, ask = [], driver._Process.ask
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driver._Process, "ask", lambda self, it: asked.append(it["file"]) or ask(self, it))
+        with driver.renderer(tmp_path, CPU) as one, driver.renderer(tmp_path, CPU) as other:
+            one(scene.cameras[0])
+            other(scene.cameras[0])
+    first, second = map(Path, asked)
+    assert first != second
+    assert not first.parent.exists()
+
+
+def test_what_nerfstudio_says_when_it_cannot_render_is_shown(
+    scene: Scene, tmp_path: Path, fake: None, caplog: pytest.LogCaptureFixture
+):
+    driver.train("nerfacto", scene, tmp_path, Budget(steps=3), 0, CPU, None, lambda step, seconds: None)
+    driver.WORKER.write_text("import sys\nsys.exit('no memory is left')")
+    with pytest.raises(RunError, match="read what it says above"), driver.renderer(tmp_path, CPU):
+        pass
+    assert "no memory is left" in caplog.text
 
 
 def with_alpha(scene: Scene) -> Scene:

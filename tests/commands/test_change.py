@@ -6,9 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes_on_disk import PINHOLE, write_colmap
+from scenes_on_disk import survey as posed_photographs
 from surveys_of_two_dates import pair
 
 from tidefield import cli
+from tidefield.addresses import copy_of
+from tidefield.commands.change import _check_scenes, _view_folders
+from tidefield.config import PRESETS
+from tidefield.train.checkpoint import Run, write_run
 
 
 def call(*words: object) -> None:
@@ -229,10 +235,27 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
     monkeypatch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
     assert "none" in told
+    twice = ("--cameras", "ground_textures_0004", "ground_textures_0004.png")
+    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, *twice)
+    assert "twice" in told
     nowhere = ("--scenes", tmp_path / "early", tmp_path / "nowhere")
     told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *nowhere)
     assert "nowhere" in told
     assert not (tmp_path / "new").exists()
+
+
+def test_views_from_photographs_of_one_name_have_folders_of_their_own(tmp_path: Path):
+    names = ["a/IMG_1.JPG", "a/IMG_1.PNG", "a_IMG_1.JPG", "IMG_2.JPG"]
+    assert len(set(_view_folders(names, tmp_path))) == len(names)
+    assert _view_folders(["a/IMG_1.JPG", "IMG_2.JPG"], tmp_path) == [tmp_path / "a_IMG_1", tmp_path / "IMG_2"]
+
+
+def test_the_scenes_of_runs_may_be_at_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_colmap(tmp_path / "flats", posed_photographs(PINHOLE))
+    (tmp_path / "run").mkdir()
+    write_run(tmp_path / "run", Run(copy_of(f"local://{tmp_path}/flats"), None, 0, PRESETS["swift"]))
+    _check_scenes((tmp_path / "run", tmp_path / "run"), (), "cpu")
 
 
 def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(

@@ -170,6 +170,13 @@ def test_users_mistakes_are_one_clear_message(
     assert "holds no run" in fails(capsys, "evaluate", tmp_path)
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
     assert "--opened-width belongs to --zero-shot" in fails(capsys, "evaluate", run, "--opened-width", 400)
+    weights = "--weights", tmp_path / "w.safetensors"
+    for words in (
+        ("evaluate", run),
+        ("evaluate", tmp_path, tmp_path / "new", "--method", "nearest"),
+        ("render", run, tmp_path / "a.png", "--camera", "a"),
+    ):
+        assert "--weights belongs to --zero-shot" in fails(capsys, *words, *weights)
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
     for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):

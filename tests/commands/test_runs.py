@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from networks import SMALL
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
+from tidefield.commands import demo
 from tidefield.commands.evaluate import Evaluate, evaluate
 from tidefield.commands.pretrain import Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
@@ -23,8 +26,10 @@ from tidefield.commands.train import Train, train
 from tidefield.compare.run import read_evaluation
 from tidefield.config import PRESETS, Budget
 from tidefield.errors import RunError
+from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import only_writer
 from tidefield.model.network import make_network
+from tidefield.processes import Ended
 from tidefield.train import checkpoint, pretrain, stream
 from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE, load_network, read_run, write_run, write_weights
 from tidefield.train.loop import SceneTrainer
@@ -97,6 +102,42 @@ def test_a_run_that_replaces_another_and_dies_leaves_nothing_of_it(
     assert read_run(run).id != before.id
     with pytest.raises(RunError, match="--resume"):
         evaluate(Evaluate(run, device="cpu"), QUIET)
+
+
+def test_a_resumed_run_keeps_the_points_of_its_curve_up_to_its_checkpoint(scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    start(scene, run, steps=4, curve=True)
+    before = json.loads((run / CURVE_FILE).read_text())
+    lost = [before[-1][0] + 1e-9, 20.0]  # a moment after the last save
+    (run / CURVE_FILE).write_text(json.dumps([*before, lost]))
+    start(scene, run, steps=8, curve=True, resume=True)
+    after = json.loads((run / CURVE_FILE).read_text())
+    assert after[: len(before)] == before
+    assert lost not in after
+    assert len(after) == len(before) + 1
+
+
+def test_an_interrupted_demonstration_continues_its_training(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(trainer: SceneTrainer, budget: Budget) -> float:
+        made.append(trainer.progress.step)
+        os.kill(os.getpid(), signal.SIGINT)
+        return take_step(trainer, budget)
+
+    take_step, made = SceneTrainer.step, []
+    out, console = tmp_path / "demo", Console(record=True, width=200, file=io.StringIO())
+    monkeypatch.setattr("tidefield.synthetic.write_survey", lambda _, folder: write_colmap(folder, survey(PINHOLE)))
+    monkeypatch.setattr("tidefield.synthetic.make_survey", lambda *_, **__: None)
+    monkeypatch.setattr(demo, "TRAINING_WIDTH", 48)
+    monkeypatch.setattr(demo, "render", lambda *_: None)
+    monkeypatch.setattr(demo, "evaluate", lambda *_: pytest.fail("it was evaluated half-trained"))
+    monkeypatch.setattr(SceneTrainer, "step", step)
+    for _ in range(2):
+        with pytest.raises(Ended):
+            demo.demo(demo.Demo(out, minutes=10.0, device="cpu"), console)
+    assert made == [0, 1]
+    assert "interrupted; the same command continues" in console.export_text()
 
 
 @pytest.mark.parametrize("options", [{}, {"from_scratch": True}])

@@ -312,6 +312,19 @@ def test_nothing_is_drawn_of_nothing(tmp_path: Path):
     assert side_by_side(results, "a", wall.scene(wall.cameras(3), test=(1,))) is None
 
 
+def test_a_wholly_masked_photograph_is_left_out(disk: Path, tmp_path: Path):
+    scene, out = load_scene(disk, width=48), tmp_path / "out"
+    compare({"flats": disk}, ("tidefield",), SETTINGS, out, Children(scene), quiet)
+    file = out / "runs" / "flats" / "tidefield" / "evaluation.json"
+    data = json.loads(file.read_text())
+    names = [scene.names[i] for i in scene.test]
+    for count in (1, len(names)):
+        data["per_photograph"] |= {name: {**data["per_photograph"][name], "psnr": None} for name in names[:count]}
+        write_json(file, data)
+        figure = side_by_side(read_results(out, ["flats"], ["tidefield"]), "flats", scene)
+        assert (figure is None) == (count == len(names))
+
+
 def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_path: Path):
     data, out = tmp_path / "360_v2", tmp_path / "out"
     with pytest.raises(SceneError, match="none of bicycle"):
@@ -332,6 +345,12 @@ def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_pat
             scene = load_scene(scenes[name])
             assert scene.cameras[0].width == whole.cameras[0].width // factor
             assert scene.test == tuple(range(0, len(scene.names), 8))
+    (out / "garden" / "images").unlink()
+    (out / "garden" / "images").symlink_to(tmp_path / "gone")
+    assert load_scene(mipnerf360(data, out)["garden"]).cameras[0].width == whole.cameras[0].width // 4
+    shutil.copytree(data, tmp_path / "other")
+    with pytest.raises(RunError, match=r"garden/images leads to .*360_v2/garden/images_4: expected .*other/garden"):
+        mipnerf360(tmp_path / "other", out)
     shutil.rmtree(data / "room" / "images_2")
     with pytest.raises(SceneError, match="images_2 is not there"):
         mipnerf360(data, out)
@@ -355,6 +374,8 @@ def test_protocols_name_their_scenes(disk: Path, tmp_path: Path, monkeypatch: py
     assert len(made) == 5
     tidal_flats(tmp_path / "scenes", 100, [])
     assert len(made) == 5
+    with pytest.raises(SceneError, match="vegetation has the name of a scene of the protocol"):
+        tidal_flats(tmp_path / "scenes", 100, [disk, tmp_path / "vegetation"])
 
 
 @pytest.mark.parametrize("method", METHODS)

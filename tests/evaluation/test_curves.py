@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,8 @@ from networks import SMALL
 from rich.console import Console
 
 from tidefield.config import Budget
+from tidefield.data.scene import Scene
+from tidefield.errors import SceneError
 from tidefield.evaluation.curves import SHARES, SMALLER, QualityCurve, make_curve
 from tidefield.model.rendering import Rendering
 from tidefield.train.loop import SceneTrainer, train
@@ -75,3 +78,17 @@ def test_masked_pixels_do_not_count():
         colour[:, : colour.shape[1] // 2] = 0
     curve.add(1.0, [Rendering(colour, depth, depth) for colour in wrong_left])
     assert curve.points[0][1] > 50
+
+
+def test_wholly_masked_photographs_are_left_out():
+    scene = wall.scene(wall.cameras(6), (1, 3, 4))
+    nothing = torch.zeros(scene.photographs.colours[0].shape[:2], dtype=torch.bool)
+
+    def masked(*which: int) -> Scene:
+        masks = tuple(nothing if index in which else None for index in range(6))
+        return replace(scene, photographs=replace(scene.photographs, masks=masks))
+
+    curve = make_curve(masked(1, 3))
+    assert [camera.names for camera in curve.cameras] == [(scene.names[4],)]
+    with pytest.raises(SceneError, match=r"wholly masked ones only: expected one for --curve"):
+        make_curve(masked(1, 3, 4))

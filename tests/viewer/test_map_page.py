@@ -135,6 +135,27 @@ def test_the_level_of_detection_hides_smaller_changes_and_the_area_has_the_volum
     assert float(re.search(r"(-[\d.]+) m³", row).group(1)) == pytest.approx(-400 * 0.5 * 0.25, rel=0.05)
 
 
+def test_the_legend_has_the_unit_of_its_layer_and_the_detection_its_step(
+    tmp_path: Path, browser, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Atlas, "_units", lambda _: (1.0, 0.3048, "m", "foot", "heights in feet"))
+    change = write_change(tmp_path / "change", np.full(SHAPE, 0.1, np.float32))
+    with page_of(write_map(tmp_path / "map 2023-05-01", (90, 120, 60)), change) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(page.address)
+        for layer, ends in (
+            ("0.height", r"\d foot$"),
+            ("0.error", r"\d foot$"),
+            ("1.error", r"\d m$"),
+            ("1.change", r"\d m \(red"),
+        ):
+            tab.locator("#left").select_option(layer)
+            assert re.search(ends, tab.locator("#legendends").inner_text())
+        tab.get_by_label("Detection").fill("0.057")
+        assert tab.locator("#detectionvalue").inner_text() == "0.057 m"
+        tab.close()
+
+
 def test_on_a_phone_nothing_leaves_the_screen(tmp_path: Path, browser):
     with page_of(*two_dates(tmp_path)) as page:
         context = browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True)

@@ -155,7 +155,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Names, numbered where two surveys have one."""
+    """Names, numbered where two are the same."""
     return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
 
 
@@ -272,11 +272,11 @@ def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, 
             opened = open_source(path, zero, device, False, console, hold_out=False)
             scene, render, _ = stack.enter_context(opened)
             sites.append(Site.of(scene, render))
-        names = options.cameras or (choose_camera(found, sites[0]),)
+        asked, earlier = options.cameras or (choose_camera(found, sites[0]),), sites[0].scene
+        names = [earlier.names[earlier.index(name)] for name in asked]
         with ProgressBar(console, "Rendering views") as bar:
-            for k, name in enumerate(names):
+            for k, (name, own) in enumerate(zip(names, _view_folders(names, folder / "views"), strict=True)):
                 view = make_view(found, cover, sites[0], sites[1], name, options.view_width)
-                own = folder / "views" / Path(view.name).with_suffix("").as_posix().replace("/", "_")
                 own.mkdir(parents=True)
                 write_views(view, (found.earlier.name, found.later.name), own)
                 made.append(view)
@@ -284,12 +284,19 @@ def _views(options: Change, found: Measured, cover: Cover | None, folder: Path, 
     return made
 
 
+def _view_folders(names: list[str], folder: Path) -> list[Path]:
+    """The folders of views from the cameras of these photographs."""
+    stems = [Path(name).with_suffix("").as_posix().replace("/", "_") for name in names]
+    return [folder / own for own in _distinct(stems)]
+
+
 def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: str) -> None:
     """Find the mistakes that views would find only after everything is measured.
 
     Raises:
-        TidefieldError: a scene cannot be read, has no such photographs, or there is no such device.
+        TidefieldError: a scene cannot be read, has no such photographs, one is named twice, or there is no such device.
     """
+    from tidefield.addresses import pull
     from tidefield.data.load import read_posed
     from tidefield.device import choose_device
     from tidefield.geometry.cameras import find_name
@@ -297,9 +304,12 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
 
     choose_device(device)
     roots = [read_run(path).scene if (path / RUN_FILE).exists() else path for path in scenes]
+    for root in roots:
+        pull(root)
     earlier, _ = (read_posed(root, allow_missing=False) for root in roots)
-    for name in cameras:
-        find_name(name, earlier.names, str(roots[0]))
+    found = [find_name(name, earlier.names, str(roots[0])) for name in cameras]
+    if len(set(found)) < len(found):
+        raise RunError("--cameras names a photograph twice: expected each once; leave one out")
 
 
 def _check(options: Change) -> None:
@@ -315,8 +325,6 @@ def _check(options: Change) -> None:
     for name, value in given.items():
         if options.series and value is not None:
             raise RunError(f"{name} was given with --series: it belongs to two surveys; leave it out")
-    if len(set(options.cameras)) < len(options.cameras):
-        raise RunError("--cameras names a photograph twice: expected each once; leave one out")
     if not 64 <= options.view_width <= 8192:
         raise RunError(f"--view-width {options.view_width} was asked for: expected 64 to 8192 pixels; choose another")
     for level in (*(options.water or ()), *options.levels):

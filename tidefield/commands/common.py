@@ -76,6 +76,19 @@ class ZeroShot:
     weights: Path | None = None
     """Its weights, of `tidefield pretrain`; the installed ones if not given."""
 
+    def checked(self) -> ZeroShot:
+        """These options.
+
+        Raises:
+            RunError: weights are given that nothing would use.
+        """
+        if self.weights is not None and not self.zero_shot:
+            raise RunError(
+                "--weights belongs to --zero-shot: runs have their own, and other methods none; add --zero-shot, or "
+                "leave --weights out"
+            )
+        return self
+
 
 @dataclass(frozen=True)
 class Footprint:
@@ -128,8 +141,11 @@ def open_source(
     """The scene and the method of a scene with trained weights, or of a run, while the block lasts, and its record.
 
     Without `hold_out` all photographs are sources, as for products.
+
+    Raises:
+        RunError: weights are given, but not for a scene without training.
     """
-    if zero.zero_shot:
+    if zero.checked().zero_shot:
         scene = load(source, None, allow_missing, console, hold_out)
         yield scene, *open_zero_shot(zero, scene, device, sampling)
     else:

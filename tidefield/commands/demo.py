@@ -74,10 +74,10 @@ def demo(options: Demo, console: Console) -> None:
         with made.making():  # the picture is the last of its three files
             render(replace(view, overwrite="first-view_depth.npy" in made.files), console)
     with made.making():
-        if not (run / CHECKPOINT_FILE).exists():
-            budget = Budget(options.minutes)
-            train(Train(scene, run, budget=budget, width=TRAINING_WIDTH, device=device, overwrite=True), console)
         if not (run / "evaluation.json").exists():
+            budget, resume = Budget(options.minutes), (run / CHECKPOINT_FILE).exists()
+            training = Train(scene, run, budget=budget, width=TRAINING_WIDTH, device=device)
+            train(replace(training, resume=resume, overwrite=not resume), console, "the same command")
             evaluate(Evaluate(run, device=device), console)
         if not video.exists():
             if not path.exists():

@@ -67,7 +67,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
 
     if options.download_lpips:
         download_lpips_weights()
-    source, out, method, zero_shot = options.source, options.out, options.method, options.zero.zero_shot
+    source, out, method, zero_shot = options.source, options.out, options.method, options.zero.checked().zero_shot
     sampling = options.footprint.sampling
     settings = {"overwrite": options.overwrite, "console": console}
     if method is not None and zero_shot:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+AGAIN = "the same command with --resume"
+
 
 @dataclass(frozen=True)
 class Train:
@@ -72,8 +74,8 @@ class Train:
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
-def train(options: Train, console: Console) -> None:
-    """Run `tidefield train`."""
+def train(options: Train, console: Console, again: str = AGAIN) -> None:
+    """Run `tidefield train`; `again` says what continues a training that is interrupted."""
     from tidefield.evaluation.curves import CURVE_FILE
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
@@ -82,10 +84,10 @@ def train(options: Train, console: Console) -> None:
         raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     with only_writer(folder):
         delete_partials(*(folder / name for name in (RUN_FILE, CHECKPOINT_FILE, CURVE_FILE)))
-        _train(options, console)
+        _train(options, console, again)
 
 
-def _train(options: Train, console: Console) -> None:
+def _train(options: Train, console: Console, again: str) -> None:
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
     from tidefield.progress import ProgressBar
@@ -114,8 +116,6 @@ def _train(options: Train, console: Console) -> None:
     scene = load(run.scene, run.width, options.allow_missing, console)
     if not scene.train:
         raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
-    if options.curve and not scene.test:
-        raise SceneError(f"{options.scene} holds no photograph out: expected one for --curve; leave --curve out")
     if options.view and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
         raise RunError(f"{run.config.method} trains in a program of its own: --view shows our methods; leave it out")
     curve = make_curve(scene) if options.curve else None
@@ -141,6 +141,8 @@ def _train(options: Train, console: Console) -> None:
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
             trainer.resume(folder)
+            if curve is not None:
+                curve.resume(folder, trainer.progress.seconds)
         else:
             _start(folder, run, scene)
         used = budget.share(trainer.progress.step, trainer.progress.seconds)
@@ -153,7 +155,7 @@ def _train(options: Train, console: Console) -> None:
                 console.print(f"{page.page.address} shows it", highlight=False, soft_wrap=True)
                 callback = _both(callback, page)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
-    report_end(progress, stopped, folder, console)
+    report_end(progress, stopped, folder, console, again)
 
 
 def _both(first: Callback | None, second: Callback) -> Callback:
@@ -168,11 +170,13 @@ def _both(first: Callback | None, second: Callback) -> Callback:
     return call
 
 
-def report_end(progress: TrainingProgress, stopped: int | None, folder: Path, console: Console) -> None:
+def report_end(
+    progress: TrainingProgress, stopped: int | None, folder: Path, console: Console, again: str = AGAIN
+) -> None:
     """Print what was done; a training that a signal stopped ends its command as the signal does."""
     console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
     if stopped is not None:
-        console.print("interrupted; the same command with --resume continues")
+        console.print(f"interrupted; {again} continues")
         raise Ended(stopped)
 
 

@@ -26,16 +26,19 @@ _COLOURS = ((214, 39, 40), (31, 119, 180))
 
 
 def side_by_side(results: Results, name: str, scene: Scene) -> Image.Image | None:
-    """Ground truth and every method on one held-out photograph; None where no method has been there.
+    """Ground truth and every method on one held-out photograph; None where no method has been there, or all is masked.
 
-    The photograph is the one whose PSNR is the middle one of the first method's. Crops are where methods differ most
-    about what at least two training photographs see: what none sees can only be guessed.
+    The photograph is the one whose PSNR is the middle one of the first method's; wholly masked ones have none. Crops
+    are where methods differ most about what at least two training photographs see: what none sees can only be guessed.
     """
     methods = [method for method in results.methods if (name, method) in results.by]
     if not methods:
         return None
     photographs = results.by[name, methods[0]].evaluation["per_photograph"]
-    ranked = sorted(photographs, key=lambda photograph: photographs[photograph]["psnr"])
+    measured = [photograph for photograph, one in photographs.items() if one["psnr"] is not None]
+    if not measured:
+        return None
+    ranked = sorted(measured, key=lambda photograph: photographs[photograph]["psnr"])
     chosen = ranked[len(ranked) // 2]
     index = scene.index(chosen)
     truth = scene.photographs[index].numpy()

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tidefield.compare.run import RUNS, read_evaluation, read_process
-from tidefield.errors import RunError
-from tidefield.evaluation.curves import CURVE_FILE
+from tidefield.evaluation.curves import read_curve
 from tidefield.files import read_json
 
 
@@ -70,15 +69,8 @@ def read_results(out: Path, scenes: Sequence[str], methods: Sequence[str]) -> Re
             folder = out / RUNS / scene / method
             evaluation = read_evaluation(folder)
             if evaluation is not None:
-                found[scene, method] = Result(evaluation, read_process(folder), _curve(folder / CURVE_FILE), folder)
+                found[scene, method] = Result(evaluation, read_process(folder), read_curve(folder), folder)
     return Results(tuple(scenes), tuple(methods), found)
-
-
-def _curve(path: Path) -> list[tuple[float, float]]:
-    try:
-        return [(float(x), float(y)) for x, y in read_json(path) or ()]
-    except (TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{path} is damaged: expected what this program wrote; delete it and repeat") from error
 
 
 def figures_of(results: Results) -> list[dict[str, Any]]:

@@ -96,6 +96,7 @@ def mipnerf360(folder: Path, out: Path) -> dict[str, Path]:
 
     Raises:
         SceneError: none of them is there, or one has no photographs of that size.
+        RunError: `out` has links to another data set.
     """
     there = [name for name in MIPNERF360 if (folder / name / "sparse").is_dir()]
     if not there:
@@ -109,22 +110,47 @@ def mipnerf360(folder: Path, out: Path) -> dict[str, Path]:
             raise SceneError(f"{photographs} is not there: expected the photographs as published; unpack them all")
         (out / name).mkdir(parents=True, exist_ok=True)
         for link, target in (("images", photographs), ("sparse", folder / name / "sparse")):
-            if not (out / name / link).is_symlink():
-                (out / name / link).symlink_to(target.resolve(), target_is_directory=True)
+            _make_link(out / name / link, target.resolve())
     return {name: out / name for name in there}
 
 
+def _make_link(link: Path, target: Path) -> None:
+    """Make a link to a folder unless it is there; one that leads nowhere is replaced.
+
+    Raises:
+        RunError: it leads to another folder.
+    """
+    if link.is_symlink() and not link.exists():
+        link.unlink()
+    if not link.is_symlink():
+        link.symlink_to(target, target_is_directory=True)
+    elif link.resolve() != target:
+        raise RunError(
+            f"{link} leads to {link.resolve()}: expected {target}, of the data set that is named; name another folder "
+            "with --out"
+        )
+
+
 def tidal_flats(folder: Path, width: int, real: Sequence[Path]) -> dict[str, Path]:
-    """The five synthetic categories, made in `folder` unless they are there, and real surveys, by name."""
+    """The five synthetic categories, made in `folder` unless they are there, and real surveys, by name.
+
+    Raises:
+        SceneError: two scenes have the same name.
+    """
     from tidefield.synthetic import CATEGORIES, make_survey, write_survey
 
-    scenes = {}
+    surveys, scenes = named(real), {}
+    for category in surveys.keys() & set(CATEGORIES):
+        raise SceneError(
+            f"{surveys[category]} has the name of a scene of the protocol: expected another than "
+            f"{', '.join(CATEGORIES)}; rename or link it"
+        )
     for category in CATEGORIES:
         scenes[category] = scene = folder / f"{category}-{width}"
         if not scene.exists():
             with completed_folder(scene) as partial:
                 write_survey(make_survey(category, seed=11, views=40, width=width), partial)
-    return scenes | named(real)
+    return scenes | surveys
 
 
 def named(scenes: Sequence[Path]) -> dict[str, Path]:
@@ -371,7 +397,7 @@ def _is_evaluation(data: Any) -> bool:
     reasons, weights = mean.pop("reasons", {}), data.get("lpips_weights", {})
     optional = [*mean.values(), *(trained.get(name) for name in ("steps", "seconds"))]
     numbers = [data["rays_per_second"], data["seconds_per_frame"], *(x for x in optional if x is not None)]
-    numbers += [one["psnr"] for one in data["per_photograph"].values()]
+    numbers += [one["psnr"] for one in data["per_photograph"].values() if one["psnr"] is not None]
     texts = [*reasons.values(), *weights.values()]
     are_whole = bool(data["per_photograph"]) and set(weights) <= set(mean)
     return are_whole and all(_is_number(x) for x in numbers) and all(isinstance(x, str) for x in texts)

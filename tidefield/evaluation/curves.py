@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.scene import Scene
+from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.metrics import psnr
-from tidefield.files import write_json
+from tidefield.files import read_json, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering, to_8_bit
 
@@ -40,7 +41,7 @@ class QualityCurve:
     """Views to render while a method trains, and their PSNR so far."""
 
     cameras: tuple[Cameras, ...]
-    """Of the first held-out photograph and of the middle one, at a smaller size."""
+    """Of the first held-out photograph and of the middle one, at a smaller size; wholly masked ones do not count."""
     truths: tuple[UInt8[Tensor, "_ _ 3"], ...]
     """The photographs, as means over the pixels' areas."""
     used: tuple[Bool[Tensor, "_ _"], ...]
@@ -52,6 +53,10 @@ class QualityCurve:
         """Add the point of one round of renderings."""
         views = zip(renderings, self.truths, self.used, strict=True)
         self.points.append((seconds, fmean(psnr(to_8_bit(view.colour), *truth) for view, *truth in views)))
+
+    def resume(self, folder: Path, seconds: float) -> None:
+        """Keep the points of RUN/curve.json that are of the first seconds of training."""
+        self.points = [point for point in read_curve(folder) if point[0] <= seconds]
 
     def watch(self, folder: Path, used: float) -> Callable[[TrainerLike, float], None]:
         """Return a callback of (trainer, share of the budget) that adds and writes a point at each of `SHARES`.
@@ -73,16 +78,49 @@ class QualityCurve:
         write_json(folder / CURVE_FILE, self.points)
 
 
+def read_curve(folder: Path) -> list[tuple[float, float]]:
+    """Read the points of RUN/curve.json; none where there is no such file.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    path = folder / CURVE_FILE
+    try:
+        return [(float(x), float(y)) for x, y in read_json(path) or ()]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise RunError(f"{path} is damaged: expected what this program wrote; delete it and repeat") from error
+
+
 def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
-    """Make the curve of a scene that holds photographs out, with views `smaller` times as small as these."""
+    """Make the curve of a scene that holds photographs out, with views `smaller` times as small as these.
+
+    Raises:
+        SceneError: the scene holds no photograph out, or wholly masked ones only.
+    """
+    masked = bool(scene.photographs.masks)
+    test = [index for index in scene.test if not masked or _used(scene, index, _small(scene, index, smaller)).any()]
+    if not test:
+        raise SceneError(
+            f"{scene.root} holds no photograph out, or wholly masked ones only: expected one for --curve; leave "
+            "--curve out"
+        )
     cameras, truths, used = [], [], []
-    for index in sorted({scene.test[0], scene.test[len(scene.test) // 2]}):
-        camera = scene.cameras[index]
-        small = camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
+    for index in sorted({test[0], test[len(test) // 2]}):
+        small = _small(scene, index, smaller)
         photograph = scene.photographs[index].permute(2, 0, 1)[None].float()
         mean = F.interpolate(photograph, size=(small.height, small.width), mode="area")
         cameras.append(small)
         truths.append(mean[0].permute(1, 2, 0).round().to(torch.uint8))
-        share = scene.photographs.used(index)[None, None].float()
-        used.append(F.interpolate(share, size=(small.height, small.width), mode="area")[0, 0] == 1)
+        used.append(_used(scene, index, small))
     return QualityCurve(tuple(cameras), tuple(truths), tuple(used))
+
+
+def _small(scene: Scene, index: int, smaller: int) -> Cameras:
+    camera = scene.cameras[index]
+    return camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
+
+
+def _used(scene: Scene, index: int, small: Cameras) -> Bool[Tensor, "h w"]:
+    """Pixels of a smaller photograph that hold no masked one."""
+    share = scene.photographs.used(index)[None, None].float()
+    return F.interpolate(share, size=(small.height, small.width), mode="area")[0, 0] == 1

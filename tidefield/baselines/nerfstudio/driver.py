@@ -1,18 +1,21 @@
 """Train and render with nerfstudio's methods: write it a scene, and be the other end of `worker.py`'s lines.
 
-RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio writes, RUN/job.json its job.
+RUN/data/ is the scene as nerfstudio reads it, RUN/nerfstudio/ what nerfstudio writes, RUN/job.json its job. Rendering
+changes nothing in RUN.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import logging
 import os
 import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -36,12 +39,16 @@ from tidefield.model.rendering import Render, Rendering
 from tidefield.processes import end_with_parent
 from tidefield.train.checkpoint import TrainingProgress
 
+log = logging.getLogger(__name__)
+
 NerfstudioMethod = Literal["nerfacto", "splatfacto"]
 LOG_FILE, DATA, CURVE = "nerfstudio.log", "data", "curve"
 KEEP_LARGE_ALLOCATIONS = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
 """What `tidefield.machine.tune_process` does for us, as glibc takes it from the environment."""
 END_SECONDS = 30
 """Time limit for a worker that renders to end."""
+SAID_LINES = 20
+"""Of what a worker said before it failed to render, which are shown."""
 _BACKGROUND = tuple[(Annotated[float, Range(0, 1)],) * 3]
 """Type of the colour behind objects in job.json."""
 
@@ -64,7 +71,6 @@ def delete_training(folder: Path) -> None:
     names = (
         JOB_FILE,
         LOG_FILE,
-        "rendering.npz",
         f"{DATA}/transforms.json",
         f"{DATA}/*.ply",
         f"{DATA}/images/?????.png",
@@ -103,8 +109,6 @@ def train(
     seconds = None if budget.minutes is None else 60 * budget.minutes
     job = {
         "method": method,
-        "data": str((folder / DATA).resolve()),
-        "out": str(folder.resolve()),
         "steps": budget.steps,
         "seconds": seconds,
         "seed": seed,
@@ -117,7 +121,7 @@ def train(
     }
     write_json(folder / JOB_FILE, job)
     last: dict[str, Any] = {}
-    with _worker("train", folder, device) as worker:
+    with _worker(["train", folder / JOB_FILE], folder / LOG_FILE, device) as worker:
         for last in worker.lines():
             if "curve" in last and curve is not None:
                 files = [folder / name for name in last["curve"]]
@@ -162,12 +166,14 @@ def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
         RunError: nerfstudio is not installed, or fails.
     """
     colours = _read_job(folder)[1]
-    with _worker("render", folder, device) as worker:
+    with ExitStack() as stack:
+        own = Path(stack.enter_context(TemporaryDirectory()))
+        file = own / "rendering.npz"
+        worker = stack.enter_context(_worker(["render", folder / JOB_FILE, own], own / LOG_FILE, device))
         worker.answer()  # once it has loaded
 
         def render(camera: Cameras) -> Rendering:
-            file = folder / "rendering.npz"
-            worker.ask({**camera_to_json(camera), "file": str(file.resolve())})
+            worker.ask({**camera_to_json(camera), "file": str(file)})
             return read_rendering(file, camera, colours)
 
         yield render
@@ -187,8 +193,8 @@ def read_rendering(file: Path, camera: Cameras, colours: Colours) -> Rendering:
 class _Process:
     """The worker's lines."""
 
-    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
-        self.process, self.folder = process, folder
+    def __init__(self, process: subprocess.Popen[str], log_file: Path) -> None:
+        self.process, self.log_file = process, log_file
 
     def lines(self) -> Iterator[dict[str, Any]]:
         assert self.process.stdout is not None
@@ -198,7 +204,9 @@ class _Process:
     def answer(self) -> dict[str, Any]:
         found = next(self.lines(), None)
         if found is None:
-            raise failure("nerfstudio", self.folder / LOG_FILE, "train and render")
+            said = self.log_file.read_text(encoding="utf-8", errors="replace").splitlines()
+            log.error("\n".join(said[-SAID_LINES:]))
+            raise RunError("nerfstudio ended before it was done: expected it to render; read what it says above")
         return found
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
@@ -209,27 +217,27 @@ class _Process:
 
 
 @contextmanager
-def _worker(kind: Literal["train", "render"], folder: Path, device: torch.device) -> Iterator[_Process]:
-    command = [str(python()), str(WORKER), kind, str(folder / JOB_FILE)]
-    with (folder / LOG_FILE).open("a", encoding="utf-8") as log:
+def _worker(words: Sequence[str | Path], log_file: Path, device: torch.device) -> Iterator[_Process]:
+    command = [str(python()), str(WORKER), *map(str, words)]
+    with log_file.open("a", encoding="utf-8") as said:
         process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=log,
+            stderr=said,
             text=True,
             env=_environment(device),
             preexec_fn=end_with_parent,
         )
         try:
-            yield _Process(process, folder)
+            yield _Process(process, log_file)
         finally:
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None, "both are asked for"
                 pipe.close()
             try:
                 # With its input at its end it stops, and stops the processes that nerfstudio has started.
-                process.wait(timeout=END_SECONDS if kind == "render" else None)
+                process.wait(timeout=END_SECONDS if words[0] == "render" else None)
             except subprocess.TimeoutExpired:
                 process.terminate()
                 process.wait()

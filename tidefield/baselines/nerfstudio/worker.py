@@ -1,8 +1,9 @@
 """Train one of nerfstudio's methods, or render with it: runs in nerfstudio's own environment.
 
-Imports nothing of Tidefield. `worker.py train JOB.json`, `worker.py render JOB.json`, or `worker.py check` to test
-whether all is installed. The parent writes the job (see `tidefield.baselines.nerfstudio.driver`), and this program
-prints nothing to standard output but its answers, one JSON object a line.
+Imports nothing of Tidefield. `worker.py train RUN/job.json`, `worker.py render RUN/job.json FOLDER`, where nerfstudio
+writes to another folder than the run's, or `worker.py check` to test whether all is installed. The parent writes the
+job (see `tidefield.baselines.nerfstudio.driver`), and this program prints nothing to standard output but its answers,
+one JSON object a line.
 """
 
 from __future__ import annotations
@@ -57,6 +58,17 @@ class Unused(torch.nn.Module):
 
 class TimeIsUp(Exception):
     """The budget is used."""
+
+
+def read_job(file: Path, out: Path | None = None) -> dict[str, Any]:
+    """Read a job, whose run may have been moved since it was written: it is the folder that the file is in now.
+
+    Args:
+        out: where nerfstudio writes to; the run's folder if not given.
+    """
+    run = file.parent.resolve()
+    places = {"run": str(run), "data": str(run / "data"), "out": str(out or run)}
+    return json.loads(file.read_text(encoding="utf-8")) | places
 
 
 def answer(**values: Any) -> None:
@@ -253,7 +265,7 @@ class ModelCamera:
 
 def render(job: dict[str, Any]) -> None:
     """Load a checkpoint, then render every camera that comes in, one JSON object a line."""
-    trainer = make_trainer(job, Path(job["out"]) / job["checkpoint"])
+    trainer = make_trainer(job, Path(job["run"]) / job["checkpoint"])
     answer(ready=True)
     for line in sys.stdin:
         camera = json.loads(line)
@@ -268,8 +280,8 @@ def check(_: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    kind, *files = sys.argv[1:]
-    job = json.loads(Path(files[0]).read_text(encoding="utf-8")) if files else {}
+    kind, *paths = sys.argv[1:]
+    job = read_job(*map(Path, paths)) if paths else {}
     load_only_weights()
     without_compiled_torchvision()
     import torchmetrics.image.lpip
