@@ -389,7 +389,7 @@ def scales(
     """Quality and time at several widths: read at points, by cones, and with several rays (hours); write the page.
 
     Args:
-        sources: Runs, or scenes for the trained weights.
+        sources: Runs, or scenes for the trained weights, such as those of `python -m benchmarks flight --scene`.
         runs: Store the figures in this folder's scales.json, after each; a repeated command continues.
         widths: Of the pictures in pixels.
         width: That scenes are opened at; a run has its own.
