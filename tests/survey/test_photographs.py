@@ -206,10 +206,21 @@ def test_masks_may_lie_elsewhere_or_among_the_photographs(tmp_path: Path):
     assert "1 of the photographs have masks" in survey.remarks[0]
 
 
+def test_a_mask_may_have_the_stem_of_its_photograph(tmp_path: Path):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photograph(tmp_path / "card" / name)
+    size = read_survey(tmp_path / "card").photographs[0].width, read_survey(tmp_path / "card").photographs[0].height
+    for name in ("a.png", "c.png", "c.jpg.png"):
+        mask(tmp_path / "card" / "masks" / name, size)
+    survey = read_survey(tmp_path / "card")
+    found = {p.name: p.mask.name if p.mask else None for p in survey.photographs}
+    assert found == {"a.jpg": "a.png", "b.jpg": None, "c.jpg": "c.jpg.png"}
+
+
 def test_masks_that_do_not_fit_are_errors(tmp_path: Path):
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         photograph(tmp_path / "card" / name)
-    mask(tmp_path / "other" / "a.png")
+    mask(tmp_path / "other" / "d.png")
     with pytest.raises(SurveyError, match=r"has no mask of any photograph in .*: expected a PNG .*such as a.jpg.png"):
         read_survey(tmp_path / "card", masks=tmp_path / "other")
     mask(tmp_path / "card" / "masks" / "a.jpg.png", (7, 5))

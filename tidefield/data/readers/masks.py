@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -13,6 +13,13 @@ from tidefield.data.readers.llff import SUFFIXES
 from tidefield.errors import SceneError, list_names
 
 _log = logging.getLogger(__name__)
+
+
+def mask_names(photographs: Iterable[Path]) -> dict[Path, list[Path]]:
+    """The names that the mask of each photograph may have, the better one first."""
+    names = {p: [p.with_name(f"{p.name}.png"), p.with_suffix(".png")] for p in {*photographs}}
+    fitting = Counter(name for both in names.values() for name in {*both})
+    return {p: [own] + [by_stem] * (fitting[by_stem] == 1) for p, (own, by_stem) in names.items()}
 
 
 def masks_beside(
@@ -44,7 +51,7 @@ def masks_beside(
         # Photographs without a pose, which only the files tell of, may have masks, too.
         parents = {picture.parent for picture in pictures}
         known = {*photographs}.union(*(_photographs(home, parent) for home, parent in product(images, parents)))
-        candidates = _candidates(known)
+        candidates = mask_names(known)
         strange = pictures.difference(*candidates.values())
         if strange:
             _report(folder, strange, pictures, example=candidates[photographs[present[0]]][0])
@@ -55,13 +62,6 @@ def masks_beside(
         if any(found):
             return tuple(found)
     return ()
-
-
-def _candidates(photographs: set[Path]) -> dict[Path, list[Path]]:
-    """The names that the mask of each photograph may have, the better one first."""
-    names = {p: [p.with_name(f"{p.name}.png"), p.with_suffix(".png")] for p in photographs}
-    fitting = Counter(name for both in names.values() for name in {*both})
-    return {p: [own] + [by_stem] * (fitting[by_stem] == 1) for p, (own, by_stem) in names.items()}
 
 
 def _is_picture(path: Path) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from PIL import ExifTags
 
 from tidefield.data.pictures import check_mask
+from tidefield.data.readers.masks import mask_names
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control
@@ -218,11 +219,13 @@ def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -
         SurveyError: there is no mask where they were asked for.
     """
     home = masks or folder / MASKS
-    candidates = {path: home / f"{path.relative_to(folder)}.png" for path in photographs}
-    found = {path: mask for path, mask in candidates.items() if mask.is_file()}
+    names = mask_names(path.relative_to(folder) for path in photographs)
+    candidates = {path: [home / name for name in names[path.relative_to(folder)]] for path in photographs}
+    masked = {path: next(filter(Path.is_file, own), None) for path, own in candidates.items()}
+    found = {path: mask for path, mask in masked.items() if mask is not None}
     count = len([path for path in photographs if path not in set(found.values())])
     if masks is not None and not found:
-        example = next(iter(candidates.values())).relative_to(home).as_posix()
+        example = next(iter(candidates.values()))[0].relative_to(home).as_posix()
         raise SurveyError(
             f"{masks} has no mask of any photograph in {folder}: expected a PNG called like its photograph, such as "
             f"{example}, that is black where the photograph is not to be used; give the folder of the masks, or leave "
