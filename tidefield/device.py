@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from threading import Lock
@@ -73,3 +74,12 @@ def _cpu_gains_by_bfloat16() -> bool:
                 if number:
                     least[dtype] = min(least[dtype], perf_counter() - began)
     return least[torch.bfloat16] < least[torch.float32]
+
+
+def environment_of(device: torch.device) -> dict[str, str]:
+    """This process's environment, for a program that takes the first GPU that it sees: of several, this device only."""
+    environment = dict(os.environ)
+    if device.index is not None:
+        visible = [one for one in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if one]
+        environment["CUDA_VISIBLE_DEVICES"] = visible[device.index] if visible else str(device.index)
+    return environment

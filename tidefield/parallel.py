@@ -74,8 +74,8 @@ def read_ahead(read: Callable[[K], T], keys: Sequence[K], device: torch.device |
         yield read
         return
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        begun = {key: pool.submit(read, key) for key in keys}
-        yield lambda key: begun.pop(key).result() if key in begun else read(key)
+        pending = {key: pool.submit(read, key) for key in keys}
+        yield lambda key: pending.pop(key).result() if key in pending else read(key)
 
 
 @contextmanager

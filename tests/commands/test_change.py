@@ -133,11 +133,11 @@ def test_a_cloud_and_a_surface_are_not_compared(
 ):
     early = compared[0].parent / "early_0.tif"
     (tmp_path / "late.laz").write_bytes(b"LASF")
-    told = fails(capsys, monkeypatch, "change", early, tmp_path / "late.laz", tmp_path / "new")
-    assert "two surfaces or two clouds" in told
+    message = fails(capsys, monkeypatch, "change", early, tmp_path / "late.laz", tmp_path / "new")
+    assert "two surfaces or two clouds" in message
     (tmp_path / "early.laz").write_bytes(b"LASF" + bytes(300))
-    told = fails(capsys, monkeypatch, "change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "new")
-    assert "cannot be read as a point cloud" in told
+    message = fails(capsys, monkeypatch, "change", tmp_path / "early.laz", tmp_path / "late.laz", tmp_path / "new")
+    assert "cannot be read as a point cloud" in message
 
 
 def test_mistakes_are_told_in_one_message(
@@ -229,18 +229,18 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
     ]
     assert errors[0] < 0.95 * min(errors[1:])
     assert "The same place then and now" in (tmp_path / "out" / "change.html").read_text()
-    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
-    assert "--scenes" in told
+    message = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "--cameras", "a")
+    assert "--scenes" in message
     # Mistakes about views are found before anything is measured.
     monkeypatch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
-    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
-    assert "none" in told
+    message = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, "--cameras", "none")
+    assert "none" in message
     twice = ("--cameras", "ground_textures_0004", "ground_textures_0004.png")
-    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, *twice)
-    assert "twice" in told
+    message = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *scenes, *twice)
+    assert "twice" in message
     nowhere = ("--scenes", tmp_path / "early", tmp_path / "nowhere")
-    told = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *nowhere)
-    assert "nowhere" in told
+    message = fails(capsys, monkeypatch, "change", *surfaces, tmp_path / "new", "-q", *nowhere)
+    assert "nowhere" in message
     assert not (tmp_path / "new").exists()
 
 
@@ -297,7 +297,7 @@ def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_fir
     for link in ("step_1/change.html", "step_2/change.html"):
         assert link in page
         assert (out / link).is_file()
-    told = fails(capsys, monkeypatch, "change", names[0], names[2], tmp_path / "new", "--series", names[1], "-q")
-    assert "order of time" in told or "earlier survey first" in told
-    told = fails(capsys, monkeypatch, "change", *names[:2], tmp_path / "new", "--series", names[2], "--water", 0, 0)
-    assert "two surveys" in told
+    message = fails(capsys, monkeypatch, "change", names[0], names[2], tmp_path / "new", "--series", names[1], "-q")
+    assert "order of time" in message or "earlier survey first" in message
+    message = fails(capsys, monkeypatch, "change", *names[:2], tmp_path / "new", "--series", names[2], "--water", 0, 0)
+    assert "two surveys" in message

@@ -41,6 +41,7 @@ from tidefield.baselines.splats import Splats, read_splats, render_splats
 from tidefield.config import Budget
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
+from tidefield.device import environment_of
 from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.curves import SHARES, QualityCurve
 from tidefield.files import delete_files, write_json
@@ -232,10 +233,6 @@ def _keep_saves(saves: list[_Save], found: dict[int, Path], seconds: float, due:
 @contextmanager
 def _running(program: Path, words: list[str], device: torch.device) -> Iterator[subprocess.Popen[str]]:
     """OpenSplat, ended with the block."""
-    environment = dict(os.environ)
-    if device.index is not None:  # it takes the first that it sees
-        visible = [one for one in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if one]
-        environment["CUDA_VISIBLE_DEVICES"] = visible[device.index] if visible else str(device.index)
     process = subprocess.Popen(
         [program, *words],
         stdin=subprocess.DEVNULL,
@@ -243,7 +240,7 @@ def _running(program: Path, words: list[str], device: torch.device) -> Iterator[
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        env=environment,
+        env=environment_of(device),
         preexec_fn=end_with_parent,
     )
     assert process.stdout is not None, "it is asked for"

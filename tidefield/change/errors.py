@@ -254,6 +254,8 @@ def _pieces(values: np.ndarray) -> list[np.ndarray]:
         return int(np.isfinite(piece).sum())
 
     spread = pieces(_SPREAD)
+    if sum(map(known, spread)) >= sum(piece.size for piece in spread) / 2:
+        return spread  # no others hold more than twice as much
     fullest = sorted(pieces(max(values.shape)), key=known, reverse=True)[: _SPREAD**2]
     return spread if sum(map(known, spread)) >= sum(map(known, fullest)) / 2 else fullest
 

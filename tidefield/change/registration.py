@@ -65,8 +65,7 @@ class Registration:
     def plane(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """What was subtracted, for some rows of a grid."""
         x, y = offsets(grid, self.centre_m, rows)
-        c, gx, gy = self.coefficients
-        return (c + gx * x[None] + gy * y[:, None]).astype(np.float32)
+        return self._lift(x[None], y[:, None]).astype(np.float32)
 
     def deviation(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of the systematic error of each cell, for some rows of a grid."""
@@ -85,8 +84,10 @@ class Registration:
 
     def lift_at(self, xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, " N"]:
         """What is taken from the later heights at places in the grid's system, metres."""
+        return self._lift(*(xy - self.centre_m).T)
+
+    def _lift(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         c, gx, gy = self.coefficients
-        x, y = (xy - self.centre_m).T
         return c + gx * x + gy * y
 
     def _deviation(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:

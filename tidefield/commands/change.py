@@ -71,10 +71,10 @@ class Change:
     windows: tuple[int, ...] = (5, 11, 21)
     """Cells along each side of the windows in which change is tested, odd numbers."""
     water: tuple[float, float] | None = None
-    """Heights of the water at both dates, in the earlier survey's heights and their unit: how far the waterline moved
-    is told."""
+    """Heights of the water at both dates, in the earlier survey's heights and their unit, for how far the waterline
+    moved."""
     levels: tuple[float, ...] = ()
-    """Heights, likewise: the ground below each is told at both dates."""
+    """Heights, likewise, for the area of the ground below each at both dates."""
     m3c2: bool = False
     """Measure M3C2 distances between the clouds of two folders, too; between two clouds they are always measured."""
     scenes: tuple[Path, Path] | None = None

@@ -26,12 +26,8 @@ def estimate_near_far(
     """
     if points is None:
         return _from_cameras(T_world_camera)
-    ranges = ranges_of_points(T_world_camera, pinholes, points)
-    valid = np.isfinite(ranges[:, 0])
-    if not valid.any():
-        return _from_cameras(T_world_camera)
-    ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
-    return ranges
+    ranges = with_widest(ranges_of_points(T_world_camera, pinholes, points))
+    return _from_cameras(T_world_camera) if ranges is None else ranges
 
 
 def ranges_of_points(
@@ -49,6 +45,15 @@ def ranges_of_points(
             nearest, farthest = np.percentile(depth, [1, 99])
             ranges[i] = _NEAREST * nearest, _FARTHEST * farthest
     return ranges
+
+
+def with_widest(ranges: Float64[np.ndarray, "V 2"]) -> Float64[np.ndarray, "V 2"] | None:
+    """Give cameras without a range (NaN) the widest of any; None where none has one."""
+    valid = np.isfinite(ranges[:, 0])
+    if not valid.any():
+        return None
+    widest = ranges[valid, 0].min(), ranges[valid, 1].max()
+    return np.where(valid[:, None], ranges, widest)
 
 
 def _from_cameras(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> Float64[np.ndarray, "V 2"]:

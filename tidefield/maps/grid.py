@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError
 from tidefield.data.georeference import Georeference
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.geometry.geodesy import LocalFrame, in_metres, parse_crs
+from tidefield.geometry.geodesy import LocalFrame, horizontal, in_metres, parse_crs
 from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
@@ -126,16 +126,16 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
             )
         return MapFrame(None, origin, _upright(scene), LOCAL_WKT, LOCAL_WKT, "local, without a datum")
     system = parse_crs(frame.crs)
-    horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
+    plan = horizontal(system)
     vertical = system.sub_crs_list[1] if system.is_compound else _vertical(frame.vertical_datum, heights)
-    metre = 1 / horizontal.axis_info[0].unit_conversion_factor
+    metre = 1 / plan.axis_info[0].unit_conversion_factor
     metre_up = 1 / vertical.axis_info[0].unit_conversion_factor if vertical is not None and system.is_compound else 1.0
     named = frame.vertical_datum if vertical is None else vertical.name
-    whole = horizontal
+    whole = plan
     if vertical is not None:
         # Made anew, because GDAL loses the code of a compound system that has one.
-        whole = CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical])
-    return MapFrame(frame, origin, np.eye(3), whole.to_wkt(), horizontal.to_wkt(), named, metre, metre_up)
+        whole = CompoundCRS(f"{plan.name} + {vertical.name}", [plan, vertical])
+    return MapFrame(frame, origin, np.eye(3), whole.to_wkt(), plan.to_wkt(), named, metre, metre_up)
 
 
 def _vertical(datum: str, given: str | None) -> CRS | None:

@@ -118,10 +118,10 @@ def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
     ground, _ = coarse_ground(low, factor * cell_m, grid.frame.metre_up)
     rim = max(1, round(RIM_M / cell_m))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
+    columns_of = (np.arange(grid.columns) + 0.5) / factor - 0.5
     with raster_writer(out, grid) as writer:
         for (row, count, height), (_, _, error) in zip(blocks(dsm, rim), blocks(sigma, rim), strict=True):
             rows_of = (np.arange(row - rim, row + count + rim) + 0.5) / factor - 0.5
-            columns_of = (np.arange(grid.columns) + 0.5) / factor - 0.5
             below = _interpolated(_interpolated(ground, rows_of, 0), columns_of, 1)
             error_m = np.minimum(np.nan_to_num(error) / grid.frame.metre_up, LEAST_RISE_M)
             rise_m = np.maximum(GROUND_SIGMAS * error_m, LEAST_RISE_M)

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import softmax
 
-from tidefield.data.near_far import ranges_of_points
+from tidefield.data.near_far import ranges_of_points, with_widest
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
@@ -446,11 +446,9 @@ def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Le
         if len(few) and len(xyz):
             some = Observations(xyz[:: len(xyz) // most + 1])
             ranges[few] = ranges_of_points(pose[few], tuple(lenses[i] for i in few), some)
-    valid = np.isfinite(ranges[:, 0])
-    if valid.any():
-        ranges[~valid] = ranges[valid, 0].min(), ranges[valid, 1].max()
-    else:
+    filled = with_widest(ranges)
+    if filled is None:
         near, far = scene.cameras.near_far[list(scene.train)].double().cpu().numpy().T
-        ranges[:] = np.quantile(near, 0.05), np.quantile(far, 0.95)
+        filled = np.tile([np.quantile(near, 0.05), np.quantile(far, 0.95)], (len(pose), 1))
     # A jump of the range would be a jump in the picture: samples lie elsewhere.
-    return np.exp(gaussian_filter1d(np.log(ranges), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))
+    return np.exp(gaussian_filter1d(np.log(filled), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import logging
-import os
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -30,6 +29,7 @@ from tidefield.config import Budget, Range, from_json
 from tidefield.data.pictures import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
+from tidefield.device import environment_of
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, QualityCurve
 from tidefield.files import delete_files, write_json
@@ -226,7 +226,7 @@ def _worker(words: Sequence[str | Path], log_file: Path, device: torch.device) -
             stdout=subprocess.PIPE,
             stderr=said,
             text=True,
-            env=_environment(device),
+            env=environment_of(device) | KEEP_LARGE_ALLOCATIONS,
             preexec_fn=end_with_parent,
         )
         try:
@@ -241,14 +241,6 @@ def _worker(words: Sequence[str | Path], log_file: Path, device: torch.device) -
             except subprocess.TimeoutExpired:
                 process.terminate()
                 process.wait()
-
-
-def _environment(device: torch.device) -> dict[str, str]:
-    environment = {**os.environ, **KEEP_LARGE_ALLOCATIONS}
-    if device.index is not None:  # nerfstudio takes the first that it sees
-        visible = [one for one in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if one]
-        environment["CUDA_VISIBLE_DEVICES"] = visible[device.index] if visible else str(device.index)
-    return environment
 
 
 def _read_job(folder: Path) -> tuple[tuple[int, float], Colours]:

@@ -15,7 +15,14 @@ from jaxtyping import Float64
 from pyproj import Transformer
 
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import EARTH_RADIUS_M, WGS84, metres_per_degree, metres_per_height, parse_crs
+from tidefield.geometry.geodesy import (
+    EARTH_RADIUS_M,
+    WGS84,
+    horizontal,
+    metres_per_degree,
+    metres_per_height,
+    parse_crs,
+)
 from tidefield.survey.io.text_files import PhotographNames, find_file, leading_numbers, read_lines, read_list
 from tidefield.survey.survey import Photograph, Position
 
@@ -172,8 +179,8 @@ def _read_table(path: Path, lines: Sequence[str], header: int, names: Photograph
             raise SurveyError(
                 f"{where} gives {degrees}: {_EXPECTED_TABLE}; metres belong under the EPSG code of a geo.txt"
             )
-        height, horizontal, vertical = (numbers.get(key, math.nan) for key in ("height", "horizontal", "vertical"))
-        position = Position(*degrees, height, *_positive(horizontal, vertical), "unknown", path.name)
+        height, across, up = (numbers.get(key, math.nan) for key in ("height", "horizontal", "vertical"))
+        position = Position(*degrees, height, *_positive(across, up), "unknown", path.name)
         _add(found, name, GpsRecord(position), where)
     return found
 
@@ -208,8 +215,7 @@ def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
     if not read:
         return {}
     system = parse_crs(crs)
-    horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
-    to_degrees = Transformer.from_crs(horizontal, WGS84, always_xy=True)
+    to_degrees = Transformer.from_crs(horizontal(system), WGS84, always_xy=True)
     degrees = np.column_stack(to_degrees.transform(*np.array([values[:2] for _, _, values in read]).T))
     datum = "mean sea level" if system.is_compound else "ellipsoid" if len(system.axis_info) == 3 else "unknown"
     found: dict[str, GpsRecord] = {}
