@@ -179,6 +179,16 @@ def test_weights_for_a_training_that_starts_without_are_one_clear_error(
     assert not (tmp_path / "run" / RUN_FILE).exists()
 
 
+def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    start(scene, run, steps=3)
+    assert read_run(run).budget == Budget(steps=3)
+    for budget, steps in ((Budget(steps=5), 5), (Budget(), 5), (Budget(steps=6), 6)):
+        train(Train(scene, run, budget=budget, device="cpu", resume=True), QUIET)
+        assert load_network(run, make_network(SMALL.network)).step == steps
+        assert read_run(run).budget == Budget(steps=steps)
+
+
 def test_a_folder_is_trained_into_by_one_process_at_a_time(scene: Path, tmp_path: Path) -> None:
     start(scene, tmp_path / "run")
     for options in ({"resume": True}, {"overwrite": True}):

@@ -212,6 +212,7 @@ def test_others_may_read_a_run_where_the_umask_allows_it(trained: bytes, scene: 
         "seed": ["x", None, 1 << 80, 1.0],
         "scene": [None, 5],
         "id": [5],
+        "budget": [5, {"steps": 1}, {"minutes": "x", "steps": None}],
         "config": [None, [], {}, {"method": []}, {"network": {"as_printed": 1, "views": 5}, "train": 5}],
         "weights": [5],
         "new": [5],
@@ -233,10 +234,11 @@ def test_a_damaged_run_file_is_one_clear_error(name: str, values: list[Any], tmp
 def test_a_run_of_version_0_1_has_no_id_and_neither_has_its_checkpoint(trained: bytes, tmp_path: Path) -> None:
     write_run(tmp_path, Run(tmp_path / "scene", None, 0, SMALL))
     data = json.loads((tmp_path / RUN_FILE).read_text())
-    data.pop("id", None)
+    del data["id"], data["budget"]
     (tmp_path / RUN_FILE).write_text(json.dumps(data))
     (tmp_path / CHECKPOINT_FILE).write_bytes(trained)
     assert read_run(tmp_path).id is None
+    assert read_run(tmp_path).budget is None
     assert load_network(tmp_path, make_network(SMALL.network)).step == 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,7 +59,8 @@ class Train:
     weights: Path | None = None
     """Start from these weights, of `tidefield pretrain`."""
     resume: bool = False
-    """Continue the run in the folder; one that has saved nothing yet starts again."""
+    """Continue the run in the folder, to the end of its budget or of a new one, both from the run's start; one that has
+    saved nothing yet starts again."""
     overwrite: bool = False
     """Replace the run in the folder."""
     opensplat: OpensplatProgram = None
@@ -91,7 +92,7 @@ def _train(options: Train, console: Console, again: str) -> None:
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
     from tidefield.progress import ProgressBar
-    from tidefield.train.checkpoint import read_run
+    from tidefield.train.checkpoint import read_run, write_run
     from tidefield.train.loop import train as run_training
 
     budget, folder, weights = options.budget.checked(), options.run, None
@@ -111,6 +112,8 @@ def _train(options: Train, console: Console, again: str) -> None:
         if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
         weights = _resumed_weights(options, run)
+        if options.budget == Budget() and run.budget is not None:
+            budget = run.budget.checked()
     else:
         run, weights = _new_run(options)
     scene = load(run.scene, run.width, options.allow_missing, console)
@@ -141,6 +144,7 @@ def _train(options: Train, console: Console, again: str) -> None:
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
             trainer.resume(folder)
+            write_run(folder, replace(run, budget=budget))
             if curve is not None:
                 curve.resume(folder, trainer.progress.seconds)
         else:
@@ -236,7 +240,8 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
         weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
     digest = None if weights is None else weights_sha256(weights)
     root = Path(os.path.realpath(options.scene))
-    return Run(root, options.width, checked_seed(options.seed), config, digest), weights
+    seed, budget = checked_seed(options.seed), options.budget.checked()
+    return Run(root, options.width, seed, config, digest, budget=budget), weights
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from tidefield import __version__
 from tidefield.addresses import address_of, path_of
-from tidefield.config import AnyConfig, Config, Range, Seed, config_from_json, config_to_json, from_json
+from tidefield.config import AnyConfig, Budget, Config, Range, Seed, config_from_json, config_to_json, from_json
 from tidefield.errors import RunError
 from tidefield.files import completed_file, file_sha256, read_json, reading_from, write_json
 from tidefield.model.network import Network
@@ -42,6 +42,7 @@ _RUN = {
     "version": str,
     "weights": str | None,
     "id": str | None,
+    "budget": Budget | None,
 }
 _PROGRESS = {
     "step": Annotated[int, Range(0, (1 << 63) - 1)],
@@ -54,7 +55,7 @@ _PROGRESS = {
 
 @dataclass(frozen=True)
 class Run:
-    """What a run is; does not change while it trains.
+    """What a run is; does not change while it trains, but for a new budget with which it is continued.
 
     Attributes:
         scene: the folder of its scene.
@@ -64,6 +65,7 @@ class Run:
         weights: SHA-256 of the trained weights it started from; None from scratch.
         version: of the program that started it.
         id: random; None in runs of version 0.1.
+        budget: of the training, from its start; None in runs of version 0.1.
     """
 
     scene: Path
@@ -73,6 +75,7 @@ class Run:
     weights: str | None = None
     version: str = __version__
     id: str | None = field(default_factory=lambda: secrets.token_hex(8))
+    budget: Budget | None = None
 
 
 @dataclass
@@ -87,8 +90,8 @@ class TrainingProgress:
 
 def write_run(folder: Path, run: Run) -> None:
     """Write RUN/run.json."""
-    data = {name: getattr(run, name) for name in _RUN} | {"scene": address_of(run.scene) or str(run.scene)}
-    write_json(folder / RUN_FILE, {**data, "config": config_to_json(run.config)})
+    data = asdict(run) | {"scene": address_of(run.scene) or str(run.scene), "config": config_to_json(run.config)}
+    write_json(folder / RUN_FILE, data)
 
 
 def read_run(folder: Path) -> Run:
@@ -104,7 +107,7 @@ def read_run(folder: Path) -> Run:
             f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
         )
     keys = {*_RUN, "config"}
-    if not isinstance(data, dict) or not keys - {"id"} <= set(data) <= keys:
+    if not isinstance(data, dict) or not keys - {"id", "budget"} <= set(data) <= keys:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
