@@ -416,7 +416,7 @@ def maps(
     views: int = 20,
     half: float = 12.0,
 ) -> None:
-    """Maps of built-in flats against the exact truth, and two floors: sparse points, semi-global matching (an hour).
+    """Maps of built-in flats against the exact truth, and two baselines: sparse points, semi-global matching (an hour).
 
     Args:
         runs: Folder for flats, maps and maps.json; what it holds is not measured again.

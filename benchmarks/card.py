@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.table import SCENES, marks_of, notes
+from benchmarks.table import SCENES, age, marks_of, notes, without_empty_columns
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.tables import Table, lpips_weights, marked, shown
 from tidefield.errors import RunError
@@ -54,7 +54,7 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
     """
     preset = read_weights_file(weights)[0]["config"]["preset"]
     own = next(name for name in names("zero-shot") if METHODS[name].preset == preset)
-    results = read_figures(comparison, SCENES, (own, *OTHERS))
+    results = without_empty_columns(read_figures(comparison, SCENES, (own, *OTHERS)))
     if not any(method == own for _, method in results.by):
         files = ", ".join(map(str, comparison))
         raise RunError(f"{files} hold no {own} results: expected some; run `tidefield compare` with them")
@@ -103,7 +103,9 @@ def card(weights: Path, results: Results) -> str:
         "views of each:",
         Table("", ["step", *kinds], curve).markdown(),
         "## What they achieve",
-        "Zero-shot, means over the held-out photographs; `docs/results.md` says how the others were trained.",
+        "Zero-shot, means over all pixels of the held-out photographs, without a fit of the colours; "
+        "`docs/results.md` says how the others were trained.",
+        *age([*results.by.values()]),
         *notes(results, marks),
         *(marked(table, marks).markdown() for table in _quality(results)),
         *lpips_weights(results),

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 from scipy.optimize import nnls
 
-from benchmarks.large import run_by_stage, total
+from benchmarks.large import LARGE_FILE, run_by_stage, total
 from tidefield.compare.run import tidefield
 from tidefield.compare.tables import Table
 from tidefield.errors import RunError
@@ -30,6 +30,8 @@ COST_FILE = "cost.json"
 MAP = "map"
 TRAIN = "train"
 TRAINED_STEPS = 100
+LARGE_MEGAPIXELS = 0.12
+"""Of photographs of the flights of `python -m benchmarks large`."""
 FULL_MEGAPIXELS = 25
 """Of all photographs together, from which on memory for their features is full (`model.cache.LEAST_BYTES`)."""
 REDUCED_MEGAPIXELS = FeatureOptions().side_px ** 2 * 3 / 4 / 1e6
@@ -353,7 +355,7 @@ def write_page(runs: Path, out: Path) -> None:
         ("a coast, 10 km2", survey_of_area(10, 20, 0.03, 0.05, 60), Machines(16, number=10)),
         ("a coast, 1,000 km2", survey_of_area(1000, 20, 0.03, 0.1, 600), Machines(16, number=100)),
     ]
-    machine = measured[0]["machine"]
+    machine, large = measured[0]["machine"], _large_surveys(model, runs)
     photographs, megapixels, cells = model.largest
     most = f"{photographs:,} photographs, {megapixels:.2f} megapixels, {cells / 1e6:.1f} million cells"
     parts = [
@@ -364,8 +366,8 @@ def write_page(runs: Path, out: Path) -> None:
         "```sh\npython -m benchmarks cost --photographs 1200 --megapixels 20 --cells 400e6 --cores 16\n```",
         "## Estimates",
         estimate_table(model, surveys).markdown(),
-        f"\\* Beyond twice the largest measurement ({most}): the model takes costs to go on growing in proportion, "
-        "which nothing here has shown.",
+        f"\\* Beyond twice the largest measurement ({most}): the model takes costs to go on growing in proportion"
+        + ("; *Large surveys*, below, says how far that is off." if large else ", which nothing here has shown."),
         "Areas are flown with overlaps of 80% and 70% at a ground sampling of 3 cm, and mapped at 5 cm, the 1,000 km2 "
         "at 10 cm. `prepare` and training run on one machine; only maps are shared among several. Training takes the "
         "time it is given: 10 minutes, 1 and 10 hours for the coasts. Of memory, `prepare` needs that of a photograph "
@@ -379,8 +381,34 @@ def write_page(runs: Path, out: Path) -> None:
         Table(
             "", ["flight", "prepare and map, s", "by the model, s", "ratio", "memory, GB", "by the model, GB"], check
         ).markdown(),
+        *large,
     ]
     write_text(out, "\n\n".join(parts) + "\n")
+
+
+def _large_surveys(model: Model, runs: Path) -> list[str]:
+    """What `python -m benchmarks large` measured of `prepare`, and what the model says of it; nothing if it did not."""
+    rows = []
+    for of in sorted((read_json(runs / LARGE_FILE) or {"measured": {}})["measured"].values(), key=_photographs):
+        estimate = model.estimate(Survey(of["photographs"], LARGE_MEGAPIXELS, 0.0), Machines(model.cores))
+        stages = of["stages"].values()
+        seconds, memory = sum(stage["seconds"] for stage in stages), max(stage["peak_bytes"] for stage in stages)
+        predicted = 3600 * sum(estimate.hours[stage] for stage in of["stages"])
+        predicted_bytes = max(estimate.memory_bytes[stage] for stage in of["stages"])
+        cells = [f"{seconds:,.0f}", f"{predicted:,.0f}", f"{predicted / seconds:.2f}"]
+        rows.append([f"{_photographs(of):,}", *cells, f"{memory / 1e9:.1f}", f"{predicted_bytes / 1e9:.1f}"])
+    if not rows:
+        return []
+    text = (
+        f"`prepare` of flights of {LARGE_MEGAPIXELS:g} megapixels, as `python -m benchmarks large` measured it. None "
+        "of these is among the measurements that the model is fitted to."
+    )
+    columns = ["photographs", "prepare, s", "by the model, s", "ratio", "memory, GB", "by the model, GB"]
+    return ["## Large surveys", text, Table("", columns, rows).markdown()]
+
+
+def _photographs(of: dict[str, Any]) -> int:
+    return of["photographs"]
 
 
 def _gpus(measured: Sequence[dict[str, Any]]) -> str:

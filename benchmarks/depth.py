@@ -1,6 +1,6 @@
 """Rendered depth of held-out views of built-in flats against the exact truth, next to the triangulated points.
 
-The floor is the surface that interpolates the triangulated points in the view (`surface_depth`), as the baseline
+The baseline is the surface that interpolates the triangulated points in the view (`surface_depth`), as the method
 `sparse-depth` has it. Both are measured where two training photographs or more see the ground.
 """
 

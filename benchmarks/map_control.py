@@ -152,5 +152,5 @@ def tables(record: dict[str, Any]) -> list[Table]:
         f"{100 * record['gsd_m']:.1f}",
         f"{100 * record['within']:.0f}%",
     )
-    columns = ["n", "RMSE", "mean", "NMAD", "RMS of the poses alone", "bar: 5 cm + 1 GSD", "GSD", "within 1.96 errors"]
+    columns = ["n", "RMSE", "mean", "NMAD", "RMS of the poses alone", "aim: 5 cm + 1 GSD", "GSD", "within 1.96 errors"]
     return [Table("Heights at control points, cm", head, rows), Table("Left out in turn, cm", columns, [whole])]

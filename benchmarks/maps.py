@@ -1,7 +1,7 @@
-"""Maps of built-in flats against the exact truth, next to two floors.
+"""Maps of built-in flats against the exact truth, next to two baselines.
 
-The floors are the surface of the sparse points, and OpenCV's semi-global matching (Hirschmüller, Stereo processing by
-semiglobal matching and mutual information, 2008) of pairs of photographs, fused into the map's grid. Both know the
+The baselines are the surface of the sparse points, and OpenCV's semi-global matching (Hirschmüller, Stereo processing
+by semiglobal matching and mutual information, 2008) of pairs of photographs, fused into the map's grid. Both know the
 exact poses, as the map does.
 """
 
@@ -61,7 +61,7 @@ def measure_maps(
                 write_survey(make_survey(category, seed=SEED, views=views, width=width), partial)
         say(f"{name}: map")
         made = made_map(folder / "scene", folder / "map", area=area)
-        say(f"{name}: floors")
+        say(f"{name}: baselines")
         record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
         command = f"python -m benchmarks maps --width {width} --views {views} --half {half_m:g}"
         write_json(runs / MAPS_FILE, {**record, **describe(), "command": command})
@@ -95,7 +95,7 @@ def made_map(scene: Path, out: Path, **options: Any) -> dict[str, Any]:
 
 
 def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
-    """Measure a map and the floors against the truth of a built-in flat, on cells that have a height in all of them."""
+    """Measure a map and the baselines against the truth of a built-in flat, on cells with a height in all of them."""
     import rasterio
 
     scene = load_scene(root, hold_out=False)

@@ -57,6 +57,15 @@ WITHOUT_ALPHA = Mark(
     "over Nerfacto here rests on that.",
 )
 """Of figures without a protocol, which are older than alpha in what nerfstudio gets."""
+SOURCES = (
+    ("caliterra", "a building site in Texas, bare soil, from a fixed wing", "OpenDroneMap/odm_data_caliterra"),
+    ("swindale", "a river restoration in Cumbria, muddy channel and grass", "vesnikos/Swindale-UAV-Images"),
+    ("turin_lot", "a vacant lot in Turin, from straight above and obliquely", "vinstray/i-sfm"),
+    ("brighton_beach", "a park on the shore of Lake Superior", "pierotofy/drone_dataset_brighton_beach"),
+    ("fern", "a fern from the front", "LLFF (Mildenhall et al., 2019)"),
+    ("lego", "a rendered model on white", "NeRF's synthetic scenes (Mildenhall et al., 2020)"),
+)
+"""Real scenes, and where their photographs are from: repositories of GitHub, or data of a publication."""
 PUBLISHED = (
     ("IBRNet (Wang et al., CVPR 2021)", "LLFF", 25.13, 26.73),
     ("NeuRay (Liu et al., CVPR 2022)", "LLFF", 25.35, 27.06),
@@ -87,21 +96,26 @@ class Stored:
 
 @dataclass(frozen=True)
 class OnGpu:
-    """What was stored of a GPU: speed, views of two sizes, and a comparison with a remark on how it was made."""
+    """What was stored of a GPU: speed, views of two sizes, and a comparison with a remark on how it was made.
+
+    `width` is that of the comparison's photographs, pixels.
+    """
 
     speed: Mapping[str, Any] | None
     frames: Mapping[str, Any] | None
     large_frames: Mapping[str, Any] | None
     compared: Results
     remark: str
+    width: int | None
 
 
 def read_gpu(folder: Path) -> OnGpu:
     """Read what was measured on a GPU."""
     quality = folder / GPU_QUALITY
-    compared = _without_empty_columns(read_figures([quality], SCENES, names()))
+    compared = without_empty_columns(read_figures([quality], SCENES, names()))
     speed, frames, large = (read_json(folder / file) for file in (SPEED_FILE, FRAMES_FILE, LARGE_FRAMES_FILE))
-    return OnGpu(speed, frames, large, compared, (read_json(quality) or {}).get("remark", ""))
+    record = read_json(quality) or {}
+    return OnGpu(speed, frames, large, compared, record.get("remark", ""), record.get("settings", {}).get("width"))
 
 
 def write_page(
@@ -150,6 +164,9 @@ def page(
         "# Results",
         "## Quality, by width",
         *(_widths(sized) or ["Not measured."]),
+        "## Scenes",
+        "None of these is a tidal flat. The others on this page are built-in flats, named after their categories.",
+        Table("", ["scene", "what", "from"], SOURCES).markdown(),
         "## Quality beside other methods",
         *(_quality(compared) or ["Not measured."]),
         "## The field, as published",
@@ -161,20 +178,20 @@ def page(
         f"Photographs of {LENGTHS_PX} px, on CPUs; from the shipped weights, or *from scratch*, from random ones.",
         *([table.markdown() for table in lengths] or ["Not measured."]),
         "## Ablation",
-        *_age([*ablated.by.values()]),
+        *age([*ablated.by.values()]),
         *(summarise(ablated) or ["Not measured."]),
         *(table.markdown() for table in ablation_tables(ablated)),
         "## What the paper's parts bring",
         "Zero-shot, with weights that were trained across scenes alike, with and without them: the preset `swift` has "
         "those parts that bring something there.",
-        *([table.markdown() for table in paper_parts.tables(stored.parts)] if stored.parts else ["Not measured."]),
+        *_dated(stored.parts, paper_parts.tables),
         "## Depth",
         "Zero-shot, of held-out views of built-in flats, against the exact truth, in doubly seen pixels; *points* are "
         "interpolated in the view. The weights learned from other flats of the same generator.",
-        *([table.markdown() for table in depth.tables(stored.depth)] if stored.depth else ["Not measured."]),
+        *_dated(stored.depth, depth.tables),
         "## Scenes without sparse points",
         "Zero-shot, with the points of COLMAP, and without any: then they are found when the scene is opened.",
-        *([table.markdown() for table in points.tables(stored.points)] if stored.points else ["Not measured."]),
+        *_dated(stored.points, points.tables),
         "## Speed",
         *_speed(stored.speed),
         "## Zero-shot views",
@@ -194,11 +211,19 @@ def page(
     return "\n\n".join(parts) + "\n"
 
 
+def _dated(record: Mapping[str, Any] | None, tables: Callable[[Mapping[str, Any]], Sequence[Table]]) -> list[str]:
+    """Tables of a benchmark, after the code that they were measured with: others on the page have newer code."""
+    if record is None:
+        return ["Not measured."]
+    made = f"Measured {record['date']} at commit {record['commit'][:7]}: compare its columns with each other."
+    return [made, *(table.markdown() for table in tables(record))]
+
+
 def _quality(compared: Results) -> list[str]:
     """Tables of quality with the sentences that one must know to read them."""
     if not compared.by:
         return []
-    results = _without_empty_columns(compared)
+    results = without_empty_columns(compared)
     marks = marks_of(results, learned_from())
     tables = quality_tables(results, {suffix: REGIONS[suffix] for suffix in SHOWN_REGIONS})
     papers = paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic")
@@ -206,9 +231,10 @@ def _quality(compared: Results) -> list[str]:
         of.metric(metric) is not None for of in results.by.values() for metric in ("lpips_alex", "lpips_vgg")
     )
     return [
-        *_age([*compared.by.values()]),
-        "Means over the held-out photographs. Every method had the same photographs, split, resolution, machine and "
-        "minutes of training; bold is the best.",
+        *age([*compared.by.values()]),
+        "Means over the held-out photographs. Every method had the same photographs, split, resolution and minutes of "
+        "training; bold is the best.",
+        *_code_and_machines(results),
         *notes(results, marks),
         *(marked(table, marks).markdown() for table in tables),
         *([papers.markdown()] if papers else []),
@@ -217,7 +243,7 @@ def _quality(compared: Results) -> list[str]:
     ]
 
 
-def _age(results: Sequence[Result]) -> list[str]:
+def age(results: Sequence[Result]) -> list[str]:
     """What measurements without the strict protocol were made with, as a sentence; nothing if all have it."""
     older = [result for result in results if "protocol" not in result.evaluation]
     if not older:
@@ -240,7 +266,7 @@ def published_table() -> Table:
     return Table("", ["method", "data", "zero-shot", "trained on each scene", "gain"], rows)
 
 
-def _without_empty_columns(results: Results) -> Results:
+def without_empty_columns(results: Results) -> Results:
     """The same results, with those methods that have any."""
     there = {method for _, method in results.by}
     return Results(results.scenes, tuple(method for method in results.methods if method in there), results.by)
@@ -267,14 +293,23 @@ def by_width(files: Sequence[Path]) -> dict[int, Results]:
         if (record := read_json(file)) is not None:
             groups.setdefault(int(record["settings"]["width"]), []).append(file)
     return {
-        width: _without_empty_columns(read_figures(group, SCENES, names())) for width, group in sorted(groups.items())
+        width: without_empty_columns(read_figures(group, SCENES, names())) for width, group in sorted(groups.items())
     }
 
 
 PLACED_AFTERWARDS = (
-    "The scenes were made from photographs by `tidefield prepare --holdout`: their poses and points owe nothing to the "
-    "held-out photographs, either."
+    "Made from photographs by `tidefield prepare --holdout`, so that their poses and points owe nothing to "
+    "held-out photographs, either: "
 )
+PLACED_TOGETHER = "With poses and lenses of all photographs, the held-out ones included: "
+
+
+def _poses(results: Results) -> list[str]:
+    """Which scenes' poses owe something to held-out photographs, as sentences."""
+    groups: dict[str, dict[str, None]] = {PLACED_AFTERWARDS: {}, PLACED_TOGETHER: {}}
+    for (scene, _), result in results.by.items():
+        groups[PLACED_AFTERWARDS if result.evaluation.get("held_out_of_poses") else PLACED_TOGETHER][scene] = None
+    return [f"{sentence}{', '.join(scenes)}." for sentence, scenes in groups.items() if scenes]
 
 
 def _code_and_machines(results: Results) -> list[str]:
@@ -318,9 +353,9 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
     """Tables of quality and costs, of one width after another."""
     suffix = SHOWN_REGIONS[-1]
     parts = [
-        "Nothing of a held-out photograph had a part in what it was compared with, its observations of sparse points "
-        "included. `sparse-depth` blends the same neighbours on the surface of the sparse points and reads "
-        "photographs in the same way: the floor. Our presets and the methods without training read what lies between "
+        "No pixel of a held-out photograph, and none of its observations of sparse points, had a part in what it was "
+        "compared with. `sparse-depth`, the baseline, blends the same neighbours on the surface of the sparse points "
+        "and reads photographs in the same way. Our presets and the methods without training read what lies between "
         "pixels from files of twice the width, where there are such (method, section 3): on all scenes but lego at "
         "400 px, on all but caliterra at 800 px, on none at 1600 px."
     ]
@@ -328,11 +363,10 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         marks = marks_of(results, learned_from())
         tables = quality_tables(results, {suffix: REGIONS[suffix]})
         costs = cost_table(results)
-        placed_afterwards = all(result.evaluation.get("held_out_of_poses") for result in results.by.values())
         parts += [
             f"### {width} px",
             *_code_and_machines(results),
-            *([PLACED_AFTERWARDS] if placed_afterwards else []),
+            *_poses(results),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),
             replace(costs, title=f"{width} px: {costs.title}").markdown(),
@@ -348,7 +382,9 @@ def _on_gpu(gpu: OnGpu) -> list[str]:
     views = [table for record in (gpu.frames, gpu.large_frames) if record for table in frame_tables(record)]
     tables = [*(marked(table, marks) for table in quality), *costs, *views]
     return [
-        *([gpu.remark] if gpu.remark else []),
+        *([f"Photographs of {gpu.width} px. {gpu.remark}"] if quality else []),
+        *(_code_and_machines(gpu.compared)),
+        *(_poses(gpu.compared)),
         *(notes(gpu.compared, marks) if quality else []),
         *(replace(table, title=f"On a GPU: {table.title}").markdown() for table in tables),
         *([table.markdown() for table in speed_tables(gpu.speed)] if gpu.speed else []),

@@ -77,7 +77,7 @@ The usual order of commands:
   tidefield map RUN OUT             orthophoto, surface model and point cloud; with --zero-shot from SCENE
   tidefield change FIRST LATER OUT  what changed between two surveys, with volumes and intervals
 
-tidefield demo does all of it on a built-in scene."""
+tidefield demo trains, evaluates and renders on a built-in scene."""
 
 
 def main() -> None:

@@ -115,3 +115,20 @@ def test_the_page_of_costs_marks_what_was_not_measured(tmp_path: Path):
     assert "| a coast, 1,000 km2 * |" in text
     assert text.count("| a flat, 1 km2 * |") == 2
     assert "GPUs: not measured." in text
+    assert "Large surveys" not in text
+
+
+def test_the_page_of_costs_says_how_far_it_is_off_for_large_surveys(tmp_path: Path):
+    of = [measurement(*of) for of in MEASURED[:5]]
+    write_json(tmp_path / "cost.json", {"measured": {str(k): one for k, one in enumerate(of)}})
+    prepared = {name: stage for name, stage in of[0]["stages"].items() if name not in ("map", "train")}
+    large = {"f900": {"photographs": 900, "stages": prepared}, "f80": {"photographs": 80, "stages": prepared}}
+    write_json(tmp_path / "large.json", {"measured": large})
+    write_page(tmp_path, tmp_path / "cost.md")
+    text = (tmp_path / "cost.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    small, big = (next(row for row in rows if row[:1] == [count]) for count in ("80", "900"))
+    seconds = sum(stage["seconds"] for stage in prepared.values())
+    assert small[1] == big[1] == f"{seconds:,.0f}"
+    assert float(big[2].replace(",", "")) > float(small[2].replace(",", ""))
+    assert float(big[3]) == pytest.approx(float(big[2].replace(",", "")) / seconds, abs=0.01)

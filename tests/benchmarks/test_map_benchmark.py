@@ -1,4 +1,4 @@
-"""The benchmark of maps: its floors are fair, and its tables show what was stored."""
+"""The benchmark of maps: its baselines are fair, and its tables show what was stored."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ class Ablate:
 
     scenes: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
     variants: tuple[str, ...] = ()
-    """Which; all of them if not given. Joined by `+` they are of one another: `no-sparse-points+no-agreement` is
-    compared with `no-sparse-points`."""
+    """Which; all of them if not given (docs/comparing.md lists them). Several joined by `+` are changed together, and
+    compared with what lacks the last: `no-sparse-points+no-agreement` with `no-sparse-points`."""
     preset: Preset = "swift"
     """What they are variants of."""
     budget: OmitArgPrefixes[Budget] = Budget()

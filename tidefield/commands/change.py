@@ -34,7 +34,7 @@ class Change:
     OUT is a new folder: change.html (the report), change.tif (difference, its standard error and p-value),
     significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have
     95% intervals from the random, the spatially correlated and the systematic part of the error, which are measured
-    over stable ground. Where both surveys have orthophotos, plants gained and lost are told, too (cover.tif,
+    over stable ground. Where both surveys have orthophotos, plants gained and lost are reported, too (cover.tif,
     cover.csv); with --scenes the same places then and now are in views, as pictures, a page that swipes and a video.
     """
 

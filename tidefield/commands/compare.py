@@ -56,6 +56,7 @@ class Compare:
     """Folder for the runs, tables and figures."""
     device: Device = "auto"
     seed: int = 0
+    """Of all methods that take one."""
     opensplat: OpensplatProgram = None
     cluster: Annotated[
         Cluster,

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Export a run, or with --zero-shot a scene, as Gaussians (PLY), which SuperSplat and gsplat's viewer open.
+    """Export a run, or with --zero-shot a scene, as Gaussians (PLY, in the layout of 3D Gaussian
+    splatting).
 
     Every pixel of the training photographs' views becomes a flat Gaussian, unless other views see through it; nothing
     is optimised. Lost are colours that change with the direction (mirrors of water), what is finer than a pixel of
