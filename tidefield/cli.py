@@ -98,6 +98,9 @@ def main() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
+        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # PyTorch's, of a GPU
+            reason = str(error).split("\n")[0].split(". ")[0] or "the system gave no more"
+            _end(2, f"not enough memory ({reason}): expected more; choose a smaller --width, or another --device")
         if isinstance(error, OSError) and error.filename is not None and user_can_mend(error):
             place = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else error.filename
             _end(2, f"{place} cannot be used ({error.strerror}): expected a place of yours; check name and permissions")

@@ -13,12 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from tidefield import cli, synthetic
 from tidefield import progress as meter
 from tidefield.commands import demo
 from tidefield.data.load import load_scene
+from tidefield.files import only_writer
 from tidefield.synthetic import make_survey, write_survey
 
 
@@ -288,6 +290,15 @@ def test_the_demonstration_leaves_alone_what_it_did_not_make(
     assert contents(out) == before
 
 
+def test_a_folder_has_one_demonstration_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    partial = tmp_path / ".scene-0123abcd.partial"
+    partial.mkdir()
+    (tmp_path / "demonstration.json").write_text('{"files": [], "unfinished": true}')
+    with only_writer(tmp_path):
+        assert "another process is writing" in fails(capsys, "demo", tmp_path)
+    assert partial.exists(), "the other one is making it"
+
+
 def test_progress_is_told_where_there_is_no_terminal(
     scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -338,6 +349,24 @@ def test_what_is_no_users_mistake_is_reported_as_a_defect(
     assert ended.value.code == 70
     assert re.search(r"Traceback.*in stumble.*ZeroDivisionError: oh\n.*a defect of the program", message, re.DOTALL)
     assert message.endswith("  command: tidefield train 'a b'\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (MemoryError(), "the system gave no more"),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB. GPU 0 has\nmore"), "CUDA out of memory"),
+    ],
+)
+def test_too_little_memory_is_no_defect(
+    error: Exception, reason: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stumble(words: list[str]) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "_run", stumble)
+    message = fails(capsys, "train", "a", "b")
+    assert f"not enough memory ({reason}): expected more; choose a smaller --width" in message
 
 
 def test_a_place_that_the_system_refuses_is_one_clear_message(

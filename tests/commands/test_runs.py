@@ -20,7 +20,7 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield.commands import demo
 from tidefield.commands.evaluate import Evaluate, evaluate
-from tidefield.commands.pretrain import Pretrain
+from tidefield.commands.pretrain import PRETRAINING_FILE, Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
 from tidefield.commands.train import Train, train
 from tidefield.compare.run import read_evaluation
@@ -189,6 +189,38 @@ def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given
         assert read_run(run).budget == Budget(steps=steps)
 
 
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"width": 40}, "--width 40: "),
+        ({"seed": 3}, "--seed 3: "),
+        ({"preset": "paper"}, "--preset paper: "),
+        ({"method": "nerf", "from_scratch": True}, "--method nerf, --from-scratch: "),
+        ({"variant": "views-2"}, "--variant views-2: "),
+        ({"overwrite": True}, "--overwrite: "),
+    ],
+)
+def test_a_run_is_not_continued_with_the_options_of_another(
+    scene: Path, tmp_path: Path, other: dict[str, Any], said: str
+) -> None:
+    run, own = tmp_path / "run", {"width": 48, "budget": Budget(steps=1), "device": "cpu"}
+    train(Train(scene, run, **own), QUIET)
+    train(Train(scene, run, **own, resume=True), QUIET)
+    before = (run / CHECKPOINT_FILE).read_bytes()
+    with pytest.raises(RunError, match=rf"was not started with {said}expected its own options with --resume"):
+        train(Train(scene, run, **{**own, "budget": Budget(steps=2), **other}, resume=True), QUIET)
+    assert (run / CHECKPOINT_FILE).read_bytes() == before
+
+
+def test_a_run_that_has_saved_is_not_continued_from_other_weights(scene: Path, tmp_path: Path) -> None:
+    start(scene, tmp_path / "run")
+    other = tmp_path / "w.safetensors"
+    write_weights(other, make_network(SMALL.network), SMALL, {})
+    with pytest.raises(RunError, match=r"was not started with --weights .*w\.safetensors: "):
+        start(scene, tmp_path / "run", resume=True, weights=other)
+    start(scene, tmp_path / "run", resume=True, weights=checkpoint.SHIPPED / "swift.safetensors")
+
+
 def test_a_folder_is_trained_into_by_one_process_at_a_time(scene: Path, tmp_path: Path) -> None:
     start(scene, tmp_path / "run")
     for options in ({"resume": True}, {"overwrite": True}):
@@ -249,12 +281,34 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
         pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert not (tmp_path / "out").exists()
     (tmp_path / "out" / "scenes").mkdir(parents=True)
+    started = {"preset": "swift", "variant": None, "seed": 0, "real": []}
+    (tmp_path / "out" / PRETRAINING_FILE).write_text(json.dumps(started))
     (tmp_path / "out" / ".checkpoint-0123abcd.partial.safetensors").touch()
     with only_writer(tmp_path / "out"), pytest.raises(RunError, match="another process"):
         pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert {name for name in os.listdir(tmp_path / "out") if name.startswith(".")} == set()
     assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
+    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
+    for others, was in (
+        ({"seed": 3}, "seed 0, not 3"),
+        ({"variant": "no-depth-loss"}, "variant None, not no-depth-loss"),
+        ({"real": (tmp_path / "flats",)}, r"real \[\], not \['flats'\]"),
+    ):
+        with pytest.raises(RunError, match=f"was started with {was}: expected the same options"):
+            pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, **others), QUIET)
+
+
+def test_a_pretraining_does_not_continue_a_run_of_one_scene(scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    start(scene, run)
+    before = (run / CHECKPOINT_FILE).read_bytes()
+    for folder in (run, scene):
+        there = files(folder)
+        with pytest.raises(RunError, match="holds no training of `tidefield pretrain`"):
+            pretrain_command(Pretrain(folder, budget=Budget(steps=9), device="cpu", resume=True), QUIET)
+        assert files(folder) == there
+    assert (run / CHECKPOINT_FILE).read_bytes() == before
 
 
 def test_opensplat_does_not_continue_and_is_replaced_with_all_that_it_left(

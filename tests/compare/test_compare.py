@@ -22,7 +22,17 @@ from tidefield.commands.compare import Compare, make_settings
 from tidefield.commands.compare import compare as compare_command
 from tidefield.compare.figures import most_different, side_by_side
 from tidefield.compare.results import Result, Results, figures_of, read_figures, read_results
-from tidefield.compare.run import MIPNERF360, Settings, Usage, commands, compare, mipnerf360, named, tidal_flats
+from tidefield.compare.run import (
+    MIPNERF360,
+    Settings,
+    Usage,
+    commands,
+    compare,
+    mipnerf360,
+    named,
+    require_one_state,
+    tidal_flats,
+)
 from tidefield.compare.tables import (
     TABLE_2,
     TABLE_3,
@@ -105,6 +115,18 @@ def test_results_of_other_settings_are_not_mixed_in(disk: Path, tmp_path: Path):
     compare({"flats": disk}, ("nearest",), longer, tmp_path / "out", run, quiet)  # is not trained
     with pytest.raises(RunError, match=r"was made with .*'minutes': 10.0.*'minutes': 20.0.*name another folder"):
         compare({"flats": disk}, ("tidefield",), longer, tmp_path / "out", run, quiet)
+
+
+def test_results_on_a_scene_that_was_made_anew_are_not_mixed_in(disk: Path, tmp_path: Path):
+    out, methods = tmp_path / "out", ("tidefield", "nearest", "nerf")
+    compare({"flats": disk}, methods, SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
+    for method, poses in zip(methods, ("first", "second", None), strict=True):
+        file = out / "runs" / "flats" / method / "evaluation.json"
+        write_json(file, {**json.loads(file.read_text()), "poses": poses})
+    require_one_state(["flats"], methods[1:], out)
+    options = Compare((disk,), methods=methods, width=48, device="cpu", out=out)
+    with pytest.raises(RunError, match="flats has results of tidefield, and nearest, on different poses or splits"):
+        compare_command(options, Console(quiet=True))
 
 
 def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
@@ -325,7 +347,9 @@ def test_a_wholly_masked_photograph_is_left_out(disk: Path, tmp_path: Path):
         assert (figure is None) == (count == len(names))
 
 
-def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_path: Path):
+def test_the_public_scenes_are_read_at_their_published_sizes(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     data, out = tmp_path / "360_v2", tmp_path / "out"
     with pytest.raises(SceneError, match="none of bicycle"):
         mipnerf360(data, out)
@@ -348,6 +372,14 @@ def test_the_public_scenes_are_read_at_their_published_sizes(disk: Path, tmp_pat
     (out / "garden" / "images").unlink()
     (out / "garden" / "images").symlink_to(tmp_path / "gone")
     assert load_scene(mipnerf360(data, out)["garden"]).cameras[0].width == whole.cameras[0].width // 4
+    with monkeypatch.context() as patch:
+
+        def refused(*_: object, **__: object) -> None:
+            raise OSError(22, "a required privilege is not held")
+
+        patch.setattr(Path, "symlink_to", refused)
+        with pytest.raises(RunError, match=r"images cannot be made \(a required privilege .*Developer Mode"):
+            mipnerf360(data, tmp_path / "on-windows")
     shutil.copytree(data, tmp_path / "other")
     with pytest.raises(RunError, match=r"garden/images leads to .*360_v2/garden/images_4: expected .*other/garden"):
         mipnerf360(tmp_path / "other", out)

@@ -92,6 +92,24 @@ def test_the_report_says_whether_poses_know_of_the_held_out_photographs(prepared
     assert report["held_out_of_poses"] is prepared_without
 
 
+def test_results_on_other_poses_or_another_split_can_be_told_apart(scene, tmp_path):
+    moved = scene.cameras.T_world_camera.clone()
+    moved[2, 0, 3] += 0.01
+    rounded = scene.cameras.T_world_camera * (1 + 1e-7)
+    states = {
+        "as it is": scene,
+        "rounded": replace(scene, cameras=replace(scene.cameras, T_world_camera=rounded)),
+        "moved": replace(scene, cameras=replace(scene.cameras, T_world_camera=moved)),
+        "split": replace(scene, train=(0,), test=(1, 2)),
+    }
+    poses = {
+        name: evaluate(perfect, state, tmp_path / name, configuration={}, console=quiet()).report["poses"]
+        for name, state in states.items()
+    }
+    assert poses["as it is"] == poses["rounded"]
+    assert len(set(poses.values())) == 3
+
+
 def test_a_colour_fit_undoes_an_exposure(scene, tmp_path):
     mean = evaluate(darker, scene, tmp_path, configuration={}, console=quiet()).mean
     assert mean["psnr"] < 25

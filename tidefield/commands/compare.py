@@ -149,12 +149,14 @@ def run_all(
         RUNS,
         check_scene,
         compare,
+        require_one_state,
         require_same_settings,
         run_measured,
         scene_runner,
     )
 
     require_writable(out / PROCESS_FILE, overwrite=True)
+    require_one_state(scenes, methods, out)
     # In a process of its own, because the memory of a scene would be charged to every process that this one starts.
     with worker_processes(1) as pool:
         for scene in scenes.values():
@@ -173,6 +175,7 @@ def run_all(
         for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
             pull(out / RUNS / name)
             print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
+    require_one_state(scenes, methods, out)
     return read_results(out, list(scenes), methods)
 
 

@@ -18,7 +18,7 @@ from tidefield.commands.render import Render, render
 from tidefield.commands.train import Train, train
 from tidefield.config import Budget
 from tidefield.errors import RunError, list_names
-from tidefield.files import completed_file, completed_folder, read_json, write_json
+from tidefield.files import completed_file, completed_folder, only_writer, read_json, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,6 +54,11 @@ class Demo:
 
 def demo(options: Demo, console: Console) -> None:
     """Run `tidefield demo`."""
+    with only_writer(options.out):
+        _demo(options, console)
+
+
+def _demo(options: Demo, console: Console) -> None:
     from tidefield.synthetic import make_survey, write_survey
     from tidefield.train.checkpoint import CHECKPOINT_FILE
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -13,11 +13,14 @@ from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.train import report_end
 from tidefield.config import PRESETS, Budget, Config, checked_seed, vary
 from tidefield.errors import RunError
-from tidefield.files import delete_partials, is_empty, only_writer
+from tidefield.files import delete_partials, is_empty, only_writer, read_json, write_json
 
 if TYPE_CHECKING:
     import torch
     from rich.console import Console
+
+PRETRAINING_FILE = "pretraining.json"
+"""What a training across scenes was started with."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Pretrain:
     """Of the weights, the scenes and their order."""
     device: Device = "auto"
     resume: bool = False
-    """Continue the training in the folder."""
+    """Continue the training in the folder, with the options that it was started with; only the budget may be another,
+    and counts from its start."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
@@ -55,8 +59,8 @@ def pretrain(options: Pretrain, console: Console) -> None:
     seed = checked_seed(options.seed)
     occupied = folder.exists() and (not folder.is_dir() or not is_empty(folder))
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
-    if options.resume and not occupied:
-        raise RunError(f"{folder} holds no training: expected one to continue; leave --resume out")
+    if options.resume:
+        _require_same(folder, _record(options))
     if occupied and not options.resume:
         raise RunError(f"{folder} is not empty: expected a new folder; choose another, or continue it with --resume")
     if not across.is_main_process():
@@ -81,7 +85,10 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
             raise RunError(f"--variant {options.variant} has no neighbouring views to learn from: choose another")
         config = varied
     if across.is_main_process():
-        delete_partials(*(folder / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)))
+        names = (PRETRAINING_FILE, CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)
+        delete_partials(*(folder / name for name in names))
+        if not options.resume:
+            write_json(folder / PRETRAINING_FILE, _record(options))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
         shown = next(iter(validation.scenes.values()))
@@ -102,3 +109,24 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         }
         write_weights(folder / WEIGHTS_FILE, trainer.network, trainer.config, description)
     report_end(trainer.progress, stopped, folder, console)
+
+
+def _record(options: Pretrain) -> dict[str, Any]:
+    """What must not change while a training is continued: its weights tell what they learned from."""
+    real = sorted(scene.resolve().name for scene in options.real)
+    return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
+
+
+def _require_same(folder: Path, record: dict[str, Any]) -> None:
+    """Raises: RunError when the folder holds no training across scenes, or one with other options."""
+    found = read_json(folder / PRETRAINING_FILE)
+    if not isinstance(found, dict):
+        raise RunError(
+            f"{folder} holds no training of `tidefield pretrain` (no {PRETRAINING_FILE}): expected one to continue; "
+            "name it, or leave --resume out"
+        )
+    wrong = [f"{name} {found.get(name)}, not {value}" for name, value in record.items() if found.get(name) != value]
+    if wrong:
+        raise RunError(
+            f"{folder} was started with {'; '.join(wrong)}: expected the same options to continue it; repeat them"
+        )

@@ -111,6 +111,7 @@ def _train(options: Train, console: Console, again: str) -> None:
             )
         if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
+        _require_its_options(options, run)
         weights = _resumed_weights(options, run)
         if options.budget == Budget() and run.budget is not None:
             budget = run.budget.checked()
@@ -198,6 +199,36 @@ def _start(folder: Path, run: Run, scene: Scene) -> None:
     opensplat.delete_training(folder)
     delete_evaluation(folder, scene.names)
     write_run(folder, run)
+
+
+def _require_its_options(options: Train, run: Run) -> None:
+    """Raises: RunError when a run is to be continued with options that are not its own."""
+    from tidefield.train.checkpoint import weights_sha256
+
+    config = run.config
+    preset = config.preset if isinstance(config, Config) else None
+    given = {
+        "--width": (options.width, None, run.width),
+        "--seed": (options.seed, 0, run.seed),
+        "--method": (options.method, "tidefield", config.method),
+        "--preset": (options.preset, "swift", preset),
+        "--from-scratch": (options.from_scratch, False, run.weights is None),
+        "--overwrite": (options.overwrite, False, False),
+    }
+    others = [
+        name if value is True else f"{name} {value}"
+        for name, (value, usual, own) in given.items()
+        if value not in (usual, own)
+    ]
+    if options.variant is not None and (preset is None or vary(PRESETS[preset], options.variant) != config):
+        others.append(f"--variant {options.variant}")
+    if options.weights is not None and weights_sha256(options.weights) != run.weights:
+        others.append(f"--weights {options.weights}")
+    if others:
+        raise RunError(
+            f"{options.run} was not started with {', '.join(others)}: expected its own options with --resume; leave "
+            f"{'it' if len(others) == 1 else 'them'} out"
+        )
 
 
 def _resumed_weights(options: Train, run: Run) -> Path | None:

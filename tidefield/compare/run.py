@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -118,12 +118,18 @@ def _make_link(link: Path, target: Path) -> None:
     """Make a link to a folder unless it is there; one that leads nowhere is replaced.
 
     Raises:
-        RunError: it leads to another folder.
+        RunError: it leads to another folder, or Windows does not let this user make links.
     """
     if link.is_symlink() and not link.exists():
         link.unlink()
     if not link.is_symlink():
-        link.symlink_to(target, target_is_directory=True)
+        try:
+            link.symlink_to(target, target_is_directory=True)
+        except OSError as error:
+            raise RunError(
+                f"{link} cannot be made ({error.strerror}): expected a place for links; on Windows turn Developer Mode "
+                "on, else name another folder with --out"
+            ) from error
     elif link.resolve() != target:
         raise RunError(
             f"{link} leads to {link.resolve()}: expected {target}, of the data set that is named; name another folder "
@@ -308,6 +314,22 @@ def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], se
             was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
             asked = {key: wanted[key] for key in was}
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
+
+
+def require_one_state(scenes: Iterable[str], methods: Sequence[str], out: Path) -> None:
+    """Raises: RunError when a scene's results are of different poses or splits: it was made anew in between."""
+    for name in scenes:
+        measured: dict[str, list[str]] = {}
+        for method in methods:
+            poses = (read_evaluation(out / RUNS / name / method) or {}).get("poses")
+            if poses is not None:
+                measured.setdefault(poses, []).append(method)
+        if len(measured) > 1:
+            groups = ", and ".join(", ".join(group) for group in measured.values())
+            raise RunError(
+                f"{out / RUNS / name} has results of {groups}, on different poses or splits of the scene: expected the "
+                "same for all; delete the older ones, or name another folder with --out"
+            )
 
 
 def _jobs(scenes: Mapping[str, Path], methods: Sequence[str], out: Path) -> list[tuple[Path, str, Path, str]]:
