@@ -70,3 +70,20 @@ def test_an_unknown_device_is_refused() -> None:
     assert choose_device("cpu") == CPU
     with pytest.raises(DeviceError, match="there is no device 'tpu'"):
         choose_device("tpu")
+
+
+def test_mps_is_taken_only_where_it_has_all_operations(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacking(*_: object, **__: object) -> None:
+        raise NotImplementedError("The operator 'aten::_embedding_bag' is not currently implemented for the MPS device")
+
+    assert device._has_all(CPU)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "_has_all", lambda _: True)
+        assert choose_device("auto") == choose_device("mps") == torch.device("mps")
+    monkeypatch.setattr(device, "embedding_bag", lacking)
+    assert not device._has_all(CPU)
+    assert choose_device("auto") == CPU
+    with pytest.raises(DeviceError, match="lacks what our networks need on MPS: expected a later one"):
+        choose_device("mps")

@@ -306,12 +306,12 @@ def vary(config: Config, name: str) -> AnyConfig:
 
 
 def variants_of(config: Config) -> tuple[str, ...]:
-    """The names of the variants that a configuration has."""
+    """The names of the variants that a configuration has, and is not itself."""
     names = []
     for name, change in VARIANTS.items():
         with contextlib.suppress(_NotApplicable):
-            change(config)
-            names.append(name)
+            if change(config) != config:
+                names.append(name)
     return tuple(names)
 
 
@@ -365,7 +365,7 @@ VARIANTS: dict[str, Callable[[Config], AnyConfig]] = {
     "with-ray-transformer": partial(_with, part="ray transformer"),
     "with-target-colour": partial(_with, part="target colour"),
     "with-every-part": lambda config: _with(_with(config, "ray transformer"), "target colour"),
-    **{f"degree-{degree}": partial(_degree, degree=degree) for degree in (0, 1, 2, 3, 4)},
+    **{f"degree-{degree}": partial(_degree, degree=degree) for degree in (0, 1, 2, 4)},
     **{f"views-{views}": partial(_network, views=views) for views in (2, 3, 4, 5, 6, 8, 10, 12)},
     "neighbours-seen": partial(_neighbours, strategy="seen"),
     "neighbours-direction": partial(_neighbours, strategy="direction"),

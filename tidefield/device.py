@@ -10,7 +10,7 @@ from threading import Lock
 from time import perf_counter
 
 import torch
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, embedding_bag, grid_sample
 
 from tidefield.errors import DeviceError
 
@@ -22,11 +22,17 @@ def choose_device(name: str) -> torch.device:
     """`auto` takes CUDA, then MPS, then the CPU; anything else must be there.
 
     Raises:
-        DeviceError: the device is unknown or not on this machine.
+        DeviceError: the device is unknown, not on this machine, or lacks what our networks compute.
     """
     there = ["cpu"]
     if torch.backends.mps.is_available():
-        there.insert(0, "mps")
+        if _has_all(torch.device("mps")):
+            there.insert(0, "mps")
+        elif name == "mps":
+            raise DeviceError(
+                f"PyTorch {torch.__version__} lacks what our networks need on MPS: expected a later one; update it, or "
+                "choose --device cpu"
+            )
     there[:0] = [f"cuda:{k}" for k in range(torch.cuda.device_count())]
     if name == "auto":
         return torch.device(there[0])
@@ -35,6 +41,22 @@ def choose_device(name: str) -> torch.device:
     if name not in there:
         raise DeviceError(f"there is no device {name!r} on this machine: expected auto or one of {', '.join(there)}")
     return torch.device(name)
+
+
+def _has_all(device: torch.device) -> bool:
+    """Whether PyTorch has our less usual operations on a device: on MPS they came one after another."""
+    try:
+        grid_sample(
+            torch.zeros(1, 1, 2, 2, device=device),
+            torch.zeros(1, 1, 1, 2, device=device),
+            padding_mode="border",
+            align_corners=False,
+        )
+        index, rows = torch.zeros(1, 2, dtype=torch.long, device=device), torch.zeros(2, 4, device=device)
+        embedding_bag(index, rows, per_sample_weights=torch.ones(1, 2, device=device), mode="sum")
+    except (NotImplementedError, RuntimeError):
+        return False
+    return True
 
 
 def choose_precision(device: torch.device) -> torch.dtype:

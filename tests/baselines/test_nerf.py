@@ -1,13 +1,14 @@
 """Classical NeRF: its encoding and rays against closed forms, and that it learns, is resumed and renders."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import textured_wall as wall
 import torch
 
-from tidefield.baselines.nerf import Mlp, Nerf, NerfTrainer, Rays, draw_pixels, encode
+from tidefield.baselines.nerf import Mlp, Nerf, NerfTrainer, Rays, draw_pixels, encode, make_render
 from tidefield.config import Budget, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
@@ -26,6 +27,13 @@ class Fog(Mlp):
 
     def forward(self, xyz, direction):
         return torch.full(xyz.shape[:2], 3.0), torch.full(xyz.shape, 0.25)
+
+
+class Nothing(Mlp):
+    """Empty space."""
+
+    def forward(self, xyz, direction):
+        return torch.full(xyz.shape[:2], -1.0), torch.zeros_like(xyz)
 
 
 def fog() -> Nerf:
@@ -100,7 +108,7 @@ def test_all_that_cameras_may_see_lies_between_minus_and_plus_one(scene: Scene):
 
 
 def test_pixels_are_drawn_from_training_photographs_alone_with_their_own_colours(scene: Scene):
-    which, uv, colour = draw_pixels(scene, 500, torch.Generator().manual_seed(0))
+    which, uv, colour, _ = draw_pixels(scene, 500, torch.Generator().manual_seed(0))
     assert set(which.tolist()) == set(scene.train)
     for index, (u, v), rgb in zip(which.tolist(), uv.long().tolist(), colour, strict=True):
         torch.testing.assert_close(rgb * 255, scene.photographs[index][v, u].float())
@@ -141,25 +149,30 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: S
 
 
 def test_a_background_shows_where_nothing_is(scene: Scene):
-    from dataclasses import replace
-
-    from tidefield.baselines.nerf import make_render
-
-    class Nothing(Mlp):
-        def forward(self, xyz, direction):
-            return torch.full(xyz.shape[:2], -1.0), torch.zeros_like(xyz)
-
     network = Nerf(SMALL)
     network.coarse, network.fine = Nothing(SMALL), Nothing(SMALL)
     view = make_render(network, replace(scene, background_rgb=(1.0, 0.5, 0.0)), CPU)(scene.cameras[0])
     torch.testing.assert_close(view.colour, torch.tensor([1.0, 0.5, 0.0]).expand(36, 48, 3))
 
 
+def test_nothing_is_learned_from_background_at_any_exposure(scene: Scene):
+    white = tuple(torch.full_like(photograph, 255) for photograph in scene.photographs.colours)
+    empty = replace(
+        scene,
+        cameras=wall.with_gains(scene.cameras),
+        photographs=replace(scene.photographs, colours=white),
+        background_rgb=(1.0, 1.0, 1.0),
+    )
+    learner = NerfTrainer(SMALL, empty, 0, CPU)
+    learner.nerf.coarse, learner.nerf.fine = Nothing(SMALL), Nothing(SMALL)
+    assert learner.loss()[0].item() == pytest.approx(0, abs=1e-10)
+
+
 def test_masked_pixels_are_not_drawn(scene: Scene):
     masked = wall.with_left_halves_masked(scene, scene.train[:2])
-    which, uv, colour = draw_pixels(masked, 500, torch.Generator().manual_seed(0))
+    which, uv, colour, _ = draw_pixels(masked, 500, torch.Generator().manual_seed(0))
     everything = draw_pixels(scene, 500, torch.Generator().manual_seed(0))
     kept = (everything[1][:, 0] >= scene.cameras.width // 2) | ~torch.isin(everything[0], torch.tensor(scene.train[:2]))
     assert 100 < len(which) == kept.sum() < 500
-    for drawn, all_of_them in zip((which, uv, colour), everything, strict=True):
+    for drawn, all_of_them in zip((which, uv, colour), everything[:3], strict=True):
         assert torch.equal(drawn, all_of_them[kept])

@@ -90,6 +90,9 @@ def test_a_path_of_a_file_has_its_own_size_unless_another_in_its_proportion_is_g
         assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
     stretched = ["--path", path, "--width", 32, "--height", 32]
     assert "the same proportion" in fails(capsys, "render", run, tmp_path / "a.mp4", *stretched)
+    name = load_scene(scene).names[0]
+    stretched = ["--camera", name, "--width", 32, "--height", 32]
+    assert "the same proportion" in fails(capsys, "render", run, tmp_path / "a.png", *stretched)
 
 
 def test_a_run_is_evaluated_at_another_width_than_its_own_and_with_several_rays(

@@ -83,6 +83,19 @@ def test_the_memory_is_that_of_the_gpu_that_was_used(scene, tmp_path, monkeypatc
     assert found == [None, 7_000_000]
 
 
+def test_the_memory_is_that_of_all_photographs(tmp_path, monkeypatch):
+    scene = wall.scene(wall.cameras(5), test=(1, 3))
+    peak = [0]
+
+    def render(camera):
+        peak[0] += 1_000_000
+        return perfect(camera)
+
+    monkeypatch.setattr(module, "_peak_memory", lambda: {"peak_memory_bytes": peak[0], "peak_cuda_memory_bytes": None})
+    report = evaluate(render, scene, tmp_path, configuration={}, console=quiet()).report
+    assert report["peak_memory_bytes"] == 2_000_000
+
+
 @pytest.mark.parametrize("prepared_without", [True, False])
 def test_the_report_says_whether_poses_know_of_the_held_out_photographs(prepared_without, scene, tmp_path):
     scene = replace(scene, root=tmp_path)

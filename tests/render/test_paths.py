@@ -8,6 +8,7 @@ import torch
 from captures import SCENES, TILT, UP, angle, object_scene, oblique, scene_of, survey
 from torch import Tensor
 
+from tidefield.data.hull import Hull, hull_range
 from tidefield.data.scene import Scene
 from tidefield.geometry.lenses import Lens
 from tidefield.render.camera_paths import (
@@ -198,3 +199,20 @@ def test_a_free_camera_always_has_a_range():
     close[:, 3] += 36 * pose[:, 2]
     near, far = free_camera(dense, close, lens).near_far[0].tolist()
     assert near < 4 < far < 10
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.5, 4.0, 8.0])
+def test_without_points_a_free_camera_has_the_range_of_the_visual_hull(distance: float):
+    hull = Hull(torch.full((3,), -0.5), torch.full((3,), 0.25), torch.ones(4, 4, 4, dtype=torch.bool))
+    scene = replace(object_scene(), points=None, hull=hull)
+    pose, lens = np.eye(3, 4), Lens(40, 30, 30.0, 30.0, 20.0, 15.0)
+    pose[2, 3] = -distance
+    camera = free_camera(scene, pose, lens)
+    far = distance + 0.5
+    assert camera.near_far[0].tolist() == pytest.approx([max(distance - 0.5, 0.02 * far), far])
+    assert hull_range(camera, hull)[2][15, 20]
+    pose[:, 1:3] *= -1
+    away = free_camera(scene, pose, lens).near_far
+    if distance > 0.5:
+        low, high = scene.cameras.near_far[list(scene.train)].T
+        assert away[0].tolist() == pytest.approx([float(low.quantile(0.05)), float(high.quantile(0.95))])

@@ -192,6 +192,15 @@ def test_training_begins_with_few_photographs_and_learns_from_all(
     assert (len(trainer._targets(trainer.open_area().area)) > 4) == at_once
 
 
+def test_another_seed_begins_with_other_photographs() -> None:
+    many = wall.scene(wall.cameras(20, step=0.3))
+    first = []
+    for seed in (3, 3, 4):
+        trainer = SceneTrainer(SMALL, many, seed=seed, device=CPU)
+        first.append(trainer._targets(trainer.open_area().area))
+    assert first[0] == first[1] != first[2]
+
+
 HELD = """
 import re, sys
 import torch

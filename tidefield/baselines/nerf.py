@@ -193,14 +193,16 @@ class NerfTrainer(Trainer):
     def loss(self) -> tuple[Tensor, Tensor]:
         """Compute the squared errors of both passes (NeRF's eq. 6), and that of the fine one."""
         scene, device = self.scene, self.device
-        which, uv, truth = draw_pixels(scene, self.config.rays, self.generator)
+        which, uv, truth, gain = draw_pixels(scene, self.config.rays, self.generator)
         rays = Rays.of(self.cameras, which.to(device), uv.to(device))
         background, truth = scene.background_rgb, truth.to(device)
         errors = []
         for seen in self.nerf(rays, background is None, self.generator, self.precision):
             colour = seen.colour
             if background is not None:
-                colour = colour + (1 - seen.opacity[:, None]) * colour.new_tensor(background)
+                # The background has no exposure: rendering adds it to colours that the gain was applied to.
+                behind = colour.new_tensor(background) / gain.to(device)
+                colour = colour + (1 - seen.opacity[:, None]) * behind
             errors.append(F.mse_loss(colour, truth))
         return errors[0] + errors[1], errors[1].detach()
 
@@ -210,23 +212,23 @@ class NerfTrainer(Trainer):
 
 def draw_pixels(
     scene: Scene, count: int, generator: torch.Generator
-) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 2"], Float[Tensor, "R 3"]]:
-    """Random pixels of random training photographs: which photographs, where, and their colours at common exposure.
+) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 2"], Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+    """Random pixels of random training photographs: which, where, their colours at common exposure, and their gains.
 
     Those of them that are masked are left out.
     """
     train = torch.tensor(scene.train)
     which = train[torch.randint(len(train), (count,), generator=generator)]
     pixel = (torch.rand(count, 2, generator=generator) * scene.cameras.size_px[which]).floor()
-    colour, used = torch.empty(count, 3), torch.ones(count, dtype=torch.bool)
+    colour, gain, used = torch.empty(count, 3), torch.empty(count, 3), torch.ones(count, dtype=torch.bool)
     for index in which.unique().tolist():
         mine = which == index
         u, v = pixel[mine].long().unbind(-1)
-        gain = scene.cameras[index].gain_at(pixel[None, mine] + 0.5)[0]
-        colour[mine] = scene.photographs[index][v, u].float() / (255 * gain)
+        gain[mine] = scene.cameras[index].gain_at(pixel[None, mine] + 0.5)[0]
+        colour[mine] = scene.photographs[index][v, u].float() / (255 * gain[mine])
         if scene.photographs.masks:
             used[mine] = scene.photographs.used(index)[v, u]
-    return which[used], pixel[used] + 0.5, colour[used]
+    return which[used], pixel[used] + 0.5, colour[used], gain[used]
 
 
 def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:

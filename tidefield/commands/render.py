@@ -85,7 +85,7 @@ def render(options: Render, console: Console) -> None:
     with opened as (scene, view, record):
         if camera is not None:
             own = scene.cameras[scene.index(camera)]
-            own = own.resized(*_size(own, options.width, options.height))
+            own = _resized(own, options.width, options.height)
             made = view(replace(own, names=()) if options.with_itself else own)
             for file in write_still(made, out, about=describe_view(scene, own), overwrite=overwrite):
                 console.print(str(file), highlight=False, soft_wrap=True)
@@ -117,11 +117,11 @@ def render(options: Render, console: Console) -> None:
 
 
 def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras:
-    """Cameras of a path in a size in their own proportion, if one is given: those of a file have their own."""
+    """Cameras in a size in their own proportion, if one is given."""
     own, size = cameras[0], _size(cameras[0], width, height)
     if abs(size[0] * own.height - size[1] * own.width) > max(own.width, own.height):
         raise RunError(
-            f"--width {width} --height {height} was given for a path of {own.width} x {own.height} pixels: expected "
+            f"--width {width} --height {height} was given for views of {own.width} x {own.height} pixels: expected "
             "the same proportion; leave one of them out"
         )
     return cameras.resized(*size)

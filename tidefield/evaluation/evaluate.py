@@ -86,14 +86,11 @@ def evaluate(
     files = picture_names([scene.names[i] for i in scene.test])
     delete_partials(path, *(out / folder / file for folder in FOLDERS for file in files))
     photographs: dict[str, dict[str, Any]] = {}
-    memory: dict[str, int | None] = {}
-    networks: dict[str, Lpips | str] = {}
+    networks = load_lpips()
     with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
             rendering, seconds = _timed(render, scene, index)
-            if not memory:
-                # Measured before LPIPS's networks are loaded, which are no part of the method.
-                memory, networks = _peak_memory(), load_lpips()
+            if not photographs:
                 delete_files(out, [path])  # an older one is not of the pictures that follow
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
             used = scene.photographs.used(index)
@@ -113,7 +110,7 @@ def evaluate(
         "mean": _mean(list(photographs.values())),
         "rays_per_second": int(scene.cameras.size_px[list(scene.test)].prod(1).sum()) / seconds_in_all,
         "seconds_per_frame": seconds_in_all / len(photographs),
-        **memory,
+        **_peak_memory(),
         "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
         "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
         "version": __version__,

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import softmax
 
+from tidefield.data.hull import Hull
 from tidefield.data.near_far import ranges_of_points, with_widest
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
@@ -52,6 +53,8 @@ SWING = np.radians(25)
 GENTLE = np.radians(0.8)
 """Largest motion of such a flight from frame to frame, as an angle seen from the ground, and its largest turn."""
 SAMPLES_PER_KEY = 32
+LEAST_NEAR = 0.02
+"""Near of a camera inside the box around a visual hull, as a share of its far."""
 ROTATION_SMOOTHING = 0.3
 """Standard deviation of the smoothing of orientations, in key frames: rounds the corners of slerp at the keys."""
 DETOUR = 2
@@ -437,7 +440,8 @@ def free_camera(scene: Scene, T_world_camera: Float64[np.ndarray, "3 4"], lens: 
 def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Lens, ...]) -> Float64[np.ndarray, "N 2"]:
     """Return the depth ranges of the sparse points, smoothed over the frames.
 
-    Frames that show few of them have the widest range of any frame; where all do, that of the photographs.
+    Frames that show few of them have the widest range of any frame; where all do, and the scene has a visual hull, that
+    of the box around it, else that of the photographs.
     """
     ranges = np.full((len(pose), 2), np.nan)
     xyz = np.zeros((0, 3)) if scene.points is None else scene.points.xyz_world.double().cpu().numpy()
@@ -446,9 +450,21 @@ def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Le
         if len(few) and len(xyz):
             some = Observations(xyz[:: len(xyz) // most + 1])
             ranges[few] = ranges_of_points(pose[few], tuple(lenses[i] for i in few), some)
+    if scene.hull is not None and np.isnan(ranges).all():
+        ranges = _ranges_of_hull(scene.hull, pose)
     filled = with_widest(ranges)
     if filled is None:
         near, far = scene.cameras.near_far[list(scene.train)].double().cpu().numpy().T
         filled = np.tile([np.quantile(near, 0.05), np.quantile(far, 0.95)], (len(pose), 1))
     # A jump of the range would be a jump in the picture: samples lie elsewhere.
     return np.exp(gaussian_filter1d(np.log(filled), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))
+
+
+def _ranges_of_hull(hull: Hull, pose: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 2"]:
+    """Nearest and farthest depth of the box around a visual hull, which a camera may be in; NaN where it is behind."""
+    side = hull.voxel_world.double().cpu().numpy() * len(hull.filled)
+    corners = hull.corner_world.double().cpu().numpy() + side * np.array(list(np.ndindex(2, 2, 2)))
+    depth = (corners - pose[:, None, :, 3]) @ pose[:, :, 2, None]
+    near, far = depth.min(axis=1)[:, 0], depth.max(axis=1)[:, 0]
+    ranges = np.stack([near.clip(min=LEAST_NEAR * far), far], axis=1)
+    return np.where(far[:, None] > 0, ranges, np.nan)

@@ -258,7 +258,8 @@ class SceneTrainer(Trainer):
         """The photographs of an area that the next step draws from: a few at first, then more and more."""
         step = self.progress.step
         turn, within = (0, step) if len(self.areas) == 1 else divmod(step, STEPS_EACH)
-        order = torch.randperm(len(area.targets), generator=torch.Generator().manual_seed(turn))
+        seed = self.generator.initial_seed()  # of a run that is continued, too: its state has it
+        order = torch.randperm(len(area.targets), generator=torch.Generator().manual_seed(seed + turn))
         return [area.targets[k] for k in order[: FIRST_TARGETS + within // STEPS_PER_TARGET].tolist()]
 
     def loss(self, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
