@@ -1,5 +1,6 @@
 """Matching finds the textured wall from a wrong start, leaves what it cannot see, and says how far to search."""
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from tidefield.data.images import Read
 from tidefield.data.matching import Matcher
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
+from tidefield.data.surface import seen_count
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.sampling import intervals_from_prior
 from tidefield.parallel import read_ahead
@@ -109,6 +111,23 @@ def test_without_any_expected_depth_all_of_the_range_is_searched():
     assert cells[0].isnan().all()
     error = parallax_px(at, matched(at, cells))[6:-6, 12:-12]
     assert error.median() < 0.05
+
+
+@pytest.mark.parametrize("beside", [(0.3, 3.0), (0.4, 3.2)])
+def test_without_any_expected_depth_what_one_photograph_sees_lies_where_its_surroundings_do(
+    beside: tuple[float, float],
+):
+    own = wall.cameras(3, 128, 96)
+    pose = own.T_world_camera.clone()
+    pose[:, 0, 3] = torch.tensor([0.0, *beside])  # of two photographs, one shows little of the view
+    at = replace(wall.scene(replace(own, T_world_camera=pose), (0,)), points=None)
+    camera, others = at.cameras[0], at.cameras[[1, 2]]
+    seen = seen_count(camera, wall.true_depth(camera), others)
+    assert (seen == 1).sum() > 1000
+    found = 1 / inverse_depth(Matcher(at)(camera, surface_prior(camera, None, at.cameras)), camera)
+    alone = found[seen == 1]
+    assert (alone > camera.near_far[0, 1]).float().mean() < 0.1
+    assert (alone / wall.true_depth(camera)[seen == 1]).log().abs().median() < math.log(1.25)
 
 
 def test_the_interval_is_a_few_pixels_of_parallax_around_the_surface():

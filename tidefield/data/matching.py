@@ -302,7 +302,14 @@ class Matcher:
         curvature = (before - 2 * lowest + after).clamp(min=1e-6)
         offset = best[0] - steps + ((before - after) / (2 * curvature)).clamp(-1, 1)
         known = curvature / (lowest + LEAST_COST) + 1e-4
-        found = _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX)
+        if reach:
+            # What fewer than two photographs see fits at every depth; it lies where what is around it does.
+            several = torch.zeros_like(start)
+            for look in looks:
+                several[look.rows, look.columns] += look.weight > 0
+            found = _filled(start + (step * offset).clamp(-reach, reach), known * (several > 1))
+        else:
+            found = _box((start + step * offset) * known, SMOOTH_PX) / _box(known, SMOOTH_PX)
         return found, _Fit(known, lowest, step)
 
     def _looks(
@@ -436,6 +443,17 @@ def _box(values: Float[Tensor, "*K H W"], side: int) -> Float[Tensor, "*K H W"]:
         counts = _window_sums(values.new_ones(values.shape[dim]), side, -1)
         values = _window_sums(values, side, dim) / (counts[:, None] if dim == -2 else counts)
     return values
+
+
+def _filled(values: Float[Tensor, "H W"], weight: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Weighted means over the smallest windows in which something has weight; the values where nothing has."""
+    filled, empty, side = values, torch.ones_like(values, dtype=torch.bool), SMOOTH_PX
+    while empty.any() and side < 4 * max(values.shape):
+        share = _box(weight, side)
+        found = empty & (share > 0)
+        filled = torch.where(found, _box(values * weight, side) / share.clamp(min=1e-12), filled)
+        empty, side = empty & ~found, 2 * side + 1
+    return filled
 
 
 def _window_sums(values: Tensor, side: int, dim: int) -> Tensor:
