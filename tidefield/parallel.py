@@ -80,12 +80,22 @@ def read_ahead(read: Callable[[K], T], keys: Sequence[K], device: torch.device |
 
 @contextmanager
 def interruptible(check: Callable[[], None]) -> Iterator[None]:
-    """Have `in_parallel` call a function before each task, from the task's thread: what it raises ends the work."""
+    """Have a function called before each piece of the work: what it raises ends the work.
+
+    `in_parallel` calls it before each task, from the task's thread; other work by `check_interrupted`.
+    """
     token = _CHECK.set(check)
     try:
         yield
     finally:
         _CHECK.reset(token)
+
+
+def check_interrupted() -> None:
+    """End the work of this thread here if it is not wanted any more (`interruptible`)."""
+    check = _CHECK.get()
+    if check is not None:
+        check()
 
 
 @contextmanager

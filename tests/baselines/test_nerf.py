@@ -12,6 +12,7 @@ from tidefield.baselines.nerf import Mlp, Nerf, NerfTrainer, Rays, draw_pixels, 
 from tidefield.config import Budget, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
+from tidefield.parallel import interruptible
 
 CPU = torch.device("cpu")
 SMALL = NerfConfig(coarse=8, fine=8, depth=4, width=32, position_octaves=6, rays=128, learning_rate=5e-3)
@@ -153,6 +154,18 @@ def test_a_background_shows_where_nothing_is(scene: Scene):
     network.coarse, network.fine = Nothing(SMALL), Nothing(SMALL)
     view = make_render(network, replace(scene, background_rgb=(1.0, 0.5, 0.0)), CPU)(scene.cameras[0])
     torch.testing.assert_close(view.colour, torch.tensor([1.0, 0.5, 0.0]).expand(36, 48, 3))
+
+
+def test_a_view_that_is_not_wanted_any_more_ends_at_the_next_rays(scene: Scene):
+    begun = []
+
+    def check() -> None:
+        begun.append(1)
+        if len(begun) == 2:
+            raise TimeoutError
+
+    with interruptible(check), pytest.raises(TimeoutError):
+        make_render(fog(), scene, CPU)(scene.cameras[0])
 
 
 def test_nothing_is_learned_from_background_at_any_exposure(scene: Scene):

@@ -137,6 +137,23 @@ def test_the_worker_sees_only_the_gpu_that_was_asked_for(
     assert seen.read_text().splitlines() == [expected, expected, str(visible)]
 
 
+def test_a_worker_that_has_died_between_two_views_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    script = tmp_path / "worker.py"
+    script.write_text("import sys\nprint('{}', flush=True)\nsys.exit('no memory is left')")
+    monkeypatch.setattr(driver, "WORKER", script)
+    monkeypatch.setattr(driver, "python", lambda: Path(sys.executable))
+    with driver._worker(["render"], tmp_path / "log", CPU) as worker:
+        worker.answer()
+        worker.process.wait()
+        with pytest.raises(RunError, match="nerfstudio ended before it was done"):
+            worker.ask({"file": "view.npz"})
+    assert "no memory is left" in caplog.text
+    assert worker.process.stdout is not None
+    assert worker.process.stdout.closed
+
+
 @pytest.fixture
 def standin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """nerfstudio's own worker, in a process where nerfstudio is its stand-in."""

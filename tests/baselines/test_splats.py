@@ -14,6 +14,7 @@ from tidefield.baselines import splats as module
 from tidefield.baselines.splats import Splats, read_splats, render_splats
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.parallel import interruptible
 
 CPU, BLACK = torch.device("cpu"), (0.0, 0.0, 0.0)
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -99,6 +100,18 @@ def test_what_is_nearer_covers_what_is_farther():
     assert view.opacity[13, 20] == pytest.approx(0.975, abs=1e-5)
     behind = render_splats(splats, camera(math.pi), BLACK, CPU)
     assert behind.opacity.max() == 0
+
+
+def test_a_view_that_is_not_wanted_any_more_ends_at_the_next_tile():
+    begun = []
+
+    def check() -> None:
+        begun.append(1)
+        if len(begun) == 3:
+            raise TimeoutError
+
+    with interruptible(check), pytest.raises(TimeoutError):
+        render_splats(gaussians([[0.0, 0.0, 4.0]], [0.1], [0.5], [[1.0, 1.0, 1.0]]), camera(), BLACK, CPU)
 
 
 def test_light_is_followed_until_hardly_any_is_left(monkeypatch: pytest.MonkeyPatch):

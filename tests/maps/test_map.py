@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tidefield.change.inputs import open_survey
 from tidefield.commands.common import ZeroShot
 from tidefield.commands.map_ import Map, map_
 from tidefield.data.georeference import Georeference, Residuals
@@ -189,6 +190,32 @@ def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path,
     with pytest.raises(RunError, match="holds something else"):
         mapped(scene, tmp_path / "mine")
     assert (out / MAP_FILE).read_bytes() == before
+
+
+def test_a_map_that_replaces_another_has_none_of_its_files(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def files(folder: Path) -> set[str]:
+        found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+        return {name for name in found if not name.startswith((make.TILES, ".lock"))}
+
+    def killed(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    own, lines, small = tmp_path / "map", tmp_path / "lines.geojson", polygon(tmp_path, 2.0)
+    lines.write_text(json.dumps({"type": "LineString", "coordinates": [[-1, 0], [1, 0]]}))
+    mapped(scene, own, area=small, fill=True, sections=lines)
+    assert files(own) == {MAP_FILE, *make.PRODUCTS}
+    (own / "odm_dem" / "notes.txt").write_text("mine")
+    with monkeypatch.context() as patch:
+        patch.setattr(make, "join", killed)
+        with pytest.raises(KeyboardInterrupt):
+            mapped(scene, own, area=small, overwrite=True)
+    assert files(own) == {MAP_FILE, "odm_dem/notes.txt"}
+    mapped(scene, own, area=small)
+    assert open_survey(own).filled is None
+    left = {name for name in make.PRODUCTS if name != make.FILLED and not name.startswith(make.SECTIONS)}
+    assert files(own) == {MAP_FILE, "odm_dem/notes.txt", *left}
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from tidefield.model.cache import FeatureCache
 from tidefield.model.network import Network, TileRendering
 from tidefield.model.renderer import Renderer, in_turn
 from tidefield.model.sampling import Intervals, Tiles, place_samples
+from tidefield.parallel import interruptible
 from tidefield.train import loop
 
 PASSES = {"swift": "passes", "paper": "aggregate"}
@@ -365,3 +366,23 @@ def test_coarse_colours_are_the_neighbours_mean_colours_under_the_coarse_weights
     means = torch.stack([truth[v - 2 : v + 2, u - 2 : u + 2].mean((0, 1)) for u, v in uv[inside].tolist()])
     error = (result.coarse_colours[0][0][inside] - means).mean().abs()
     assert error < 0.02, "mean colours are not those of the wall"
+
+
+def test_a_view_whose_pieces_are_made_one_by_one_ends_at_the_next_when_it_is_not_wanted_any_more():
+    at = scene()
+    renderer = Renderer(network(SMALL_PAPER).eval(), at, replace(PAPER, network=SMALL_PAPER), CPU)
+    renderer.tiles_in_parallel, renderer.tiles_at_once = False, 1
+    compute, computed = renderer._compute, []
+
+    def compute_one(*given) -> Tensor:
+        computed.append(1)
+        return compute(*given)
+
+    def check() -> None:
+        if computed:
+            raise TimeoutError
+
+    renderer._compute = compute_one
+    with interruptible(check), pytest.raises(TimeoutError):
+        renderer(at.cameras[TARGET])
+    assert len(computed) == 1

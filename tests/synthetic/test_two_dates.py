@@ -1,8 +1,15 @@
 """One flat at two dates: the change is what was asked for, and known exactly."""
 
-import numpy as np
-import torch
+from pathlib import Path
 
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.synthetic.flights import write_flights
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import Difference, SurveyErrors, ground_pair, make_pair, surveyed
 
@@ -48,3 +55,15 @@ def test_photographs_of_both_dates_show_the_flat_that_changed():
     assert float(pair.later.cameras.position_world[:, 2].mean()) > float(
         pair.earlier.cameras.position_world[:, 2].mean()
     )
+
+
+def test_flights_can_be_written_where_opencv_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its `imwrite` takes no other names than ASCII on Windows."""
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
+    pair = make_pair("river_mouths", 3, Difference(change_m=0.3, tide_m=0.0), views=4, width=64, supersample=1)
+    dates = ("2023-05-01", "2024-05-01")
+    write_flights(pair, tmp_path / "Süßwasserwatt", LocalFrame.at("EPSG:32631", (5e5, 5.8e6, 0.0)), dates, 11)
+    for k, survey in enumerate((pair.earlier, pair.later)):
+        shown = Image.open(tmp_path / "Süßwasserwatt" / dates[k] / "photographs" / f"IMG_{k}003.jpg")
+        error = np.asarray(shown).astype(int) - survey.photographs[3].numpy()
+        assert np.abs(error).mean() < 4

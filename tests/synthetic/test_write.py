@@ -94,6 +94,18 @@ def test_photographs_can_be_jpegs(survey: Survey, tmp_path: Path) -> None:
     assert np.abs(picture[..., ::-1].astype(int) - survey.photographs[1].numpy()).mean() < 4
 
 
+def test_folders_can_have_names_that_opencv_cannot_write_to(
+    survey: Survey, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its `imwrite` takes no other names than ASCII on Windows."""
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
+    write_survey(survey, tmp_path / "Süßwasserwatt")
+    pictures = [path.relative_to(folder) for path in folder.rglob("*.png")]
+    assert len(pictures) == 9 + 2
+    for path in pictures:
+        assert (tmp_path / "Süßwasserwatt" / path).read_bytes() == (folder / path).read_bytes()
+
+
 def test_the_truth_can_be_left_out(survey: Survey, folder: Path, tmp_path: Path) -> None:
     write_survey(survey, tmp_path / "scene", truth=False)
     written = {path.relative_to(tmp_path / "scene") for path in (tmp_path / "scene").rglob("*") if path.is_file()}

@@ -15,6 +15,7 @@ from map_folders import CELL, SHAPE, corner, write_change, write_map
 from surveys_of_two_dates import write_surface
 
 from tidefield.errors import RunError
+from tidefield.maps.grid import LOCAL_WKT
 from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
 
 
@@ -42,6 +43,44 @@ def test_a_tile_has_the_cell_below_each_of_its_pixels(tmp_path: Path):
         inside = np.ix_(rows < SHAPE[0], columns < SHAPE[1])
         expected[inside] = heights[np.ix_(rows[rows < SHAPE[0]], columns[columns < SHAPE[1]])]
         assert np.allclose(decoded(content), expected, atol=STEP / 2 + 1e-5, equal_nan=True)
+
+
+@pytest.mark.parametrize(("kind", "most"), [(np.uint16, 4000), (np.float32, 0.6)])
+def test_a_picture_of_other_numbers_than_bytes_is_shown_from_black_to_white(tmp_path: Path, kind: type, most: float):
+    ramp = np.linspace(0, most, SHAPE[1]).astype(kind)
+    picture = np.stack([np.broadcast_to(band, SHAPE) for band in (ramp, ramp / 2, ramp)]).astype(kind)
+    write_surface(tmp_path / "odm_orthophoto" / "odm_orthophoto.tif", picture, CELL)
+    content = Atlas([tmp_path]).tile(0, "orthophoto", 0, 0, 0)
+    assert content is not None
+    shown = np.asarray(Image.open(io.BytesIO(content)))
+    red, green, blue, _ = shown[10, shown[10, :, 3] > 0].astype(int).T
+    assert (np.diff(red) >= 0).all()
+    assert (red[0], red[-1]) == (0, 255)
+    assert (red == blue).all()
+    assert abs(2 * green - red).max() < 8, "all bands are stretched alike"
+
+
+def test_bytes_of_a_picture_are_shown_as_they_are(tmp_path: Path):
+    content = Atlas([write_map(tmp_path / "map", (200, 1, 128))]).tile(0, "orthophoto", 0, 0, 0)
+    assert content is not None
+    assert np.asarray(Image.open(io.BytesIO(content)))[10, 10].tolist() == [200, 1, 128, 255]
+
+
+@pytest.mark.parametrize(
+    ("system", "units", "measures"),
+    [
+        (LOCAL_WKT, ("units", "units"), ("units", "square units", "cubic units")),
+        ('LOCAL_CS["site",UNIT["metre",1]]', ("m", "m"), ("m", "m²", "m³")),
+        ("EPSG:32630", ("m", "m"), ("m", "m²", "m³")),
+    ],
+)
+def test_lengths_are_metres_where_a_system_knows_them(
+    tmp_path: Path, system: str, units: tuple[str, str], measures: tuple[str, str, str]
+):
+    write_surface(tmp_path / "dsm.tif", np.ones(SHAPE, np.float32), CELL, crs=system)
+    atlas = Atlas([tmp_path])
+    assert (atlas.unit, atlas.unit_up) == units
+    assert tuple(atlas.describe()[name] for name in ("length", "area", "volume")) == measures
 
 
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):

@@ -12,7 +12,8 @@ import torch
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
-from tidefield.parallel import in_parallel
+from tidefield.parallel import check_interrupted, in_parallel
+from tidefield.viewer import frames
 from tidefield.viewer.frames import COARSE_PX, Frame, FrameServer
 
 PATIENCE = 20.0
@@ -30,9 +31,10 @@ def grey(camera: Cameras, value: float = 0.5) -> Rendering:
 
 
 class SlowMethod:
-    """A method whose picture has pieces; each waits until it may go on."""
+    """A method whose picture has pieces, made on all cores or one by one; each waits until it may go on."""
 
-    def __init__(self) -> None:
+    def __init__(self, one_by_one: bool = False) -> None:
+        self.one_by_one = one_by_one
         self.may_go = threading.Event()
         self.started, self.finished, self.pieces = 0, 0, 0
 
@@ -44,7 +46,12 @@ class SlowMethod:
             self.may_go.wait(PATIENCE)
             return 0
 
-        in_parallel([piece] * 50, "cpu")
+        if self.one_by_one:
+            for _ in range(50):
+                check_interrupted()
+                piece()
+        else:
+            in_parallel([piece] * 50, "cpu")
         self.finished += 1
         return grey(camera)
 
@@ -96,8 +103,9 @@ def test_a_coarse_picture_comes_first_and_a_sharp_one_follows():
     assert shown[1].rendering.colour.shape == (300, 400, 3)
 
 
-def test_motion_cancels_the_sharp_picture_that_is_being_made():
-    method, shown = SlowMethod(), Shown()
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_motion_cancels_the_sharp_picture_that_is_being_made(one_by_one: bool):
+    method, shown = SlowMethod(one_by_one), Shown()
     with serving(method) as server:
         server.ask("a", camera(0.0), shown)
         eventually(lambda: method.pieces > 0)
@@ -207,3 +215,25 @@ def test_what_makes_coarse_pictures_faster_is_prepared_while_nothing_moves():
         eventually(lambda: left[0] == 0)
         time.sleep(0.05)
         assert left[0] == 0
+
+
+def test_closing_waits_for_no_method_that_does_not_hear_of_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(frames, "END_SECONDS", 0.1)
+    begun, may_go = threading.Event(), threading.Event()
+
+    def method(camera: Cameras) -> Rendering:
+        begun.set()
+        may_go.wait(PATIENCE)
+        raise FileNotFoundError("what it renders with is gone")
+
+    with serving(method) as server:
+        server.ask("a", camera(), Shown())
+        assert begun.wait(PATIENCE)
+        start = time.monotonic()
+        server.close()
+        assert time.monotonic() - start < PATIENCE / 4
+        may_go.set()
+        eventually(lambda: not server.busy)
+    assert caplog.text == ""

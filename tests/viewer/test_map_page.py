@@ -3,9 +3,14 @@
 import http.client
 import io
 import json
+import logging
 import os
 import re
 import socket
+import struct
+import sys
+import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +25,10 @@ from PIL import Image
 
 pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
 
-from map_folders import SHAPE, corner, write_change, write_map
+from map_folders import CELL, SHAPE, corner, write_change, write_map
+from surveys_of_two_dates import write_surface
 
+from tidefield.maps.grid import LOCAL_WKT
 from tidefield.viewer.atlas import Atlas
 from tidefield.viewer.map_page import MapPage, _Handler, _Server
 
@@ -108,6 +115,26 @@ def test_the_swipe_shows_both_dates_the_slider_changes_them_and_the_address_brin
         assert errors == []
         tab.close()
         again.close()
+
+
+def test_what_is_measured_on_a_map_without_a_georeference_is_in_units(tmp_path: Path, browser):
+    folder = tmp_path / "map"
+    write_surface(folder / "odm_dem" / "dsm.tif", np.eye(*SHAPE, dtype=np.float32), CELL, crs=LOCAL_WKT)
+    with page_of(folder) as page:
+        tab = browser.new_page(viewport=SIZE)
+        found = {}
+        for tool, places in (("ruler", 2), ("section", 2), ("area", 3)):
+            points = ";".join("{:.3f},{:.3f}".format(*corner(*at)) for at in ((60, 30), (75, 30), (75, 45))[:places])
+            tab.goto("about:blank")
+            tab.goto(f"{page.address}/#tool={tool}&points={points}")
+            tab.locator('#result[aria-busy="false"]').wait_for()
+            found[tool] = tab.locator("#result").inner_text()
+        tab.close()
+    assert re.search(r"^Distance 7.50 units\s", found["ruler"])
+    assert "units up" in found["ruler"]
+    assert found["section"].startswith("Section of 7.50 units")
+    assert re.search(r"^Area 28.1 square units\s", found["area"])
+    assert re.search(r"[\d.]+ cubic units", found["area"])
 
 
 def test_the_level_of_detection_hides_smaller_changes_and_the_area_has_the_volume(tmp_path: Path, browser):
@@ -284,6 +311,39 @@ def test_a_browser_that_has_moved_on_is_no_defect(caplog: pytest.LogCaptureFixtu
     handler.do_GET()
     assert handler.close_connection
     assert caplog.text == ""
+
+
+def test_connections_that_fail_print_nothing_on_the_terminal(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    def answer(port: int, question: bytes) -> bytes:
+        """What the server says first, before the browser resets the connection."""
+        with socket.create_connection(("127.0.0.1", port)) as connection:
+            connection.settimeout(20)
+            connection.sendall(question)
+            found = connection.recv(1 << 16)
+            linger = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        end = time.monotonic() + 20
+        while any("process_request" in thread.name for thread in threading.enumerate()):
+            assert time.monotonic() < end, "the server still waits"
+            time.sleep(0.01)
+        return found
+
+    caplog.set_level(logging.INFO, "tidefield")
+    with page_of(write_map(tmp_path / "map", (1, 2, 3))) as page:
+        port = int(page.address.rpartition(":")[2])
+        assert answer(port, b"GET /atlas.json HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 200")
+        for question in (b"GET / HTTP/1.1\r\nHost: [", b"GET http://[ HTTP/1.1\r\nHost: localhost"):
+            assert answer(port, question + b"\r\n\r\n").startswith(b"HTTP/1.1 400")
+        assert caplog.text == ""
+        monkeypatch.setattr(_Handler, "parse_request", lambda _: 1 // 0)
+        answer(port, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert "ZeroDivisionError" in caplog.text
+    assert capsys.readouterr().err == ""
 
 
 def test_the_server_answers_nothing_but_its_page(tmp_path: Path):

@@ -24,6 +24,7 @@ from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.compositing import composite, weights
 from tidefield.model.rendering import Render, Rendering, with_rays
 from tidefield.model.sampling import sample
+from tidefield.parallel import check_interrupted
 from tidefield.train.loop import Trainer
 
 RAYS_AT_ONCE = 1024
@@ -238,6 +239,7 @@ def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:
     def render(camera: Cameras) -> Rendering:
         here, parts = camera.to(device), []
         for uv in pixel_grid(camera.width, camera.height, device).split(RAYS_AT_ONCE):
+            check_interrupted()
             rays = Rays.of(here, torch.zeros(len(uv), dtype=torch.long, device=device), uv)
             _, seen = network(rays, scene.background_rgb is None)
             parts.append(torch.cat([seen.colour, seen.depth[:, None], seen.opacity[:, None]], dim=-1).cpu())

@@ -22,6 +22,7 @@ from tidefield.data.readers.files import LARGEST, in_range, opened
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.colour import basis, expand
 from tidefield.model.rendering import Rendering
+from tidefield.parallel import check_interrupted
 
 DILATION_PX2 = 0.3
 """Added to the variances in the picture: no Gaussian is narrower than about a pixel (Kerbl's `computeCov2D`)."""
@@ -154,6 +155,7 @@ def render_splats(
     for top in range(0, height, TILE_PX):
         row = found.meeting(1, top)
         for left in range(0, width, TILE_PX):
+            check_interrupted()
             blended = _blend(row.meeting(0, left), corner_px + corner_px.new_tensor([left, top]))
             picture[top : top + TILE_PX, left : left + TILE_PX] = blended.reshape(TILE_PX, TILE_PX, 5).cpu()
     colour, depth, opacity = picture[:height, :width].split([3, 1, 1], dim=-1)

@@ -23,7 +23,7 @@ from shapely.geometry.base import BaseGeometry
 
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.files import completed_file, delete_partials, read_json, write_json
+from tidefield.files import completed_file, delete_files, delete_partials, read_json, write_json
 from tidefield.machine import cores, release_memory
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
@@ -55,6 +55,14 @@ CLASSES, AGREEMENT = "odm_dem/classes.tif", "odm_dem/agreement.tif"
 CONTOURS, SECTIONS, MASKS = "contours", "sections", "masks"
 """Folders."""
 CLOUD = "odm_georeferencing/odm_georeferenced_model.laz"
+PRODUCTS = (
+    *(ORTHOPHOTO, VIEWS, MAIN, DSM, SIGMA, FILLED, DTM, DSM_HILLSHADE, DTM_HILLSHADE, CLASSES, AGREEMENT, CLOUD),
+    *(f"{CONTOURS}/contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")),
+    *(f"{SECTIONS}/sections.{suffix}" for suffix in ("csv", "svg")),
+    *(f"{MASKS}/{name}" for name in ("masks.gpkg", "vegetation.geojson", "water.geojson", "waterline.geojson")),
+    "odm_report/report.html",
+)
+"""All files of a map besides `MAP_FILE`."""
 MARGIN = 16
 """Cells that a tile shares with each of its neighbours' margins, across which both fade."""
 LARGEST_TILE, SMALLEST_TILE = 480, 96
@@ -498,10 +506,10 @@ def finish_map(job: Job, out: Path, record: dict[str, Any], bar: Callable[[str],
 
 
 def begin(out: Path, key: str, overwrite: bool) -> None:
-    """Begin or continue a map in a folder.
+    """Begin or continue a map in a folder, without what an earlier one left there.
 
     Raises:
-        RunError: the folder holds a finished map, another one, or something else.
+        RunError: the folder holds a finished map, another one, or something else, or cannot be written to.
     """
     if out.exists() and not out.is_dir():
         raise RunError(f"{out} is a file: expected a folder for the map; choose another name")
@@ -520,6 +528,8 @@ def begin(out: Path, key: str, overwrite: bool) -> None:
         delete_tiles(out)
     if there is None or overwrite:
         write_json(out / MAP_FILE, {"key": key, "complete": False})
+    # What an earlier map has and this one lacks, such as FILLED, would be taken for this one's.
+    delete_files(out, [out / name for name in PRODUCTS])
 
 
 def delete_tiles(out: Path) -> None:

@@ -28,7 +28,7 @@ from tidefield.model.network import Network
 from tidefield.model.rendering import Render, Rendering, fill_unseen, render_with_rays
 from tidefield.model.sampling import Intervals, Tiles
 from tidefield.model.views import Encoded, Views
-from tidefield.parallel import in_parallel
+from tidefield.parallel import check_interrupted, in_parallel
 from tidefield.recording import Recorder, moved
 
 TILE_PX = 32
@@ -221,6 +221,7 @@ class Renderer:
     def _piece(
         self, camera: Cameras, prior: DepthPrior, corners: Float[Tensor, "T 2"], views: Views
     ) -> Float[Tensor, "T R 6"]:
+        check_interrupted()  # of pieces that are not in parallel
         tiles = Tiles(camera[torch.zeros(len(corners), dtype=torch.long)], corners, TILE_PX)
         start = self.network.start_intervals(tiles, [prior.cells])
         detail = prior.detail_of_tiles(corners, TILE_PX)

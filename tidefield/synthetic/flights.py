@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from tidefield.errors import SceneError
-from tidefield.files import write_text
+from tidefield.files import write_text, writing_to
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.synthetic.two_dates import Pair
+from tidefield.synthetic.write import write_picture
 
 CONTROL_POINTS = 8
 CONTROL_M, MARK_PX, GPS_M = 0.01, 0.3, 1.5
@@ -36,17 +36,17 @@ def write_flights(pair: Pair, folder: Path, frame: LocalFrame, dates: Sequence[s
         seed: of all errors and of where control is.
 
     Raises:
-        SceneError: no ground is fit for control, or the folder cannot be written to.
+        SceneError: no ground is fit for control.
+        RunError: the folder cannot be written to.
     """
     for k, (survey, date) in enumerate(zip((pair.earlier, pair.later), dates, strict=True)):
         random = np.random.default_rng([seed, 20290, k])
         photographs = folder / date / "photographs"
-        photographs.mkdir(parents=True)
         names = [f"IMG_{k}{i:03d}.jpg" for i in range(len(survey.cameras))]
-        for name, picture in zip(names, survey.photographs.numpy(), strict=True):
-            bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-            if not cv2.imwrite(str(photographs / name), bgr, [cv2.IMWRITE_JPEG_QUALITY, 96]):
-                raise SceneError(f"cannot write {photographs / name}: free some space or name another folder")
+        with writing_to(photographs):
+            photographs.mkdir(parents=True)
+            for name, picture in zip(names, survey.photographs.numpy(), strict=True):
+                write_picture(photographs / name, picture, jpeg_quality=96)
         position = survey.cameras.position_world.double().numpy()
         noisy = frame.to_geographic(position + random.normal(0, GPS_M, position.shape))
         rows = [f"{n},{p[1]:.8f},{p[0]:.8f},{p[2]:.2f}" for n, p in zip(names, noisy, strict=True)]

@@ -48,7 +48,7 @@ def write_survey(survey: Survey, folder: Path, suffix: str = ".png", truth: bool
         for part in ("images", "sparse/0"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         for name, photograph in zip(names, survey.photographs, strict=True):
-            _write_picture(folder / "images" / name, photograph)
+            write_picture(folder / "images" / name, photograph.numpy())
         _reconstruction(survey, names).write_binary(folder / "sparse" / "0")
         if truth:
             (folder / "truth" / "depth").mkdir(parents=True, exist_ok=True)
@@ -99,10 +99,14 @@ def _reconstruction(survey: Survey, names: list[str]) -> pycolmap.Reconstruction
     return model
 
 
-def _write_picture(path: Path, colour: UInt8[Tensor, "H W 3"]) -> None:
-    quality = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 97]
-    if not cv2.imwrite(str(path), cv2.cvtColor(colour.numpy(), cv2.COLOR_RGB2BGR), quality):
-        raise SceneError(f"cannot write {path}: free some space or name another folder")
+def write_picture(
+    path: Path, picture: UInt8[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W"], jpeg_quality: int = 97
+) -> None:
+    """Write colours, or the values of one band, as PNG or JPEG, by the name."""
+    options = [] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    bands = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+    # Not `imwrite`, which on Windows takes ASCII names only.
+    path.write_bytes(cv2.imencode(path.suffix, bands, options)[1].tobytes())
 
 
 def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
@@ -111,12 +115,11 @@ def _write_map(survey: Survey, names: list[str], folder: Path) -> None:
     cell = float((cameras.position_world[:, 2] / cameras.focal_px[:, 0]).median())
     extent = Extent.around([whole.west_m, whole.south_m], [whole.east_m, whole.north_m], cell)
     colour, height_m = survey.flat.map(extent)
-    _write_picture(folder / "orthophoto.png", (colour * 255).round().to(torch.uint8))
+    write_picture(folder / "orthophoto.png", (colour * 255).round().to(torch.uint8).numpy())
     np.save(folder / "surface.npy", height_m.numpy())
     bare_m, classes = _classes(survey.flat, extent, height_m)
     np.save(folder / "bare.npy", bare_m)
-    if not cv2.imwrite(str(folder / "classes.png"), classes):
-        raise SceneError(f"cannot write {folder / 'classes.png'}: free some space or name another folder")
+    write_picture(folder / "classes.png", classes)
     truth = {
         "category": survey.category,
         "seed": survey.seed,

@@ -24,6 +24,7 @@ from tidefield.change.surfaces import date_in
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
+from tidefield.maps.grid import LOCAL_NAME
 from tidefield.maps.rasters import need
 
 TILE_PX = 256
@@ -50,7 +51,7 @@ class Layer:
         title: for people.
         path, band: of the raster.
         kind: "picture" (colours, or grey), or values that the page colours: "height", "error" or "change".
-        low, high: ends of the colours; most values are between them.
+        low, high: ends of the colours; most values are between them. Of pictures: black and white.
     """
 
     name: str
@@ -125,7 +126,7 @@ def open_sheet(folder: Path) -> Sheet:
         ("hillshade", "Hillshade", first_of(folder, HILLSHADES)),
     ):
         if path is not None:
-            found.append(Layer(kind, title, path, 1, "picture"))
+            found.append(Layer(kind, title, path, 1, "picture", *_black_white(path)))
     if heights is not None:
         found.append(Layer("height", "Height", heights, 1, "height", *_usual(heights, 1)))
     if sigma is not None:
@@ -189,6 +190,7 @@ class Atlas:
             "metre": self.metre,
             "metre_up": self.metre_up,
             "unit_up": self.unit_up,
+            **dict(zip(("length", "area", "volume"), self._measures(), strict=True)),
             "bounds": self.bounds,
             "side": self.side,
             "finest": self.finest,
@@ -219,13 +221,14 @@ class Atlas:
         side = self.side / (1 << level)
         west, north = self.bounds[0] + column * side, self.bounds[3] - row * side
         with self._reader(chosen.path) as file:
-            bands = [1, 2, 3] if chosen.kind == "picture" and file.count >= 3 else [chosen.band]
+            bands = _picture_bands(file) if chosen.kind == "picture" else [chosen.band]
             values, seen = _read(file, bands, west, north, side / TILE_PX, self._rasterio)
         if not seen.any():
             return None
         picture = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
         if chosen.kind == "picture":
-            picture[..., :3] = values.transpose(1, 2, 0) if len(values) == 3 else values[0][..., None]
+            shade = (values - np.float32(chosen.low)) * np.float32(255 / (chosen.high - chosen.low))
+            picture[..., :3] = np.rint(shade).clip(0, 255).transpose(1, 2, 0)
         else:
             code = np.where(seen, np.rint(np.where(seen, values[0], 0) / STEP) + (1 << 23), 0)
             code = code.clip(0, (1 << 24) - 1).astype(np.uint32)
@@ -354,6 +357,8 @@ class Atlas:
         from pyproj import CRS
 
         crs = CRS.from_wkt(self.crs.to_wkt())
+        if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
+            return 1.0, 1.0, "units", "units", crs.name
         plan = crs.axis_info[0]
         if "degree" in plan.unit_name:
             raise RunError(f"the maps are in degrees ({crs.name}): expected a projected system; make them in one")
@@ -362,6 +367,10 @@ class Atlas:
             "m" if name in ("metre", "meter") else name for name in (plan.unit_name, up.unit_name if up else "metre")
         )
         return plan.unit_conversion_factor, up.unit_conversion_factor if up else 1.0, unit, unit_up, crs.name
+
+    def _measures(self) -> tuple[str, str, str]:
+        """What lengths, areas and volumes are in: metres in every system that knows how long they are."""
+        return ("units", "square units", "cubic units") if self.unit == "units" else ("m", "m²", "m³")
 
 
 @contextmanager
@@ -385,6 +394,24 @@ def _usual(path: Path, band: int) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = np.percentile(known, [2, 98]).tolist()
     return low, max(high, low + 1e-3)
+
+
+def _picture_bands(file: Any) -> list[int]:
+    """The bands of a picture: red, green and blue, or grey."""
+    return [1, 2, 3] if file.count >= 3 else [1]
+
+
+def _black_white(path: Path) -> tuple[float, float]:
+    """The values of a picture that are shown black and white: of bytes the ends, otherwise the ends of most values.
+
+    Cameras fill a part of 16 bits, and reflectance lies in [0, 1]. All bands have the same ends, to keep colours.
+    """
+    with _opened(path) as file:
+        bands = _picture_bands(file)
+        if file.dtypes[0] == "uint8":
+            return 0.0, 255.0
+    low, high = zip(*(_usual(path, band) for band in bands), strict=True)
+    return min(low), max(high)
 
 
 def _read(

@@ -26,6 +26,9 @@ REST_SECONDS = 0.2
 """Time without motion after which a camera rests."""
 SAMPLING = Sampling(rays_per_side=1)
 """Of sharp pictures: several rays per pixel, usual from far away, take several times as long."""
+END_SECONDS = 10.0
+"""Time limit for what is being made to end, when all is closed: some pieces of work take 3 s on two busy cores, and
+PyTorch aborts a process that ends while a thread computes."""
 COARSE_PX = 200
 """Width of coarse pictures."""
 DEFECT = "This is a defect of the program: the terminal has the details."
@@ -133,13 +136,14 @@ class FrameServer:
         return self._making_coarse or self._making_sharp
 
     def close(self) -> None:
-        """Cancel what is being made and end the threads."""
+        """Cancel what is being made and end the threads; what does not hear of it in time ends with the program."""
         with self._changed:
             self._closed = True
             self._viewers.clear()
             self._changed.notify_all()
+        end = time.monotonic() + END_SECONDS
         for thread in self._threads:
-            thread.join()
+            thread.join(max(0.0, end - time.monotonic()))
 
     def _run_coarse(self) -> None:
         while True:
@@ -235,7 +239,8 @@ class FrameServer:
         except TidefieldError as found:
             error = str(found)
         except Exception:
-            log.exception("a view could not be rendered")
+            if not self._closed:  # otherwise what it renders with may be gone already
+                log.exception("a view could not be rendered")
             error = DEFECT
         return Frame(rendering, camera, sharp, time.monotonic() - asked, error)
 

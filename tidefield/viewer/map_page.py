@@ -7,12 +7,13 @@ import logging
 import math
 import re
 import secrets
+import sys
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 import numpy as np
 from jaxtyping import Float64
@@ -66,6 +67,14 @@ class _Server(ThreadingHTTPServer):
         # Other maps have the same addresses: browsers keep the tiles of each server apart by this.
         self.version = secrets.token_hex(8)
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log what has ended a connection; Python would print it on the terminal, whatever was asked for."""
+        error = sys.exception()
+        if isinstance(error, ConnectionError):
+            log.debug("a browser has gone: %s", error)
+        else:
+            log.exception("a connection of the page failed")
+
 
 class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "tidefield", ""
@@ -78,16 +87,16 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server
 
     def do_GET(self) -> None:
-        if self._own.local and (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "") not in LOCAL_HOSTS:
-            # Another site's name that points to this machine: its page could read ours.
-            self._send(HTTPStatus.FORBIDDEN, "text/plain", b"this page is for this machine only")
-            return
-        parts = urlsplit(self.path)
         try:
+            if self._own.local and (_split(f"//{self.headers.get('Host', '')}").hostname or "") not in LOCAL_HOSTS:
+                # Another site's name that points to this machine: its page could read ours.
+                self._send(HTTPStatus.FORBIDDEN, "text/plain", b"this page is for this machine only")
+                return
+            parts = _split(self.path)
             self._answer(parts.path, parse_qs(parts.query))
         except TidefieldError as error:
             self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
-        except ConnectionError:
+        except (ConnectionError, TimeoutError):
             self.close_connection = True  # the browser has moved on
         except Exception:
             log.exception("a question of the page could not be answered")
@@ -133,6 +142,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *values: Any) -> None:
         log.debug(format, *values)
+
+
+def _split(address: str) -> SplitResult:
+    try:
+        return urlsplit(address)
+    except ValueError as error:
+        raise RunError(f"{address[:40]!r} is no address: expected one of the page") from error
 
 
 def _points(query: dict[str, list[str]], least: int, most: int) -> Float64[np.ndarray, "N 2"]:

@@ -11,7 +11,7 @@ import json
 import logging
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -211,8 +211,9 @@ class _Process:
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
         assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(question) + "\n")
-        self.process.stdin.flush()
+        with suppress(BrokenPipeError):  # it has ended, which `answer` reports
+            self.process.stdin.write(json.dumps(question) + "\n")
+            self.process.stdin.flush()
         return self.answer()
 
 
@@ -234,7 +235,8 @@ def _worker(words: Sequence[str | Path], log_file: Path, device: torch.device) -
         finally:
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None, "both are asked for"
-                pipe.close()
+                with suppress(BrokenPipeError):  # a question that was not read is still to be written
+                    pipe.close()
             try:
                 # With its input at its end it stops, and stops the processes that nerfstudio has started.
                 process.wait(timeout=END_SECONDS if words[0] == "render" else None)
