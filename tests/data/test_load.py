@@ -163,6 +163,28 @@ def test_the_layouts_own_split_is_kept(tmp_path: Path) -> None:
     assert len(scene.names) == 7
 
 
+def test_a_split_next_to_a_colmap_model_is_kept_where_it_lists_its_photographs(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = survey(PINHOLE)
+    files = [f"images/{name}" for name in truth.names]
+    write_transforms(tmp_path, truth, train_filenames=files[:6], val_filenames=["./" + file for file in files[6:]])
+    write_colmap(tmp_path, truth)
+    scene = load_scene(tmp_path)
+    assert {scene.names[i] for i in scene.test} == set(truth.names[6:])
+    assert len(scene.train) == 6
+    assert load_scene(tmp_path, hold_out=False).test == ()
+    assert caplog.messages == []
+    top = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps({**top, "val_filenames": files[7:]}))
+    scene = load_scene(tmp_path)
+    assert scene.test == (0, 8)
+    assert "a split of other photographs than the COLMAP model next to it: every eighth is held out" in caplog.text
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(SceneError, match=r"transforms\.json is damaged"):
+        load_scene(tmp_path)
+
+
 def test_a_blender_scene_keeps_alpha_split_and_background(tmp_path: Path) -> None:
     write_blender(tmp_path, {"train": 6, "val": 2, "test": 3})
     scene = load_scene(tmp_path)

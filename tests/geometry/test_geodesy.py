@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from tidefield.geometry.geodesy import LocalFrame, metres_per_degree, parse_crs, utm_zone
+from tidefield.geometry.geodesy import LocalFrame, has_unstated_unit, metres_per_degree, parse_crs, utm_zone
 
 BNG_PROJ4 = (
     "+proj=tmerc +lat_0=49 +lon_0=-2 +k=0.9996012717 +x_0=400000 +y_0=-100000 +ellps=airy "
@@ -158,3 +158,9 @@ def test_other_kinds_of_system_are_refused(crs):
 def test_coordinates_outside_the_domain_of_a_system_are_refused():
     with pytest.raises(ValueError, match="outside what the system can hold"):
         LocalFrame.at("EPSG:27700", (351200.0, 512900.0, 0.0)).from_crs(np.array([[1e9, 1e9, 0.0]]))
+
+
+@pytest.mark.parametrize("crs", [*PLACES, "EPSG:4979", "EPSG:2263+5703", "+proj=lcc +lat_1=41 +lat_2=40 +units=us-ft"])
+def test_the_unit_of_heights_is_unstated_in_flat_systems_of_other_units_than_metres(crs: str):
+    flat_in_feet = ("EPSG:2263", "+proj=lcc +lat_1=41 +lat_2=40 +units=us-ft")
+    assert has_unstated_unit(parse_crs(crs)) == (crs in flat_in_feet)

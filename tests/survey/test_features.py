@@ -110,11 +110,20 @@ def test_a_strip_of_one_pixel_has_no_features(tmp_path: Path):
     assert extract([strip], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None) == 0
 
 
-def test_masked_pixels_have_no_features(wall_photographs: list[Photograph], tmp_path: Path):
+@pytest.mark.parametrize("transparent", [False, True])
+def test_masked_and_transparent_pixels_have_no_features(
+    wall_photographs: list[Photograph], tmp_path: Path, transparent: bool
+):
     used = np.zeros((180, 240), dtype=np.uint8)
     used[:, 100:] = 255
-    Image.fromarray(used).save(tmp_path / "mask.png")
-    wall_photographs[0] = replace(wall_photographs[0], mask=tmp_path / "mask.png")
+    if transparent:
+        with Image.open(wall_photographs[0].path) as picture:
+            layers = np.dstack([np.asarray(picture), used])
+        Image.fromarray(layers).save(wall_photographs[0].path)
+        wall_photographs[0] = replace(wall_photographs[0], has_alpha=True)
+    else:
+        Image.fromarray(used).save(tmp_path / "mask.png")
+        wall_photographs[0] = replace(wall_photographs[0], mask=tmp_path / "mask.png")
     extract(wall_photographs, tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
     with pycolmap.Database.open(tmp_path / "a.db") as db:
         left, count = [], []

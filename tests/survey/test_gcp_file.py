@@ -61,6 +61,14 @@ def test_a_list_is_read_with_any_header_and_separator(tmp_path, header, separato
     )
 
 
+@pytest.mark.parametrize(("crs", "remarked"), [("EPSG:26849", True), ("EPSG:26849+6360", False), (UTM, False)])
+def test_heights_of_a_system_in_feet_without_a_vertical_one_are_remarked(tmp_path, crs, remarked):
+    x, y = Transformer.from_crs(UTM, crs.partition("+")[0], always_xy=True).transform(*POINTS[0][:2])
+    _, remarks = control(survey_folder(tmp_path), f"{crs}\n{x} {y} 600.5 1 2 DJI_0000.JPG A\n")
+    assert [remark for remark in remarks if "taken in metres, as ODM does" in remark] == remarks
+    assert len(remarks) == remarked
+
+
 def test_points_without_names_are_distinguished_by_position(tmp_path):
     lines = line(0, (1, 2), "DJI_0000.JPG") + line(1, (3, 4), "DJI_0000.JPG") + line(0, (5, 6), "DJI_0001.JPG")
     found, _ = control(survey_folder(tmp_path), UTM + "\n" + lines)

@@ -224,6 +224,70 @@ def test_positions_without_the_height_that_most_have_are_not_used_and_counted():
     assert np.abs(off_m(flight, model, found.frame)).max() < 3.0
 
 
+def over_two_zeros(survey: Survey, first: int, **accuracies: float) -> Survey:
+    """Survey whose photographs from the first one on have positions of a file, 20 m higher."""
+    return moved(
+        survey,
+        {
+            p.name: {"height_m": p.position.height_m + 20, "datum": "unknown", "source": "ppk.csv", **accuracies}
+            for p in survey.photographs[first:]
+        },
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "accuracies", "kept"),
+    [
+        (8, {}, range(8, 20)),
+        (12, {}, range(12)),
+        (12, {"horizontal_m": 0.02, "vertical_m": 0.03}, range(12, 20)),
+    ],
+)
+def test_heights_over_another_zero_do_not_tilt_the_model(first, accuracies, kept):
+    flight = fly(lines=4, each=5, noise_px=0.1)
+    model, found = located(flight, over_two_zeros(flight.survey, first, **accuracies))
+    assert found.gps.names == tuple(map(name_of, kept))
+    assert f"{20 - len(kept)} of 20 positions are not used: their heights are over" in found.notes[0]
+    assert "an unknown zero (ppk.csv)" in found.notes[0]
+    assert found.frame.vertical_datum.startswith("unknown" if kept[0] else "mean sea level")
+    off = off_m(flight, model, found.frame)[:, 2]
+    spread_m = np.ptp(flight.centres_world[:, 1])
+    assert np.ptp(off) < math.tan(math.radians(0.1)) * spread_m, "the model is tilted"
+
+
+def test_the_ellipsoid_is_one_zero_whoever_names_it():
+    flight = fly()
+    sources = ("EXIF, RTK fixed", "EXIF, RTK float", "XMP", "gps.csv")
+    survey = moved(
+        flight.survey,
+        {p.name: {"datum": "ellipsoid", "source": sources[i % 4]} for i, p in enumerate(flight.survey.photographs)},
+    )
+    given = given_positions(survey.photographs)
+    assert (len(given.names), given.notes) == (15, ())
+
+
+def test_two_heights_over_each_of_two_zeros_are_too_few():
+    survey = over_two_zeros(fly(lines=1, each=4).survey, 2)
+    given = given_positions(survey.photographs)
+    assert len(given.names) == 4
+    assert "Only 2 of 4 positions have a height over one zero" in given.notes[0]
+
+
+@pytest.mark.parametrize(("slope_deg", "noted"), [(1.0, False), (3.0, True)])
+def test_positions_that_contradict_the_gimbals_are_noted(slope_deg, noted):
+    flight = fly(lines=4, each=5)
+    rise_m = math.tan(math.radians(slope_deg)) * flight.centres_world[:, 1]
+    heights_m = [p.position.height_m + rise for p, rise in zip(flight.survey.photographs, rise_m, strict=True)]
+    survey = moved(flight.survey, {name_of(i): {"height_m": height_m} for i, height_m in enumerate(heights_m)})
+    gimbals = []
+    for i, each in enumerate(survey.photographs):
+        R = flight.model.image(i + 1).cam_from_world().rotation.matrix()
+        pitch, roll = math.degrees(math.asin(R[2, 2])), math.degrees(math.atan2(-R[0, 2], -R[1, 2]))
+        gimbals.append(replace(each, gimbal_deg=(0.0, pitch, roll)))
+    _, found = located(flight, replace(survey, photographs=tuple(gimbals)))
+    assert any("degrees off that of the gimbals" in note for note in found.notes) == noted
+
+
 @pytest.mark.parametrize("left", [0, 2])
 def test_without_positions_the_model_is_only_levelled(left):
     flight = fly()

@@ -31,8 +31,11 @@ from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SceneError
+from tidefield.maps.check_points import read_check_points
+from tidefield.maps.grid import map_frame
 from tidefield.survey import import_project as convert
 from tidefield.survey.import_project import import_project
+from tidefield.survey.survey import CHECK_FILE
 
 
 @pytest.fixture(autouse=True)
@@ -217,10 +220,11 @@ def test_other_layouts_are_imported_with_a_warning_of_losses(tmp_path: Path, cap
     with caplog.at_level(logging.WARNING, logger="tidefield"):
         for layout in ("nerfstudio", "llff", "blender"):
             import_project(tmp_path / layout, tmp_path / f"{layout}-scene")
-            assert_same(load_scene(tmp_path / f"{layout}-scene"), load_scene(tmp_path / layout))
+            ours, theirs = load_scene(tmp_path / f"{layout}-scene"), load_scene(tmp_path / layout)
+            assert_same(ours, theirs)
+            assert (ours.train, ours.test) == (theirs.train, theirs.test)
     warnings = [text for record in caplog.records if "triangulated" not in (text := record.getMessage())]
-    assert [Path(message.split()[0]).name for message in warnings] == ["llff", "blender", "blender"]
-    assert sum("holds out every eighth photograph instead" in message for message in warnings) == 1
+    assert [Path(message.split()[0]).name for message in warnings] == ["llff", "blender"]
 
 
 def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
@@ -238,6 +242,34 @@ def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
         assert located.frame.crs == "EPSG:32630"
         assert '"orientation_override": "none"' in (tmp_path / name / "transforms.json").read_text()
     assert not (tmp_path / "a" / "georeference.json").exists()
+
+
+@pytest.mark.parametrize("undistort", [False, True])
+def test_check_points_are_imported_with_their_marks_in_the_written_photographs(tmp_path: Path, undistort: bool) -> None:
+    write_project(tmp_path / "project", "radial")
+    (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
+    import_project(tmp_path / "project", tmp_path / "a")
+    assert not (tmp_path / "a" / CHECK_FILE).exists()
+    names = read_posed(tmp_path / "a", False).names
+    marks = [(names[0], (3.5, 4.25)), (names[1], (60.0, 40.0)), ("gone.jpg", (1.0, 2.0))]
+    lines = [f"500000.0\t497000.5\t3.25\t{u}\t{v}\t{name}\tCHK 1" for name, (u, v) in marks]
+    text = "\n".join(["EPSG:32630", *lines, "500001.0 497001.0 3.0 CHK2"]) + "\n"
+    (tmp_path / "a" / CHECK_FILE).write_text(text)
+    import_project(tmp_path / "a", tmp_path / "b", undistort=undistort)
+    written = (tmp_path / "b" / CHECK_FILE).read_text()
+    assert (written == text) == (not undistort)
+    found, expected = (
+        read_check_points(scene / CHECK_FILE, loaded, map_frame(loaded, read_georeference(scene)))
+        for scene in (tmp_path / "b", tmp_path / "a")
+        for loaded in [load_scene(scene)]
+    )
+    for own, other in zip(found, expected, strict=True):
+        assert own.name == other.name
+        np.testing.assert_array_equal(own.surveyed, other.surveyed)
+        assert [index for index, _ in own.marks] == [index for index, _ in other.marks]
+        for (_, uv), (_, theirs) in zip(own.marks, other.marks, strict=True):
+            np.testing.assert_allclose(uv, theirs, atol=1e-6)
+    assert len(found[0].marks) == 2
 
 
 def test_photographs_are_copied_or_linked_untouched(tmp_path: Path) -> None:

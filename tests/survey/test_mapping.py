@@ -12,6 +12,7 @@ from tidefield.survey.georeference.bundle_adjustment import adjustment_options, 
 from tidefield.survey.sfm.mapping import (
     MIN_SPREAD_DEG,
     TERMS,
+    Heights,
     LensChoice,
     LensTrial,
     best_of,
@@ -159,6 +160,35 @@ def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_ch
         assert f"the {chosen} one was used" in lens_notes(choice, photographs)[0]
         assert choice.heights is not None
         assert choice.heights.calibrated_share == pytest.approx(true, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("calibrated_share", "prefers_design", "can_tell"),
+    [(1.0, False, True), (1.02, True, True), (1.005, False, True), (1.10, False, False), (0.90, False, False)],
+)
+def test_ground_below_the_place_of_take_off_does_not_choose_the_focal_length(
+    calibrated_share: float, prefers_design: bool, can_tell: bool
+):
+    heights = Heights(3650.0, 3578.0, calibrated_share, calibrated_share * 3578 / 3650)
+    assert (heights.prefers_design, heights.can_tell) == (prefers_design, can_tell)
+    choice = LensChoice((LensTrial("RADIAL", 0.5, 0.6, 3650.0),), True, False, 3.0, heights)
+    (note,) = lens_notes(choice, ())
+    assert ("cannot tell which one is right" in note) == (not can_tell)
+    assert f"the {'design' if prefers_design else 'calibrated'} one was used" in note
+
+
+def test_a_photograph_without_points_has_no_flight_height():
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    lens = LensPrior(FOCAL, None, None, "DJI dewarp data", True, 1.04 * FOCAL)
+    photographs = [replace(p, lens=lens, relative_altitude_m=75.0) for p in flight.survey.photographs]
+    model = pycolmap.Reconstruction(flight.model)
+    alone = model.image(1)
+    for index, point in enumerate(list(alone.points2D)):
+        if point.has_point3D():
+            model.delete_observation(alone.image_id, index)
+    choice = choose_lens(model, photographs, True, quiet)
+    assert choice.heights is not None
+    assert choice.heights.calibrated_share == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):

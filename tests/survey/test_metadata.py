@@ -103,6 +103,38 @@ def test_an_rtk_drone_under_the_ellipsoid_keeps_its_sign(tmp_path):
     assert read.gimbal_deg == (-179.9, -90.0, 0.0)
 
 
+RTK_FLOAT = {"RtkFlag": "34", "RtkStdLon": "1.2", "RtkStdLat": "1.2", "RtkStdHgt": "2.5", "AltitudeType": "RtkAlt"}
+HERE = {"GpsLatitude": str(BRIGHTON[0]), "GpsLongitude": str(BRIGHTON[1])}
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"AbsoluteAltitude": "+112.30", "GpsLatitude": "46.84261", "GpsLongitude": "-91.99461"},
+        {"AbsoluteAltitude": "+63.21", **HERE},
+        {"AbsoluteAltitude": "-63.21", **HERE},
+    ],
+)
+def test_a_position_that_was_corrected_in_exif_replaces_the_drones_own_in_xmp(tmp_path, own):
+    packet = xmp({**own, **RTK_FLOAT, "Camera:GPSXYAccuracy": "0.02"})
+    read = one(tmp_path, table=exif(place=BRIGHTON, height_m=112.345), packet=packet).position
+    assert read is not None
+    assert (read.latitude_deg, read.longitude_deg, read.height_m) == pytest.approx((*BRIGHTON, 112.345))
+    assert (read.horizontal_m, read.datum, read.source) == (0.02, "unknown", "EXIF")
+    assert math.isnan(read.vertical_m), "the accuracy is that of the drone's fix"
+
+
+@pytest.mark.parametrize(
+    ("height_m", "own_m"), [(112.345, "+112.35"), (12.5, "-12.50"), (4294954.796, "-12.50"), (9999.0, "8.00")]
+)
+def test_a_position_as_the_drone_wrote_it_keeps_height_and_accuracy_of_xmp(tmp_path, height_m, own_m):
+    packet = xmp({"AbsoluteAltitude": own_m, **HERE, **RTK_FLOAT})
+    read = one(tmp_path, table=exif(place=BRIGHTON, height_m=height_m), packet=packet).position
+    assert read is not None
+    assert (read.height_m, read.horizontal_m, read.vertical_m) == (float(own_m), 1.2, 2.5)
+    assert (read.datum, read.source) == ("ellipsoid", "EXIF, RTK float")
+
+
 def test_deviations_without_a_position_fix_are_ignored(tmp_path):
     packet = xmp({"RtkFlag": "0", "RtkStdLon": "0.01", "RtkStdLat": "0.01", "RtkStdHgt": "0.01"})
     read = one(tmp_path, table=exif(place=BRIGHTON), packet=packet).position

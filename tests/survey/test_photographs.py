@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,6 +189,59 @@ def test_a_folder_called_masks_without_masks_is_one_of_photographs(tmp_path: Pat
     for name in ("masks/a.jpg", "masks/b.png", "masks/c.png"):
         photograph(tmp_path / name)
     assert len(read_survey(tmp_path).photographs) == 3
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "1"])
+@pytest.mark.parametrize("name", ["{}_mask.png", "{}.JPG"])
+def test_a_folder_of_masks_by_other_names_is_refused_and_holds_no_photographs(tmp_path: Path, mode: str, name: str):
+    survey_folder(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for k in range(4):
+        path = tmp_path / "masks" / name.format(f"DJI_{k:04d}")
+        Image.new("L" if path.suffix == ".JPG" else mode, (64, 48), 255).save(path)
+    with pytest.raises(
+        SurveyError, match=r"masks has no mask of any photograph.*such as DJI_0000.JPG.png.*rename them"
+    ):
+        read_survey(tmp_path)
+
+
+def test_masks_that_belong_to_no_photograph_are_counted(tmp_path: Path):
+    survey_folder(tmp_path / "card")
+    for name in ("DJI_0000.png", "DJI_0001_mask.png", "DJI_0002.JPG", "._DJI_0003.png"):
+        mask(tmp_path / "card" / "masks" / name)
+    shutil.copytree(tmp_path / "card" / "masks", tmp_path / "elsewhere")
+    for masks, home in ((None, "card/masks"), (tmp_path / "elsewhere", "elsewhere")):
+        survey = read_survey(tmp_path / "card", masks=masks)
+        assert sum(p.mask is not None for p in survey.photographs) == 1
+        counted = f"2 of the 3 pictures in {tmp_path / home} belong to no photograph and are not used"
+        assert any(f"{counted} (DJI_0001_mask.png, DJI_0002.JPG)" in remark for remark in survey.remarks)
+
+
+def test_grey_photographs_of_a_camera_in_a_folder_called_masks_are_photographs(tmp_path: Path):
+    survey_folder(tmp_path, 3)
+    for k in range(3):
+        photograph(
+            tmp_path / "masks" / f"{k}.jpg", table=exif({Base.Model: "M1"}), pixels=np.full((48, 64), 99, np.uint8)
+        )
+    assert len(read_survey(tmp_path).photographs) == 6
+
+
+def test_linked_folders_and_pictures_of_other_formats_are_remarked(tmp_path: Path):
+    card = survey_folder(tmp_path / "card")
+    for name in ("x.webp", "sub/y.bmp", "z.gif"):
+        (card / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (64, 48)).save(card / name)
+    survey_folder(tmp_path / "elsewhere", 1)
+    mask(tmp_path / "drawn" / "DJI_0000.png")
+    (card / "sub" / "flight 2").symlink_to(tmp_path / "elsewhere")
+    (card / "masks").symlink_to(tmp_path / "drawn")
+    survey = read_survey(card)
+    assert len(survey.photographs) == 4
+    assert survey.photographs[0].mask is not None
+    assert survey.remarks[1:] == (
+        "3 pictures of other formats are not read (sub/y.bmp, x.webp, z.gif): convert them to JPEG, PNG or TIFF.",
+        "1 linked folders are not followed (sub/flight 2): move the photographs, or give the folder that has them.",
+    )
 
 
 def test_masks_may_lie_elsewhere_or_among_the_photographs(tmp_path: Path):

@@ -35,7 +35,7 @@ def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
     ],
 )
 def test_tables_of_several_programs_give_the_same_positions(tmp_path, text):
-    found = read_gps_file(written(tmp_path, text), NAMES)
+    found, _ = read_gps_file(written(tmp_path, text), NAMES)
     assert list(found) == ["DJI_0001.JPG"]
     position = found["DJI_0001.JPG"].position
     assert (position.latitude_deg, position.longitude_deg, position.height_m) == (54.5, -2.75, 344.17)
@@ -49,7 +49,7 @@ def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
         "DJI_0001,54.5,-2.75,,0.02,0\nDJI_0002,54.6,-2.75,300\nother.jpg,1,2,3,4,5\nWatt# Süd 3.jpeg,1,2,3,,\n"
         '"Watt, Süd 3.jpeg",,,1,,\n'
     )
-    found = read_gps_file(written(tmp_path, text), NAMES)
+    found, _ = read_gps_file(written(tmp_path, text), NAMES)
     first = found["DJI_0001.JPG"].position
     assert first.horizontal_m == 0.02
     assert math.isnan(first.height_m)
@@ -72,17 +72,68 @@ def test_accuracies_of_a_table_are_read_and_empty_cells_are_unknown(tmp_path):
 )
 def test_heights_have_the_unit_in_the_title(tmp_path, title, height_m):
     text = f"name,Latitude [deg],lon,{title},accuracy vertical [mm]\nDJI_0001.JPG,54.5,-2.75,1000,20\n"
-    position = read_gps_file(written(tmp_path, text), NAMES)["DJI_0001.JPG"].position
+    position = read_gps_file(written(tmp_path, text), NAMES)[0]["DJI_0001.JPG"].position
     assert position.height_m == pytest.approx(height_m, rel=1e-12)
     assert (position.latitude_deg, position.vertical_m) == (54.5, pytest.approx(0.02))
+
+
+@pytest.mark.parametrize(
+    ("title", "height_m", "datum"),
+    [
+        ("alt_m", 1000, "unknown"),
+        ("height_ft", 304.8, "unknown"),
+        ("height_usft", 1200e3 / 3937, "unknown"),
+        ("Ellipsoidal height", 1000, "ellipsoid"),
+        ("ellipsoid height [m]", 1000, "ellipsoid"),
+        ("altitude_ellipsoidal(m)", 1000, "ellipsoid"),
+        ("h_ell_m", 1000, "ellipsoid"),
+        ("Altitude above mean sea level (m)", 1000, "mean sea level"),
+    ],
+)
+def test_units_and_zeros_of_heights_are_read_from_titles_without_brackets(tmp_path, title, height_m, datum):
+    text = f"photo name;lat_deg;lon_deg;{title}\nDJI_0001.JPG;54.5;-2.75;1000\n"
+    found, remarks = read_gps_file(written(tmp_path, text), NAMES)
+    position = found["DJI_0001.JPG"].position
+    assert position.height_m == pytest.approx(height_m, rel=1e-12)
+    assert (position.datum, remarks) == (datum, [])
+
+
+@pytest.mark.parametrize("title", ["geoid height", "height above ground", "Höhe"])
+def test_columns_that_may_be_the_height_are_named_where_none_is_understood(tmp_path, title):
+    text = f"name,lat,lon,note,{title},time\nDJI_0001.JPG,54.5,-2.75,1st,48.2,\nDJI_0002.JPG,54.5,-2.75,2nd,48.3,\n"
+    found, (remark,) = read_gps_file(written(tmp_path, text), NAMES)
+    assert math.isnan(found["DJI_0001.JPG"].position.height_m)
+    assert f"its columns {title} are not read" in remark
+    assert 'call it "height (m)"' in remark
 
 
 @pytest.mark.parametrize(("vertical", "metre"), [("5703", 1), ("6360", 1200 / 3937), ("8228", 0.3048)])
 def test_heights_of_a_geo_txt_have_the_unit_of_its_system(tmp_path, vertical, metre):
     text = f"EPSG:6340+{vertical}\nDJI_0001.JPG 500000 4200000 1000\n"
-    position = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)["DJI_0001.JPG"].position
+    position = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)[0]["DJI_0001.JPG"].position
     assert position.height_m == pytest.approx(1000 * metre, rel=1e-9)
     assert position.datum == "mean sea level"
+
+
+@pytest.mark.parametrize("vertical", ["", "+5703", "+6360"])
+def test_heights_of_a_system_in_feet_without_a_vertical_one_are_metres_with_a_remark(tmp_path, vertical):
+    text = f"EPSG:2263{vertical}\nDJI_0001.JPG 1000000 200000 1000\n"
+    found, remarks = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    metre = 1200 / 3937 if vertical == "+6360" else 1
+    assert found["DJI_0001.JPG"].position.height_m == pytest.approx(1000 * metre, rel=1e-9)
+    assert len(remarks) == (vertical == "")
+    assert all("US survey foot" in remark and "EPSG:2263+6360" in remark for remark in remarks)
+    without = written(tmp_path, f"EPSG:2263{vertical}\nDJI_0001.JPG 1000000 200000\n", "geo.txt")
+    assert read_gps_file(without, NAMES)[1] == []
+
+
+@pytest.mark.parametrize("name", ["geo.txt", "positions.csv"])
+@pytest.mark.parametrize("titles", ["#image\tx\ty\tz", "# image,lat,lon,z"])
+def test_titles_below_the_system_of_a_geo_txt_are_a_comment(tmp_path, name, titles):
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32630", always_xy=True).transform(-2.75, 54.5)
+    text = f"EPSG:32630\n{titles}\nDJI_0001.JPG\t{x}\t{y}\t344.17\n"
+    position = read_gps_file(written(tmp_path, text, name), NAMES)[0]["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg) == pytest.approx((54.5, -2.75), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +165,7 @@ def test_a_short_name_of_two_photographs_is_an_error(tmp_path):
     path = written(tmp_path, "name,lat,lon\nDJI_0001.JPG,54.5,2\n")
     with pytest.raises(SurveyError, match=r"DJI_0001.JPG names 2 photographs .*write its folder, too"):
         read_gps_file(path, names)
-    found = read_gps_file(written(tmp_path, "name,lat,lon\n101media\\DJI_0001.JPG,54.5,2\n"), names)
+    found, _ = read_gps_file(written(tmp_path, "name,lat,lon\n101media\\DJI_0001.JPG,54.5,2\n"), names)
     assert list(found) == ["101MEDIA/DJI_0001.JPG"]
 
 
@@ -130,7 +181,7 @@ def test_a_short_name_of_two_photographs_is_an_error(tmp_path):
 def test_a_geo_txt_in_metres_becomes_degrees(tmp_path, header, datum):
     x, y = Transformer.from_crs("EPSG:4326", "EPSG:32630", always_xy=True).transform(-2.75, 54.5)
     text = f"# of the office\n{header}\nDJI_0001.JPG {x} {y} 344.17\nWatt, Süd 3.jpeg {x} {y}\nother.jpg 1 2 3\n"
-    found = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    found, _ = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
     assert list(found) == ["DJI_0001.JPG", "Watt, Süd 3.jpeg"]
     position = found["DJI_0001.JPG"].position
     assert (position.latitude_deg, position.longitude_deg) == pytest.approx((54.5, -2.75), abs=1e-9)
@@ -143,7 +194,7 @@ def test_angles_and_accuracies_of_a_geo_txt_are_read(tmp_path):
         "EPSG:4326\nDJI_0001.JPG -2.75 54.5 344 90 5 1 0.02 0.04 extra\n"
         "DJI_0002 -2.75 54.5 344 0 0 0 0.02 0.04\nWatt, Süd 3.jpeg\t-2.75\t54.5\tNaN\n"
     )
-    found = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    found, _ = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
     first, second = found["DJI_0001.JPG"], found["100MEDIA/DJI_0002.JPG"]
     assert first.gimbal_deg == (90, -85, 1)
     assert (first.position.horizontal_m, first.position.vertical_m) == (0.02, 0.04)
@@ -189,6 +240,25 @@ def test_a_file_that_is_given_has_priority_over_exif(tmp_path):
     assert second.position.source == "EXIF"
     with pytest.raises(SurveyError, match=r"nowhere.csv cannot be read"):
         read_survey(tmp_path / "photographs", gps=tmp_path / "nowhere.csv")
+
+
+def test_photographs_that_a_given_file_does_not_name_are_remarked(tmp_path):
+    survey_folder(tmp_path / "photographs", count=4)
+    path = written(tmp_path, "name,lat,lon,height\nDJI_0000,46.8426,-91.9946,200\nDJI_0002,46.8428,-91.9946,200\n")
+    survey = read_survey(tmp_path / "photographs", gps=path)
+    assert survey.remarks == (
+        "gps.csv has 2 of 4 photographs; 2 others keep the positions of EXIF (DJI_0001.JPG, DJI_0003.JPG).",
+    )
+
+
+def test_a_file_without_heights_leaves_those_of_exif(tmp_path):
+    survey_folder(tmp_path / "photographs", count=3)
+    path = written(tmp_path, "name,lat,lon\n" + "".join(f"DJI_000{k},46.84{k},-91.9,\n" for k in range(3)))
+    for read in read_survey(tmp_path / "photographs", gps=path).photographs:
+        position = read.position
+        assert position is not None
+        assert (position.longitude_deg, position.height_m, position.datum) == (-91.9, 200, "mean sea level")
+        assert position.source == "EXIF, gps.csv"
 
 
 def moved(folder: Path, **places: tuple[float, float]) -> Path:
@@ -265,7 +335,7 @@ def test_a_system_without_a_way_to_wgs_84_is_refused(tmp_path, crs):
 def test_long_lines_take_no_longer_than_their_length(tmp_path):
     text = "EPSG:4326\n" + "word " * 200_000 + "\nDJI_0001.JPG -2.75 54.5 1\n" + "name [" + "[" * 1_000_000
     start = time.process_time()
-    assert list(read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)) == ["DJI_0001.JPG"]
+    assert list(read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)[0]) == ["DJI_0001.JPG"]
     assert time.process_time() - start < 2
 
 

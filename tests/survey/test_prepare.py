@@ -226,6 +226,18 @@ def test_a_damaged_database_makes_the_same_scene_again(made: tuple[Path, Prepare
         assert (scene / path.relative_to(made[0])).read_bytes() == path.read_bytes()
 
 
+def test_the_split_of_an_earlier_run_is_not_read_while_photographs_are_written_again(
+    made: tuple[Path, Prepared], tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    scene, survey = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey
+    written = (scene / "transforms.json").read_text(encoding="utf-8")
+    earlier = json.loads(written) | {"train_filenames": ["images/gone.jpg"]}
+    (scene / "transforms.json").write_text(json.dumps(earlier), encoding="utf-8")
+    prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), redo="images")
+    assert "split" not in caplog.text
+    assert (scene / "transforms.json").read_text(encoding="utf-8") == written
+
+
 def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import tidefield.survey.sfm.features as features
 
@@ -414,6 +426,24 @@ def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tm
     shutil.rmtree(card / "masks")
     run(card, scene)
     assert not (scene / "masks").exists()
+
+
+def test_transparent_photographs_become_an_opaque_scene_with_masks(flight: Flight, tmp_path: Path):
+    (tmp_path / "card").mkdir()
+    alpha = np.full((ground_flight.HEIGHT, ground_flight.WIDTH), 255, dtype=np.uint8)
+    alpha[-60:] = 0
+    for name in flight.names:
+        with Image.open(flight.folder / name) as picture:
+            layers, exif = np.dstack([np.asarray(picture), alpha]), picture.getexif()
+        Image.fromarray(layers).save((tmp_path / "card" / name).with_suffix(".png"), exif=exif.tobytes())
+    scene = tmp_path / "scene"
+    assert len(run(tmp_path / "card", scene).models[0]) == 12
+    loaded = load_scene(scene)
+    assert loaded.background_rgb is None
+    assert loaded.hull is None
+    assert loaded.points is not None
+    assert loaded.points.uv_px[:, 1].max() < ground_flight.HEIGHT - 60
+    assert not any(loaded.photographs.used(i)[-59:].any() for i in range(12))
 
 
 def test_photographs_of_a_fisheye_become_a_scene_for_nerfstudio_and_for_us(tmp_path: Path):

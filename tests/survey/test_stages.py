@@ -87,6 +87,28 @@ def test_an_interrupted_stage_continues_and_its_times_add_up(tmp_path: Path):
     assert changed.run("long", 2, [], lambda resume: {"resumed": resume}) == {"resumed": False}
 
 
+@pytest.mark.parametrize("at", ["job", "read"])
+def test_stages_after_one_that_was_interrupted_are_repeated_and_not_continued(pipeline: Pipeline, at: str):
+    class Interrupted(BaseException): ...
+
+    def job(_: bool) -> Facts:
+        if at == "job":
+            raise Interrupted
+        return {"name": "two", "resumed": False}
+
+    def read(facts: Facts) -> Facts:
+        raise Interrupted
+
+    stages = Stages(pipeline.folder, "photographs", "two")
+    one, two = (pipeline.folder / f"{name}.txt" for name in ("one", "two"))
+    stages.run("one", 0, [one], lambda _: {"name": "one"})
+    with pytest.raises(Interrupted):
+        stages.run("two", 0, [two], job, read)
+    assert pipeline.run() == (["two", "three"] if at == "job" else ["three"])
+    assert json.loads((pipeline.folder / "stages.json").read_text())["three"]["facts"]["resumed"] is False
+    assert pipeline.run() == []
+
+
 def test_a_damaged_record_is_an_error(tmp_path: Path):
     for text in ("{", "[]", "[" * 100_000):
         (tmp_path / "stages.json").write_text(text)

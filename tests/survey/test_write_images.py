@@ -1,19 +1,27 @@
 """Photographs of a scene are copied where nothing changes, else turned upright and corrected."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import camera_files
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 from PIL.ExifTags import GPS, IFD, Base
 
 from tidefield.data.pictures import decode, read_header
 from tidefield.errors import RunError
 from tidefield.survey.colour import ExposureCorrection
-from tidefield.survey.export import reduced_folders, tangent_map, write_images, write_reduced_images
+from tidefield.survey.export import (
+    reduced_folders,
+    tangent_map,
+    write_image,
+    write_images,
+    write_masks,
+    write_reduced_images,
+)
 from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.survey import Photograph
@@ -125,6 +133,32 @@ def test_a_reduced_tiff_has_its_own_size_and_colours(tmp_path: Path, mode: str):
 
 WITH_DIFFERENTIAL = camera_files.exif(gps={GPS.GPSDifferential: 1}).tobytes()
 SHORT, LONG = ">HHIHH", ">HHII"
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "heic"])
+def test_a_rewritten_photograph_keeps_its_colour_profile(tmp_path: Path, suffix: str):
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    original, target = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix.replace('heic', 'jpg')}"
+    picture = Image.fromarray(camera_files.texture(SIZE))
+    if suffix == "heic":
+        heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed (the extra [heic])")
+        heif.from_pillow(picture).save(original, icc_profile=profile)
+    else:
+        picture.save(original, icc_profile=profile)
+    write_image(camera_files.texture(SIZE, 1), target, original)
+    with Image.open(target) as written:
+        assert written.info["icc_profile"] == profile
+
+
+def test_a_profile_of_other_colours_than_rgb_is_left_out(tmp_path: Path):
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    profile[16:20] = b"CMYK"
+    Image.fromarray(camera_files.texture(SIZE)).convert("CMYK").save(tmp_path / "a.jpg", icc_profile=bytes(profile))
+    write_image(camera_files.texture(SIZE), tmp_path / "b.jpg", tmp_path / "a.jpg")
+    with Image.open(tmp_path / "b.jpg") as written:
+        assert (written.mode, "icc_profile" in written.info) == ("RGB", False)
+
+
 DAMAGED = {
     "no header": b"Exif\0\0" + 40 * b"x",
     "a number that Pillow reads and does not write": WITH_DIFFERENTIAL.replace(
@@ -146,6 +180,34 @@ def test_damaged_exif_is_left_out_with_a_warning(tmp_path: Path, damage: str, ca
     with Image.open(tmp_path / "images" / "0.jpg") as picture:
         assert dict(picture.getexif()) == {Base.Orientation: 1}
         assert picture.size == SIZE
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_transparent_photographs_are_written_opaque_and_what_is_transparent_is_masked(tmp_path: Path, suffix: str):
+    (tmp_path / "card").mkdir()
+    alpha = np.full((48, 64), 255, np.uint8)
+    alpha[:12], alpha[12:20] = 0, 100
+    for k in range(3):
+        layers = np.dstack([camera_files.texture(SIZE, k), alpha])
+        exif = camera_files.exif({Base.Orientation: 6 if k == 2 else 1}).tobytes()
+        # Pillow 13 garbles turned TIFFs that are not compressed, of 1 or 4 bytes a pixel.
+        options = {"compression": "tiff_lzw"} if suffix == "tif" else {}
+        picture = Image.fromarray(layers if k else layers[..., :3])
+        picture.save(tmp_path / "card" / f"{k}.{suffix}", exif=exif, **options)
+    Image.fromarray(np.uint8(255 * (np.mgrid[:48, :64][1] < 30))).save(tmp_path / f"1.{suffix}.png")
+    photographs = read_survey(tmp_path / "card").photographs
+    assert [photograph.has_alpha for photograph in photographs] == [False, True, True]
+    photographs = (*photographs[:1], replace(photographs[1], mask=tmp_path / f"1.{suffix}.png"), photographs[2])
+    write_images(photographs, tmp_path / "images", None, LENSES, quiet)
+    write_masks(photographs, tmp_path / "masks")
+    for k, photograph in enumerate(photographs):
+        assert not read_header(tmp_path / "images" / photograph.name)[2]
+        np.testing.assert_array_equal(decode(tmp_path / "images" / photograph.name), upright(photograph))
+        used = decode(tmp_path / "masks" / f"{photograph.name}.png")[..., 0] > 0
+        shown = np.ones((48, 64), bool) if k == 0 else alpha > 0  # in part is enough
+        if k == 1:
+            shown[:, 30:] = False
+        np.testing.assert_array_equal(used, np.rot90(shown, -1) if k == 2 else shown)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])

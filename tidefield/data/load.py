@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import posixpath
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -21,7 +23,7 @@ from tidefield.data.images import PhotographFile, Photographs, Progress, is_used
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.pictures import read_header
 from tidefield.data.readers.colmap import find_colmap, read_colmap
-from tidefield.data.readers.files import naming, reading
+from tidefield.data.readers.files import naming, read_json, reading
 from tidefield.data.readers.llff import SUFFIXES, read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
@@ -32,6 +34,8 @@ from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens, LensModel
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -301,7 +305,8 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
     """Read the poses and lenses of a folder's photographs, sorted by their names, without decoding them.
 
     Args:
-        root: a folder in one of `LAYOUTS`; a COLMAP model is preferred where there are several.
+        root: a folder in one of `LAYOUTS`; a COLMAP model is preferred where there are several, with the split of a
+            transforms.json next to it.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
 
     Raises:
@@ -330,9 +335,32 @@ def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
         near_far=None if posed.near_far is None else posed.near_far[order],
         points=points,
         masks=tuple(posed.masks[i] for i in order) if posed.masks else (),
-        split=holdout.split(names) if holdout else posed.split,
+        split=holdout.split(names) if holdout else posed.split or _split_beside(root, names),
         divided_by=holdout.gains(names) if holdout else None,
     )
+
+
+def _split_beside(root: Path, names: tuple[str, ...]) -> tuple[frozenset[str], frozenset[str]] | None:
+    """Read the split that transforms.json lists next to a COLMAP model, for the model's photographs."""
+    file = root / "transforms.json"
+    if not file.is_file():
+        return None
+    top = read_json(file)
+    train, test, val = (_listed(top.get(f"{part}_filenames")) for part in ("train", "test", "val"))
+    train, test = train & {*names}, ((test or val) - train) & {*names}
+    if train and test and len(train) + len(test) == len(names):
+        return train, test
+    if any(top.get(f"{part}_filenames") for part in ("train", "test", "val")):
+        _log.warning(
+            f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out"
+        )
+    return None
+
+
+def _listed(files: object) -> frozenset[str]:
+    """Names of the photographs that a list of transforms.json has, as a COLMAP model has them."""
+    paths = files if isinstance(files, list) else []
+    return frozenset(posixpath.normpath(path).removeprefix("images/") for path in paths if isinstance(path, str))
 
 
 def own_lens(path: Path, lens: LensModel) -> tuple[LensModel, bool]:

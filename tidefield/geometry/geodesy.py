@@ -22,6 +22,8 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Proj, Transformer
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import UTMConversion
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
@@ -30,6 +32,8 @@ EARTH_RADIUS_M = 6_371_000.0
 """Mean radius, for distances on a sphere that may be wrong by half a per cent."""
 _TRUE_AREA = 0.01
 """By how much areas on a map may differ from those on the ground; lengths in one direction may by twice as much."""
+_NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")
+"""How the names begin that programs give to what has none."""
 _ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
@@ -259,7 +263,7 @@ def _name(crs: CRS) -> str:
 
 
 def metric_system(crs: CRS, x: float, y: float) -> CRS:
-    """Return the horizontal part of a system where its metres are those of the ground, else the UTM zone of a place.
+    """Return the horizontal part of a system where its metres are those of the ground, else a UTM zone of its datum.
 
     Web Mercator is projected in metres, too, of which one is 0.6 m on the ground at 53 degrees; volumes and areas of
     such cells are not those of the ground.
@@ -278,7 +282,17 @@ def metric_system(crs: CRS, x: float, y: float) -> CRS:
         if abs(scale.areal_scale - 1) < _TRUE_AREA and max(abs(k - 1) for k in lengths) < 2 * _TRUE_AREA:
             return own
     geodetic = own.geodetic_crs
-    return _utm(longitude, latitude, geodetic if geodetic is not None else CRS(WGS84))
+    if geodetic is None:
+        return _utm(longitude, latitude, CRS(WGS84))
+    known = _utm(longitude, latitude, geodetic)
+    meridian = geodetic.prime_meridian
+    same = known.geodetic_crs is not None and known.geodetic_crs.name == geodetic.name
+    # WGS 84 is metres from datums that move with a plate; a system bound to WGS 84 brings its own shift to it.
+    if same or own.is_bound or meridian is None or meridian.longitude != 0:
+        return known
+    zone = utm_zone(longitude, latitude)
+    name = f"{geodetic.name} / UTM zone {zone}"
+    return CRS(ProjectedCRS(UTMConversion(zone[:-1], zone[-1]), name, geodetic_crs=geodetic.to_2d()).to_wkt())
 
 
 def in_metres(crs: CRS) -> bool:
@@ -304,11 +318,22 @@ def _vertical_name(crs: CRS) -> str | None:
 
 
 def zero_of_heights(crs: CRS) -> str | None:
-    """Return the name of a system's vertical datum, or None where it defines none."""
-    if not crs.is_compound:
+    """Return the name of the zero of a system's heights, or None where it defines none."""
+    if crs.is_compound:
+        vertical = crs.sub_crs_list[1]
+        name = vertical.name if vertical.datum is None else vertical.datum.name
+        return None if name.lower().startswith(_NAMELESS) else name
+    geodetic = crs.geodetic_crs
+    if geodetic is None or len(crs.axis_info) < 3 or crs.is_geocentric:
         return None
-    vertical = crs.sub_crs_list[1]
-    return vertical.name if vertical.datum is None else vertical.datum.name
+    if geodetic.name.lower().startswith(_NAMELESS):
+        return None
+    return f"the ellipsoid of {geodetic.to_2d().name}"
+
+
+def has_unstated_unit(crs: CRS) -> bool:
+    """Return whether heights may be in other units than metres: a projected system's are, and it defines no heights."""
+    return _base(crs).is_projected and not in_metres(crs) and not crs.is_compound and len(crs.axis_info) < 3
 
 
 def metres_per_height(crs: CRS) -> float:

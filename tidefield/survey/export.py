@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
 from tidefield.data.exif import EXIF_DAMAGE, read_exif
-from tidefield.data.pictures import MODES, decode, read_mask, write_mask
+from tidefield.data.pictures import MODES, decode, write_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import every_eighth
@@ -27,7 +27,7 @@ from tidefield.files import completed_file
 from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.machine import cores
 from tidefield.survey.colour import ExposureCorrection, to_common_exposure
-from tidefield.survey.io.image_decoding import HEIFS, open_image, upright
+from tidefield.survey.io.image_decoding import HEIFS, open_image, upright, used_pixels
 from tidefield.survey.survey import Photograph, Progress
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,8 @@ def write_images(
 ) -> None:
     """Write photographs into a folder under their names.
 
-    A file that needs no change, and that all other commands read, is copied byte for byte.
+    A file that needs no change, and that all other commands read, is copied byte for byte. A transparent photograph is
+    written opaque: the readers of scenes would take it for an object before a background.
 
     Args:
         correction: of these photographs, in this order; None leaves their colours as they are.
@@ -78,7 +79,7 @@ def write_images(
         photograph = photographs[index]
         target = folder / photograph.name
         same = correction is None or ((correction.gain[index] == 1).all() and not correction.falloff[index].any())
-        if same and photograph.orientation == 1 and _is_readable(photograph.path):
+        if same and photograph.orientation == 1 and not photograph.has_alpha and _is_readable(photograph.path):
             with completed_file(target, overwrite=True) as partial:
                 shutil.copyfile(photograph.path, partial)
             return
@@ -102,7 +103,7 @@ def _is_readable(path: Path) -> bool:
 
 
 def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path) -> None:
-    """Write changed pixels of a photograph in its format and with its EXIF; the orientation becomes upright.
+    """Write changed pixels of a photograph in its format, with its EXIF and colours; the orientation becomes upright.
 
     HEIC becomes JPEG, and of a file with several pictures the first is written.
 
@@ -112,8 +113,11 @@ def write_image(pixels: UInt8[np.ndarray, "H W C"], target: Path, original: Path
     with _open_original(original) as picture:
         kind = _written_kind(picture, original)
         exif = _kept_exif(picture, kind, original)
+        profile = picture.info.get("icc_profile") or b""
+    # The pixels are RGB now, which the profile of a grey photograph or of one in CMYK does not describe.
+    colours = {"icc_profile": profile} if profile[16:20] == b"RGB " else {}
     with completed_file(target, overwrite=True) as partial:
-        Image.fromarray(pixels).save(partial, kind, exif=exif, **_WRITTEN[kind])
+        Image.fromarray(pixels).save(partial, kind, exif=exif, **colours, **_WRITTEN[kind])
 
 
 def refuse_unwritable(originals: Iterable[Path]) -> None:
@@ -219,8 +223,7 @@ def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
     nerfstudio reads masks of all photographs or of none.
     """
     for photograph in photographs:
-        size = photograph.width, photograph.height
-        write_mask(folder / f"{photograph.name}.png", read_mask(photograph.mask, size, photograph.path))
+        write_mask(folder / f"{photograph.name}.png", used_pixels(photograph))
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:

@@ -26,7 +26,7 @@ from tidefield.data.readers.files import naming, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.triangulate import find_points
 from tidefield.errors import RunError
-from tidefield.files import completed_folder, refuse_existing
+from tidefield.files import completed_folder, refuse_existing, write_text
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import LensModel, colmap_parameters, rectify
 from tidefield.geometry.similarity import Similarity
@@ -38,6 +38,8 @@ from tidefield.survey.export import (
     write_reduced_images,
     write_transforms,
 )
+from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
+from tidefield.survey.survey import CHECK_FILE
 
 _GREY = 128
 _CANNOT_LINK = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -64,7 +66,7 @@ def import_project(
     Args:
         source: the project or scene.
         out: the new folder, with images/, sparse/0/, transforms.json and, if the project is georeferenced,
-            georeference.json; it appears when it is complete.
+            georeference.json, and check_points.txt if it has one; it appears when it is complete.
         link: make hard links to the photographs instead of copies.
         undistort: undistort all photographs; the original 3D Gaussian splatting opens no others.
         downscale: factors of reduced photographs to write beside the others.
@@ -91,6 +93,7 @@ def import_project(
     with quiet_pillow():
         refuse_unwritable(path for path, lens, own in each if downscale or lens != own)
     located = read_georeference(source)
+    has_checks = located is not None and (source / CHECK_FILE).is_file()
     if located is None and posed.reference is not None:
         place = posed.reference
         located = Georeference(
@@ -104,8 +107,6 @@ def import_project(
             notes=("The origin is the imported project's; its accuracy is unknown.",),
         )
     holdout = read_holdout(source, posed.names, allow_missing)
-    if posed.split is not None and holdout is None:
-        _log.warning(f"{source} has its own split: the imported scene holds out every eighth photograph instead")
     if posed.near_far is not None:
         _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
     model = to_colmap(posed)
@@ -136,12 +137,15 @@ def import_project(
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
-        held_out = holdout.split(posed.names)[1] if holdout else ()
+        split = holdout.split(posed.names) if holdout else posed.split
+        held_out = split[1] if split else ()
         write_transforms(folder, model, held_out=held_out, masks=bool(posed.masks), z_is_up=located is not None)
         if holdout:
             replace(holdout, names=frozenset(held_out)).write(folder)
         if located is not None:
             located.write(folder)
+        if has_checks:
+            _write_check_points(source / CHECK_FILE, posed, original.lenses, folder / CHECK_FILE)
     return model, located
 
 
@@ -241,6 +245,26 @@ def _write_masks(posed: PosedPhotographs, lenses: Sequence[LensModel], folder: P
         if lens != own:
             used = rectify_mask(used, own, own.width, own.height)
         write_mask(folder / f"{name}.png", used)
+
+
+def _write_check_points(source: Path, posed: PosedPhotographs, lenses: Sequence[LensModel], target: Path) -> None:
+    """Write the check points of a scene, with their marks where the undistorted photographs show them.
+
+    Args:
+        lenses: of the photographs' files.
+    """
+    (crs, lines), names = read_list(source), PhotographNames(posed.names)
+    moved = [crs]
+    for _, line in lines:
+        *cells, rest = line.split(maxsplit=5)
+        uv_px, name = leading_numbers(cells[3:]), names.split(rest)[0]
+        index = posed.names.index(name) if len(uv_px) == 2 and name else None
+        if index is not None and posed.lenses[index] != lenses[index]:
+            uv_px = lenses[index].to_pinhole(np.array([uv_px]), lenses[index].pinhole())[0].tolist()
+            line = "\t".join([*cells[:3], *map(repr, uv_px), rest])
+        if np.isfinite(uv_px).all():  # else outside of what is kept of a fisheye
+            moved.append(line)
+    write_text(target, "\n".join(moved) + "\n")
 
 
 def _link(path: Path, target: Path) -> None:

@@ -338,6 +338,7 @@ def write_scene(
 
     Held-out photographs keep their own exposures; `holdout.json` says what the others were divided by.
     """
+    (scene / "transforms.json").unlink(missing_ok=True)  # its split may be of another run's photographs
     if held_out:
         Holdout(held_out, {}).write(scene)
     images, sparse = scene / "images", scene / "sparse" / "0"
@@ -346,7 +347,7 @@ def write_scene(
     cameras = [camera_of[photograph.name] for photograph in photographs]
     with ProgressBar(console, "Writing photographs") as bar:
         write_images(photographs, images, None, cameras, bar)
-    masks = any(photograph.mask is not None for photograph in photographs)
+    masks = any(photograph.mask is not None or photograph.has_alpha for photograph in photographs)
     if masks:
         write_masks(photographs, scene / "masks")
     correction = None
@@ -391,9 +392,10 @@ def _fingerprint(survey: Survey) -> list:
 
 
 def _masks_fingerprint(survey: Survey) -> list:
-    """Identify the masks of photographs; empty if no photograph has one."""
+    """Identify the masks of photographs; empty if no photograph has one, or is transparent."""
     masks = [(p.name, p.mask.stat()) for p in survey.photographs if p.mask is not None]
-    return [[name, state.st_size, state.st_mtime_ns] for name, state in masks]
+    transparent = [[p.name, "transparent"] for p in survey.photographs if p.has_alpha]
+    return [[name, state.st_size, state.st_mtime_ns] for name, state in masks] + transparent
 
 
 def _is_rounded(survey: Survey, side_px: int) -> bool:

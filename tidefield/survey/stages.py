@@ -109,6 +109,9 @@ class Stages:
         earlier = record["seconds"] if is_same else 0.0
         record = {"key": self._key, "done": False, "seconds": earlier, "files": [*files, *sorted(stale)]}
         self._records[name] = record
+        # Their files may be changed from now on, even if this run ends before they are repeated.
+        for later in self._records.keys() - {name, *self.seconds}:
+            self._records[later] |= {"key": None, "done": False}
         write_json(self._file, self._records)
         log.info(f"{name}: started")
         start = time.monotonic()

@@ -77,6 +77,7 @@ class Photograph:
         relative_altitude_m: height above take-off; NaN if unknown.
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
         mask: a picture of the upright photograph's size that is black where the photograph is not to be used, or None.
+        has_alpha: whether the file may have transparent pixels, which are not to be used either.
     """
 
     path: Path
@@ -93,6 +94,7 @@ class Photograph:
     relative_altitude_m: float
     gimbal_deg: tuple[float, float, float] | None
     mask: Path | None = None
+    has_alpha: bool = False
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
-from tidefield.survey.survey import Photograph
+from tidefield.survey.survey import Photograph, Position
 
 DIFFERENTIAL_M = 0.3
 """Positions with a stated standard deviation below this are from a differential receiver."""
@@ -27,6 +27,9 @@ _LEAST_M = 0.01
 """Smallest standard deviation, which keeps the weights finite."""
 _MAX_TILT_RAD = math.radians(1.0)
 """If positions determine the vertical less accurately than this, a prior from the photographs is used."""
+_GIMBALS = "the gimbals' pitch"
+_MAX_GIMBAL_TILT_DEG = 2.0
+"""Good positions and gimbals differ by less: by 1.3 degrees in brighton_beach, by 1.2 in turin_lot."""
 _MIRRORED = 0.3
 """Positions were mirrored if their mirror image has a median error of less than this share of theirs."""
 _DATUMS = {
@@ -69,28 +72,38 @@ class GivenPositions:
 def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
     """Collect positions with heights: absolute ones, else above take-off, else all at one height.
 
-    Heights are used if at least half of the positions have them; positions without are then left out.
+    Heights are used if at least half of the positions have them; positions without are then left out. So are those
+    whose heights may count from another zero, which would tilt the model.
     """
     located = [(photograph, photograph.position) for photograph in photographs if photograph.position is not None]
-    absolute = [pair for pair in located if math.isfinite(pair[1].height_m)]
+    any_zero = [pair for pair in located if math.isfinite(pair[1].height_m)]
+    absolute = _of_one_zero(any_zero)
     relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
-    enough, count, notes = max(3, len(located) / 2), len(located), ()
-    if len(absolute) >= enough:
-        located, heights = absolute, [position.height_m for _, position in absolute]
-        datum = _DATUMS[Counter(position.datum for _, position in absolute).most_common(1)[0][0]]
+    enough, count, without, notes = max(3, len(located) / 2), len(located), 0, []
+    if len(any_zero) >= enough and len(absolute) >= 3:
+        located, heights, without = absolute, [position.height_m for _, position in absolute], count - len(any_zero)
+        datum = _DATUMS[absolute[0][1].datum]
+        zero = _zero(absolute[0][1])
+        if others := [_zero(position) for _, position in any_zero if _zero(position) != zero]:
+            notes.append(
+                f"{len(others)} of {count} positions are not used: their heights are over "
+                f"{' and '.join(sorted(set(others)))}, those of the others over {zero}. To have them used, give all "
+                "positions in one file, with heights over one zero."
+            )
     elif len(relative) >= enough:
         located, heights = relative, [photograph.relative_altitude_m for photograph, _ in relative]
-        datum = "the place of take-off"
+        datum, without = "the place of take-off", count - len(relative)
     else:
         heights = [0.0] * count
         datum = "the mean height of flight, since too few photographs have heights"
         if absolute or relative:
-            notes = (
-                f"Only {max(len(absolute), len(relative))} of {count} positions have a height: all are taken to be at "
-                "one height. To have these heights used, add those of the others, or remove the others' positions.",
+            notes.append(
+                f"Only {max(len(absolute), len(relative))} of {count} positions have a height over one zero: all are "
+                "taken to be at one height. To have these heights used, add those of the others, or remove the others' "
+                "positions."
             )
-    if len(located) < count:
-        notes = (f"{count - len(located)} of {count} positions are not used: they have no height, unlike the others.",)
+    if without:
+        notes.append(f"{without} of {count} positions are not used: they have no height, unlike the others.")
     degrees = np.array([(p.longitude_deg, p.latitude_deg) for _, p in located], dtype=np.float64).reshape(-1, 2)
     vertical_m = [position.vertical_m if located is absolute else math.nan for _, position in located]
     stated = [(position.horizontal_m, vertical) for (_, position), vertical in zip(located, vertical_m, strict=True)]
@@ -101,8 +114,29 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
         stated_m=np.array(stated, dtype=np.float64).reshape(-1, 2),
         vertical_datum=datum,
-        notes=notes,
+        notes=tuple(notes),
     )
+
+
+def _of_one_zero(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[Photograph, Position]]:
+    """Select positions whose heights have one zero: that of the differential receiver, if there is one, or of most."""
+    by_zero = defaultdict(list)
+    for pair in located:
+        by_zero[_zero(pair[1])].append(pair)
+
+    def worth(own: Sequence[tuple[Photograph, Position]]) -> tuple[bool, int]:
+        accurate = [p for _, p in own if p.horizontal_m < DIFFERENTIAL_M and p.vertical_m < DIFFERENTIAL_M]
+        return len(accurate) >= FEWEST_DIFFERENTIAL, len(own)
+
+    return max(by_zero.values(), key=worth, default=[])
+
+
+def _zero(position: Position) -> str:
+    """Name the zero of a height: the ellipsoid is one, but two sources' sea levels may differ by tens of metres."""
+    if position.datum == "ellipsoid":
+        return "the ellipsoid"
+    source = position.source.partition(", ")[0].replace("XMP", "EXIF")
+    return f"{'an unknown zero' if position.datum == 'unknown' else position.datum} ({source})"
 
 
 @dataclass(frozen=True)
@@ -165,7 +199,7 @@ def find_down(model: pycolmap.Reconstruction, photographs: Sequence[Photograph])
         pitch, roll = np.deg2rad([gimbal[images[i].name][1:] for i in stated]).T
         down_camera = np.stack([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), -np.sin(pitch)], axis=1)
         down_model = np.einsum("nji,nj->ni", R_camera_model[stated], down_camera)
-        return Down(_unit(np.median(down_model, axis=0)), math.radians(1), "the gimbals' pitch")
+        return Down(_unit(np.median(down_model, axis=0)), math.radians(1), _GIMBALS)
     x, forward = R_camera_model[:, 0], R_camera_model[:, 2].mean(0)
     strength, axes = np.linalg.eigh(x.T @ x / len(x))
     if strength[1] > 0.05:
@@ -220,6 +254,12 @@ def fit_positions(
                 f"{math.degrees(refined.tilt_rad):.1f} degrees.",
             )
         similarity = refined.similarity
+    tilt_deg = math.degrees(math.acos(np.clip(-(similarity.rotation @ down.direction_model)[2], -1, 1)))
+    if not notes and down.source == _GIMBALS and tilt_deg > _MAX_GIMBAL_TILT_DEG:
+        notes = (
+            f"The vertical by the cameras' positions is {tilt_deg:.1f} degrees off that of the gimbals: some heights "
+            "may be wrong, or count from another zero.",
+        )
     error = similarity(centres) - given
     spread_m = rms_m((given[used] - given[used].mean(0))[:, :2])
     if np.count_nonzero(used) < 3 or rms_m(error[used, :2]) >= 0.5 * spread_m:

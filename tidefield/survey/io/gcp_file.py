@@ -24,7 +24,7 @@ from tidefield.files import write_text
 from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
 from tidefield.survey.io.positions import degrees_of
-from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
+from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list, unit_remarks
 from tidefield.survey.survey import CHECK_FILE, Control, Mark, Photograph
 
 CONTROL_FILES = ("gcp_list.txt",)
@@ -46,7 +46,7 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     Left out are marks in photographs that are missing, marks outside of their photograph, and points without marks.
 
     Returns:
-        The ground control, and remarks on what was left out.
+        The ground control, and remarks on what was left out and is doubtful.
 
     Raises:
         SurveyError: a line cannot be parsed, the coordinate reference system is unknown or puts the points far from the
@@ -106,7 +106,7 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     degrees = degrees_of(photographs)
     if np.isfinite(degrees).any():
         refuse_elsewhere(control, *np.nanmedian(degrees, axis=0).tolist())
-    remarks = []
+    remarks = unit_remarks(path, parse_crs(crs))
     if missing:
         remarks.append(
             f"{path.name} marks points in photographs that do not exist (left out): {list_names(list(missing))}."

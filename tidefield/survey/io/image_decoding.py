@@ -11,9 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from PIL import Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
+from tidefield.data.pictures import read_mask
 from tidefield.data.readers.files import MAX_PIXELS
 from tidefield.errors import SurveyError
 from tidefield.survey.survey import Photograph
@@ -156,6 +157,22 @@ def upright(photograph: Photograph) -> UInt8[np.ndarray, "H W 3"]:
         return _oriented(_rgb(image), image, photograph.orientation)
 
 
+def used_pixels(photograph: Photograph) -> Bool[np.ndarray, "H W"]:
+    """Read where an upright photograph is to be used: its mask is not black there, and the photograph shows something.
+
+    A pixel that is transparent in part still shows something; where nothing is left of it, there is no colour.
+
+    Raises:
+        SurveyError, SceneError: a file is damaged, or the mask has another size.
+    """
+    used = read_mask(photograph.mask, (photograph.width, photograph.height), photograph.path)
+    if photograph.has_alpha:
+        with open_image(photograph.path) as image:
+            alpha = image.convert("RGBA").getchannel("A")
+            used = used & (_oriented(alpha, image, photograph.orientation) > 0)
+    return used
+
+
 def thumbnail(photograph: Photograph, side_px: int) -> UInt8[np.ndarray, "H W 3"]:
     """Decode a photograph upright, reduced (never enlarged) to a longer side of `side_px`, at the least cost.
 
@@ -174,24 +191,30 @@ def thumbnail(photograph: Photograph, side_px: int) -> UInt8[np.ndarray, "H W 3"
         return _oriented(reduced, image, photograph.orientation)
 
 
+def has_alpha(image: Image.Image) -> bool:
+    """Whether an opened photograph may have transparent pixels."""
+    is_deep = image.mode.startswith("I")  # whose transparency Pillow does not convert
+    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or (not is_deep and "transparency" in image.info)
+
+
 def _rgb(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         levels = np.asarray(image).astype(np.int64)
         return Image.fromarray((levels.clip(0, 65535) >> 8).astype(np.uint8)).convert("RGB")
     if image.mode == "F":
         raise ValueError("its pixels are floating-point numbers; export it with 8 or 16 bits")
-    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+    if has_alpha(image):
         layer = image.convert("RGBA")
         return Image.alpha_composite(Image.new("RGBA", layer.size, "white"), layer).convert("RGB")
     return image.convert("RGB")
 
 
-def _oriented(rgb: Image.Image, image: Image.Image, orientation: int) -> UInt8[np.ndarray, "H W 3"]:
+def _oriented(decoded: Image.Image, image: Image.Image, orientation: int) -> UInt8[np.ndarray, "H W *C"]:
     """Apply the EXIF orientation to the decoded pixels of `image`."""
-    pixels = np.asarray(rgb)
+    pixels = np.asarray(decoded)
     if isinstance(image, TiffImagePlugin.TiffImageFile):  # Pillow has applied it while decoding
         return np.array(pixels)
     if orientation >= 5:
-        pixels = pixels.transpose(1, 0, 2)
+        pixels = pixels.swapaxes(0, 1)
     mirrored_x, mirrored_y = upright_rotation(orientation).sum(axis=1) < 0
     return np.ascontiguousarray(pixels[:: -1 if mirrored_y else 1, :: -1 if mirrored_x else 1])

@@ -12,11 +12,15 @@ from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
 from tidefield.data.exif import Exif, as_number, read_exif
+from tidefield.geometry.geodesy import metres_per_degree
 from tidefield.survey.survey import Position, VerticalDatum
 
 _XMP_TAG = 700
 # https://www.easymanua.ls/dji/mavic-3m/manual?p=89: 0 no position, 16 single point, 32 to 49 float, 50 fixed.
 _RTK_SINGLE, _RTK_FLOAT, _RTK_FIXED = 16, 32, 50
+# What a drone writes into EXIF and into XMP agrees within rounding (1 cm in brighton_beach and turin_lot).
+_CORRECTED_M = 0.5
+_LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # the Dead Sea, and Mount Everest
 # Pix4D's namespace counts a camera's pitch from straight down, the others from the horizon (as opendm/photo.py of
 # OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its pitch alone.
 _NADIR_FROM_HORIZON_DEG = -90.0
@@ -93,15 +97,17 @@ class PhotographMetadata:
         or EXIF's positioning error.
         """
         latitude, longitude = _degrees(self.exif.gps, 1, "S"), _degrees(self.exif.gps, 3, "W")
+        # DJI's early firmware misspells the longitude.
+        names = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
+        own = self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude"), self.xmp_number(*names)
+        corrected = _is_corrected(self, (latitude, longitude), own)
         source = "EXIF"
         if not math.isfinite(latitude + longitude):
-            latitude = self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude")
-            # DJI's early firmware misspells the longitude.
-            longitude = self.xmp_number("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
-            source = "XMP"
+            (latitude, longitude), source = own, "XMP"
         if not math.isfinite(latitude + longitude):
             return None
-        rtk = self.xmp_number("RtkFlag")
+        # After a correction, the drone's own fix and its accuracy are of the past.
+        rtk = math.nan if corrected else self.xmp_number("RtkFlag")
         if rtk >= _RTK_FLOAT:
             source += ", RTK fixed" if rtk == _RTK_FIXED else ", RTK float"
         accuracies_m = [
@@ -114,7 +120,7 @@ class PhotographMetadata:
         horizontal_m, vertical_m = (
             next((value for value in values if value > 0), math.nan) for values in zip(*accuracies_m, strict=True)
         )
-        height_m, datum = _height(self, rtk)
+        height_m, datum = _height(self, rtk, corrected)
         return Position(latitude, longitude, height_m, horizontal_m, vertical_m, datum, source)
 
 
@@ -194,22 +200,55 @@ def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> fl
     return -degrees if reference.strip("\0 ").upper().startswith(negative) else degrees
 
 
-def _height(metadata: PhotographMetadata, rtk: float) -> tuple[float, VerticalDatum]:
+def _is_corrected(metadata: PhotographMetadata, degrees: tuple[float, float], own: tuple[float, float]) -> bool:
+    """Whether EXIF's position was written after the flight, by PPK for example: it is not the drone's own.
+
+    Args:
+        degrees: latitude and longitude of EXIF.
+        own: those of XMP.
+    """
+    if not math.isfinite(sum(degrees)):
+        return False
+    east, north = metres_per_degree(degrees[0])
+    turned = (degrees[1] - own[1] + 180) % 360 - 180
+    own_m, height_m = metadata.xmp_number("AbsoluteAltitude"), _exif_height_m(metadata)
+    return math.hypot(north * (degrees[0] - own[0]), east * turned) > _CORRECTED_M or (
+        abs(height_m - own_m) > _CORRECTED_M and _is_plausible(height_m, own_m)
+    )
+
+
+def _exif_height_m(metadata: PhotographMetadata) -> float:
+    height_m = as_number(metadata.exif.gps.get(ExifTags.GPS.GPSAltitude))
+    return -height_m if _height_reference(metadata) in (1, 3) else height_m
+
+
+def _height_reference(metadata: PhotographMetadata) -> object:
+    reference = metadata.exif.gps.get(ExifTags.GPS.GPSAltitudeRef)
+    return reference[0] if isinstance(reference, bytes) and reference else reference
+
+
+def _is_plausible(height_m: float, own_m: float) -> bool:
+    """Whether a height of EXIF is one, and not the drone's own without its sign."""
+    return _LOWEST_M < height_m < _HIGHEST_M and (own_m >= 0 or abs(height_m + own_m) > _CORRECTED_M)
+
+
+def _height(metadata: PhotographMetadata, rtk: float, corrected: bool) -> tuple[float, VerticalDatum]:
     """Height, and its vertical datum.
 
     DJI's RTK drones and those with "RtkAlt" write ellipsoidal heights whatever EXIF states; its others write that of a
     barometer in a standard atmosphere. EXIF up to 2.32 has sea level only (0 above, 1 below); EXIF 3.0 gave these
     numbers to the ellipsoid, and 2 and 3 to the sea level.
+
+    Args:
+        rtk: the state of the drone's receiver; NaN after a correction.
+        corrected: whether EXIF has a later position than XMP.
     """
-    reference = metadata.exif.gps.get(ExifTags.GPS.GPSAltitudeRef)
-    if isinstance(reference, bytes) and reference:
-        reference = reference[0]
+    reference, exif_m = _height_reference(metadata), _exif_height_m(metadata)
     # DJI's EXIF repeats it as an unsigned number, which turns a height below zero into millions of metres.
     height_m = metadata.xmp_number("AbsoluteAltitude")
-    if not math.isfinite(height_m):
-        height_m = as_number(metadata.exif.gps.get(ExifTags.GPS.GPSAltitude))
-        height_m = -height_m if reference in (1, 3) else height_m
-    if rtk >= _RTK_FLOAT or "rtk" in metadata.xmp.get("AltitudeType", "").casefold():
+    if not math.isfinite(height_m) or (corrected and _is_plausible(exif_m, height_m)):
+        height_m = exif_m
+    if rtk >= _RTK_FLOAT or (not corrected and "rtk" in metadata.xmp.get("AltitudeType", "").casefold()):
         return height_m, "ellipsoid"
     if "AbsoluteAltitude" in metadata.xmp or reference not in range(4):
         return height_m, "unknown"

@@ -14,11 +14,19 @@ from pathlib import Path
 from PIL import ExifTags
 
 from tidefield.data.pictures import check_mask
+from tidefield.data.readers.files import quiet_pillow
 from tidefield.data.readers.masks import mask_names
 from tidefield.errors import SurveyError, list_names
 from tidefield.machine import cores
 from tidefield.survey.io.gcp_file import CONTROL_FILES, read_control
-from tidefield.survey.io.image_decoding import HEIFS, open_image, refuse_truncated, stored_size, upright_size
+from tidefield.survey.io.image_decoding import (
+    HEIFS,
+    has_alpha,
+    open_image,
+    refuse_truncated,
+    stored_size,
+    upright_size,
+)
 from tidefield.survey.io.lens_prior import lens_prior
 from tidefield.survey.io.metadata import read_metadata
 from tidefield.survey.io.positions import locate_photographs
@@ -37,7 +45,7 @@ _RAWS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mef", ".mos"),
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
-_OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp")
+_OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp", ".gif")
 # Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
 _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
@@ -69,8 +77,9 @@ def read_survey(
         SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
             positions or the given ground control cannot be parsed.
     """
-    paths, raws = _list_photographs(folder)
+    paths, about_files = _list_photographs(folder)
     mask_of, remarks = _find_masks(folder, paths, masks)
+    remarks += about_files
     home = masks or folder / MASKS
     if mask_of:  # they are no photographs
         own = set(mask_of.values())
@@ -78,8 +87,6 @@ def read_survey(
     _refuse_collisions([path.relative_to(folder).as_posix() for path in paths])
     _refuse_unreadable([path for path in paths if path.suffix.casefold() in HEIFS])
     names = [_name(path.relative_to(folder)) for path in paths]
-    if raws:
-        remarks.append(f"{len(raws)} camera raw files are not read ({list_names(raws)}): develop them first.")
     with ThreadPoolExecutor(min(8, 2 * cores())) as pool, warnings.catch_warnings():
         # Pillow warns of tags that it cannot read, without the name of the file; they count as unknown.
         warnings.simplefilter("ignore", UserWarning)
@@ -138,7 +145,7 @@ def _drop_without_lens(photographs: Sequence[Photograph]) -> tuple[Sequence[Phot
 
 
 def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
-    """List the photographs, and the names of camera raw files."""
+    """List the photographs, with remarks on what else is there and not read."""
     try:
         if not folder.is_dir():
             found = "a file" if folder.exists() else "nothing"
@@ -148,9 +155,12 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
         raise SurveyError(
             f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one"
         ) from error
-    photographs, raws, others = [], [], []
+    photographs, raws, others, links = [], [], [], []
     for path in paths:
         suffix = path.suffix.casefold()
+        if path.is_symlink() and path.is_dir():
+            links.append(path.relative_to(folder).as_posix())
+            continue
         name = os.fsencode(path.relative_to(folder))
         if suffix in (*_PHOTOGRAPHS, *_RAWS, *_OTHER_IMAGES) and name.decode(errors="replace").encode() != name:
             raise SurveyError(
@@ -162,7 +172,16 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
         elif suffix in _RAWS or suffix in _OTHER_IMAGES:
             (raws if suffix in _RAWS else others).append(path.relative_to(folder).as_posix())
     if photographs:
-        return photographs, sorted(raws)
+        skipped = {
+            "camera raw files are not read": (raws, "develop them first"),
+            "pictures of other formats are not read": (others, "convert them to JPEG, PNG or TIFF"),
+            "linked folders are not followed": (links, "move the photographs, or give the folder that has them"),
+        }
+        return photographs, [
+            f"{len(names)} {what} ({list_names(sorted(names))}): {todo}."
+            for what, (names, todo) in skipped.items()
+            if names
+        ]
     if raws:
         raise SurveyError(
             f"{folder} has {len(raws)} camera raw files ({list_names(sorted(raws))}) and no photographs: "
@@ -173,6 +192,8 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
+    """All files in a folder and its sub-folders, and the sub-folders that are links, which are not followed."""
+
     def refuse(error: OSError) -> None:
         raise error
 
@@ -184,6 +205,9 @@ def _walk(folder: Path) -> Iterator[Path]:
             and not any(Path(parent, name, part).exists() for part in _SCENE_PARTS)
         ]
         yield from (Path(parent, name) for name in files if not name.startswith("."))
+        # Linked masks are found by their names.
+        links = (Path(parent, name) for name in folders if Path(parent, name).is_symlink())
+        yield from (path for path in links if path != folder / MASKS)
 
 
 def _refuse_collisions(names: Sequence[str]) -> None:
@@ -216,25 +240,48 @@ def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -
     """Find the masks of photographs, and say what is to be said of them.
 
     Raises:
-        SurveyError: there is no mask where they were asked for.
+        SurveyError: there is no mask where they were asked for, or none of those that there are has the name of a
+            photograph.
     """
     home = masks or folder / MASKS
     names = mask_names(path.relative_to(folder) for path in photographs)
     candidates = {path: [home / name for name in names[path.relative_to(folder)]] for path in photographs}
     masked = {path: next(filter(Path.is_file, own), None) for path, own in candidates.items()}
     found = {path: mask for path, mask in masked.items() if mask is not None}
-    count = len([path for path in photographs if path not in set(found.values())])
-    if masks is not None and not found:
-        example = next(iter(candidates.values()))[0].relative_to(home).as_posix()
+    taken = set(found.values())
+    count = len([path for path in photographs if path not in taken])
+    pictures = [path for path in sorted(home.rglob("[!.]*")) if path.suffix.casefold() in _PHOTOGRAPHS]
+    strange = [] if home == folder else [path for path in pictures if path not in taken]
+    if not found and (masks or 2 * sum(map(_is_mask, strange)) > len(strange)):
+        outside = [path for path in photographs if path not in strange] or photographs
+        example = candidates[outside[0]][0].relative_to(home).as_posix()
+        listed = f" (found: {list_names([path.relative_to(home).as_posix() for path in strange])})" if strange else ""
+        todo = "give the folder of the masks, or leave --masks out" if masks else "rename them, or move the folder away"
         raise SurveyError(
-            f"{masks} has no mask of any photograph in {folder}: expected a PNG called like its photograph, such as "
-            f"{example}, that is black where the photograph is not to be used; give the folder of the masks, or leave "
-            "--masks out"
+            f"{home} has no mask of any photograph in {folder}{listed}: expected a PNG called like its photograph, "
+            f"such as {example}, that is black where the photograph is not to be used; {todo}"
         )
-    if masks is not None:
-        some = [f"{len(found)} of the photographs have masks in {masks}, the others are used whole."]
-        return found, some if len(found) < count else []
-    return found, [f"{home} has masks of {len(found)} photographs: what is black there is not used."] if found else []
+    if not found:
+        return found, []
+    remarks = [f"{home} has masks of {len(found)} photographs: what is black there is not used."]
+    if masks:
+        some = f"{len(found)} of the photographs have masks in {masks}, the others are used whole."
+        remarks = [some] if len(found) < count else []
+    if strange:
+        remarks.append(
+            f"{len(strange)} of the {len(pictures)} pictures in {home} belong to no photograph and are not used "
+            f"({list_names([path.relative_to(home).as_posix() for path in strange])}): rename them, or move them away."
+        )
+    return found, remarks
+
+
+def _is_mask(path: Path) -> bool:
+    """Whether a picture is like a mask: without colours, and from no camera."""
+    try:
+        with quiet_pillow(), open_image(path) as image:
+            return image.mode in ("1", "L", "LA", "P") and not read_metadata(image).camera
+    except SurveyError:
+        return False
 
 
 def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, tuple[str, ...]] | str:
@@ -242,7 +289,7 @@ def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, 
     try:
         with open_image(path) as image:
             metadata = read_metadata(image)
-            stored = stored_size(image)
+            stored, transparent = stored_size(image), has_alpha(image)
             refuse_truncated(path, image)
     except SurveyError as error:
         return str(error)
@@ -262,6 +309,7 @@ def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, 
         relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
         mask=mask,
+        has_alpha=transparent,
     )
     if mask is not None:
         check_mask(mask, (width, height), path)

@@ -23,14 +23,22 @@ from tidefield.geometry.geodesy import (
     metres_per_height,
     parse_crs,
 )
-from tidefield.survey.io.text_files import PhotographNames, find_file, leading_numbers, read_lines, read_list
-from tidefield.survey.survey import Photograph, Position
+from tidefield.survey.io.text_files import (
+    PhotographNames,
+    begins_with_crs,
+    find_file,
+    leading_numbers,
+    read_lines,
+    read_list,
+    unit_remarks,
+)
+from tidefield.survey.survey import Photograph, Position, VerticalDatum
 
 GPS_FILES = ("geo.txt", "gps.csv")
 """Looked for in the folder of the photographs, in this order."""
 
-# Column titles of tables of receivers, Pix4D and Metashape, in lower case, without units, which are in brackets, and
-# punctuation.
+# Column titles of tables of receivers, Pix4D and Metashape, in lower case, without punctuation, and without units and
+# zeros of heights, in brackets or not.
 _COLUMNS = {
     "name": ("name", "imagename", "image", "filename", "file", "photo", "photograph", "label", "sourcefile"),
     "latitude": ("latitude", "lat", "y", "gpslatitude", "latitudedeg"),
@@ -40,9 +48,23 @@ _COLUMNS = {
     "vertical": ("accuracyvertical", "verticalaccuracy", "vacc", "accuracyz", "zaccuracy", "sigmaz", "stdz"),
 }
 _LENGTHS = ("height", "horizontal", "vertical")
+_ZEROS: dict[str, VerticalDatum] = {
+    **dict.fromkeys(("ellipsoid", "ellipsoidal", "ellips", "ell", "hae"), "ellipsoid"),
+    **dict.fromkeys(("sea", "msl", "amsl", "orthometric", "navd", "egm"), "mean sea level"),
+}
 _BRACKETS = re.compile(r"[\[(](.*?)[\])]")
 _FOOT_M, _US_SURVEY_FOOT_M = 0.3048, 1200 / 3937
-_UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), _FOOT_M)}
+_METRES = ("m", "metre", "metres", "meter", "meters")
+_UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), _FOOT_M), **dict.fromkeys(_METRES, 1.0)}
+# Words of a title beside that of the quantity. "Geoid" is none of them: the height of the geoid is another quantity.
+_OF_DEGREES = ("deg", "degree", "degrees", "decimal", "dd")
+_OF_LENGTHS = (*_ZEROS, *_UNITS_M, "us", "survey", "wgs", "above", "over", "mean", "level")
+_BESIDE = {
+    "name": ("name",),
+    "latitude": _OF_DEGREES,
+    "longitude": _OF_DEGREES,
+    **dict.fromkeys(_LENGTHS, _OF_LENGTHS),
+}
 _MAX_TITLE = 100  # longer is no title; a search for units in megabytes of brackets would take hours
 _REQUIRED = ("name", "latitude", "longitude")
 _EXPECTED_TABLE = (
@@ -88,14 +110,21 @@ def locate_photographs(
     if file is None and any(photograph.position is None for photograph in located):
         file = find_file(folder, GPS_FILES)
     if file is not None:
-        records = read_gps_file(file, PhotographNames(photograph.name for photograph in photographs))
+        records, about_file = read_gps_file(file, PhotographNames(photograph.name for photograph in photographs))
+        others = [p for p in located if p.position and p.name not in records]
+        if gps and others:
+            about_file.append(
+                f"{file.name} has {len(records)} of {len(located)} photographs; {len(others)} others keep the "
+                f"positions of EXIF ({list_names([photograph.name for photograph in others])})."
+            )
         for index, photograph in enumerate(located):
             record = records.get(photograph.name)
             if record and (gps or photograph.position is None):
+                position = _with_height(record.position, photograph.position)
                 gimbal = photograph.gimbal_deg or record.gimbal_deg
-                located[index] = replace(photograph, position=record.position, gimbal_deg=gimbal)
+                located[index] = replace(photograph, position=position, gimbal_deg=gimbal)
         located, impossible_in_file = _drop_impossible(located)
-        remarks += impossible_in_file
+        remarks += [*about_file, *impossible_in_file]
     located, outliers = _drop_outliers(located)
     remarks += outliers
     without = [photograph.name for photograph in located if photograph.position is None]
@@ -104,7 +133,15 @@ def locate_photographs(
     return located, remarks
 
 
-def read_gps_file(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
+def _with_height(position: Position, own: Position | None) -> Position:
+    """Complete a position without a height by that of the photograph's own, with its zero and accuracy."""
+    if own is None or math.isfinite(position.height_m) or not math.isfinite(own.height_m):
+        return position
+    height = {"height_m": own.height_m, "vertical_m": own.vertical_m, "datum": own.datum}
+    return replace(position, **height, source=f"{own.source}, {position.source}")
+
+
+def read_gps_file(path: Path, names: PhotographNames) -> tuple[dict[str, GpsRecord], list[str]]:
     """Read positions of photographs from a file; lines for other photographs are skipped.
 
     Args:
@@ -112,23 +149,25 @@ def read_gps_file(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
         names: index of the photographs.
 
     Returns:
-        Records by name of the photograph.
+        Records by name of the photograph, and remarks on what is doubtful.
 
     Raises:
         SurveyError: the file is neither, a line of it cannot be parsed, or it names none of the photographs.
     """
     lines = read_lines(path)
-    header = next((row for row, line in enumerate(lines) if all(name in _columns(line)[0] for name in _REQUIRED)), None)
-    if header is None and path.suffix.casefold() == ".csv":
+    is_geo = begins_with_crs(lines)  # then titles of columns are a comment
+    titles = (row for row, line in enumerate(lines) if all(name in _columns(line)[0] for name in _REQUIRED))
+    header = None if is_geo else next(titles, None)
+    if header is None and not is_geo and path.suffix.casefold() == ".csv":
         start = next((line.strip() for line in lines if line.strip()), "nothing")
         raise SurveyError(f"{path} begins with {start[:80]!r}: {_EXPECTED_TABLE}; write one")
-    found = _read_geo(path, names) if header is None else _read_table(path, lines, header, names)
+    found, remarks = _read_geo(path, names) if header is None else _read_table(path, lines, header, names)
     if not found:
         raise SurveyError(
             f"{path} names none of the photographs: expected their file names, with or without suffix; correct them, "
             "or remove the file"
         )
-    return found
+    return found, remarks
 
 
 def _columns(header: str) -> tuple[dict[str, tuple[int, float]], str]:
@@ -137,24 +176,39 @@ def _columns(header: str) -> tuple[dict[str, tuple[int, float]], str]:
     found: dict[str, tuple[int, float]] = {}
     for index, title in enumerate(header.casefold().split(separator)):
         title = title[:_MAX_TITLE]
-        # Metashape has "X/Longitude".
-        plain = [re.sub(r"[^a-z]", "", part) for part in _BRACKETS.sub("", title).split("/")]
-        meaning = next((key for key, titles in _COLUMNS.items() if any(part in titles for part in plain)), None)
+        parts = [_words(part) for part in _BRACKETS.sub("", title).split("/")]  # Metashape has "X/Longitude"
+        meaning = next((key for key in _COLUMNS if any(_means(part, key) for part in parts)), None)
         if meaning is not None:
             found.setdefault(meaning, (index, _unit_m(title) if meaning in _LENGTHS else 1.0))
     return found, separator
 
 
+def _words(title: str) -> list[str]:
+    return re.findall("[a-z]+", title.replace("us", " us "))  # of "usft" and "ftus", too
+
+
+def _means(words: Sequence[str], key: str) -> bool:
+    """Whether the words of a title name one of the `_COLUMNS`, with or without a unit and a zero of heights."""
+    own = "".join(word for word in words if word not in _BESIDE[key])
+    return "".join(words) in _COLUMNS[key] or own in _COLUMNS[key]
+
+
 def _unit_m(title: str) -> float:
-    """Length of the unit in the brackets of a title; metres without one, also where they name a datum."""
-    words = re.findall("[a-z]+", " ".join(_BRACKETS.findall(title)).replace("us", " us "))  # of "usft" and "ftus", too
+    """Length of the unit in a title; metres without one."""
+    words = _words(title)
     unit_m = next((_UNITS_M[word] for word in words if word in _UNITS_M), 1.0)
     return _US_SURVEY_FOOT_M if unit_m == _FOOT_M and {"us", "survey"} & {*words} else unit_m
 
 
-def _read_table(path: Path, lines: Sequence[str], header: int, names: PhotographNames) -> dict[str, GpsRecord]:
+def _read_table(
+    path: Path, lines: Sequence[str], header: int, names: PhotographNames
+) -> tuple[dict[str, GpsRecord], list[str]]:
     columns, separator = _columns(lines[header])
+    titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
+    above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
+    zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), "unknown"]
     found: dict[str, GpsRecord] = {}
+    rows: list[list[str]] = []
     for number, row in _rows(path, lines, header, separator):
         if not any(cell.strip() for cell in row) or row[0].startswith("#"):
             continue
@@ -162,6 +216,7 @@ def _read_table(path: Path, lines: Sequence[str], header: int, names: Photograph
         name = names.find(cells["name"])
         if name is None:
             continue
+        rows.append(row)
         where = f"{path}, line {number}"
         numbers = {}
         for key, (_, unit_m) in columns.items():
@@ -180,9 +235,22 @@ def _read_table(path: Path, lines: Sequence[str], header: int, names: Photograph
                 f"{where} gives {degrees}: {_EXPECTED_TABLE}; metres belong under the EPSG code of a geo.txt"
             )
         height, across, up = (numbers.get(key, math.nan) for key in ("height", "horizontal", "vertical"))
-        position = Position(*degrees, height, *_positive(across, up), "unknown", path.name)
+        position = Position(*degrees, height, *_positive(across, up), zeros[0], path.name)
         _add(found, name, GpsRecord(position), where)
-    return found
+    unread = {*range(len(titles))} - {index for index, _ in columns.values()}
+    numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
+    if "height" in columns or not numeric:
+        return found, []
+    return found, [
+        f"{path.name} has no column of heights that is understood; its columns {list_names(numeric)} are not read. If "
+        'one of them is the height, call it "height (m)".'
+    ]
+
+
+def _is_numeric(rows: Sequence[Sequence[str]], index: int) -> bool:
+    """Whether a column has numbers, and nothing else."""
+    cells = [row[index].strip().replace(",", ".") for row in rows if index < len(row)]
+    return any(cells) and all(leading_numbers([cell]) for cell in cells if cell)
 
 
 def _rows(path: Path, lines: Sequence[str], header: int, separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -201,7 +269,7 @@ def _rows(path: Path, lines: Sequence[str], header: int, separator: str) -> Iter
         yield header + 1 + rows.line_num, row
 
 
-def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
+def _read_geo(path: Path, names: PhotographNames) -> tuple[dict[str, GpsRecord], list[str]]:
     crs, lines = read_list(path)
     read: list[tuple[str, str, list[float]]] = []
     for where, line in lines:
@@ -213,7 +281,7 @@ def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
             raise SurveyError(f"{where} is {line[:80]!r}: expected image_name x y [z]; correct it")
         read.append((name, where, values))
     if not read:
-        return {}
+        return {}, []
     system = parse_crs(crs)
     to_degrees = Transformer.from_crs(horizontal(system), WGS84, always_xy=True)
     degrees = np.column_stack(to_degrees.transform(*np.array([values[:2] for _, _, values in read]).T))
@@ -230,7 +298,8 @@ def _read_geo(path: Path, names: PhotographNames) -> dict[str, GpsRecord]:
         accuracies = values[_GEO_ACCURACIES:] if len(values) == _GEO_ACCURACIES + 2 else [math.nan, math.nan]
         position = Position(latitude, longitude, height, *_positive(*accuracies), datum, path.name)
         _add(found, name, GpsRecord(position, gimbal), where)
-    return found
+    has_heights = any(math.isfinite(record.position.height_m) for record in found.values())
+    return found, unit_remarks(path, system) if has_heights else []
 
 
 def _add(found: dict[str, GpsRecord], name: str, record: GpsRecord, where: str) -> None:

@@ -8,8 +8,10 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
+from pyproj import CRS
+
 from tidefield.errors import SurveyError, list_names
-from tidefield.geometry.geodesy import parse_crs
+from tidefield.geometry.geodesy import has_unstated_unit, parse_crs
 
 _MAX_MEGABYTES = 50
 _MAX_WORDS = 64
@@ -110,11 +112,7 @@ def read_list(path: Path) -> tuple[str, list[tuple[str, str]]]:
         SurveyError: the file cannot be read, or its first line is no projected or geographic system.
     """
     lines = read_lines(path)
-    header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    crs = header.strip()
-    utm = _UTM.fullmatch(crs)
-    if utm:
-        crs = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
+    header, crs = _header(lines)
     try:
         parse_crs(crs)
     except ValueError as error:
@@ -124,6 +122,36 @@ def read_list(path: Path) -> tuple[str, list[tuple[str, str]]]:
         ) from error
     items = [(f"{path}, line {number}", line.strip()) for number, line in enumerate(lines, start=1) if line != header]
     return crs, [(where, text) for where, text in items if text and not text.startswith("#")]
+
+
+def _header(lines: Sequence[str]) -> tuple[str, str]:
+    """The first line that is no comment, and as pyproj understands it."""
+    header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    utm = _UTM.fullmatch(header.strip())
+    return header, f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}" if utm else header.strip()
+
+
+def begins_with_crs(lines: Sequence[str]) -> bool:
+    """Whether the first line that is no comment is a coordinate reference system."""
+    try:
+        parse_crs(_header(lines)[1])
+    except ValueError:
+        return False
+    return True
+
+
+def unit_remarks(path: Path, system: CRS) -> list[str]:
+    """Say what the unit of heights in one of ODM's lists is where their system leaves it open.
+
+    ODM takes them in metres (https://github.com/OpenDroneMap/ODM/issues/1932).
+    """
+    if not has_unstated_unit(system):
+        return []
+    return [
+        f"{path.name}: the unit of {system.name} is the {system.axis_info[0].unit_name}, and it defines no heights; "
+        "these are taken in metres, as ODM does. If they have another unit, name their system, too, as in "
+        '"EPSG:2263+6360" (NAVD88 in US survey feet).'
+    ]
 
 
 def leading_numbers(cells: Iterable[str]) -> list[float]:

@@ -20,12 +20,11 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, UInt8
 
-from tidefield.data.pictures import read_mask
 from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.machine import cores
 from tidefield.processes import in_order, worker_processes
-from tidefield.survey.io.image_decoding import upright
+from tidefield.survey.io.image_decoding import upright, used_pixels
 from tidefield.survey.survey import Photograph, Progress
 
 Keypoints = Float32[np.ndarray, "K 4"]
@@ -221,7 +220,7 @@ def _features(
     reduced = reduced_size(*size, options.side_px)
     if reduced != size:
         grey = cv2.resize(grey, reduced, interpolation=cv2.INTER_AREA)
-    used = None if photograph.mask is None else read_mask(photograph.mask, size, photograph.path)
+    used = used_pixels(photograph) if photograph.mask or photograph.has_alpha else None
     keypoints, descriptors = find_features(grey, options.count, device, used)
     u, v = size[0] / reduced[0], size[1] / reduced[1]
     keypoints[:, :3] *= np.array([u, v, u], dtype=np.float32)

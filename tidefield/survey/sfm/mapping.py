@@ -9,7 +9,9 @@ distortion from curved ground, and the reduction may come from a bowl-shaped mod
 distinguish them: a lens model with more terms is chosen only if the cameras fit their positions as well as before.
 
 Two focal lengths: some makers state one focal length of this lens and one of its design. The flight height is
-proportional to the focal length, so the one is chosen whose flight height agrees better with the drone's own.
+proportional to the focal length, so that of the design is chosen where the drone's own height confirms it: within half
+of what the two differ by. Ground that rises or falls from the place of take-off changes heights by more, in both
+directions, and then the calibration stays.
 """
 
 from __future__ import annotations
@@ -90,7 +92,14 @@ class Heights:
 
     @property
     def prefers_design(self) -> bool:
-        return abs(math.log(self.design_share)) < abs(math.log(self.calibrated_share))
+        return self._confirms(self.design_share)
+
+    @property
+    def can_tell(self) -> bool:
+        return self._confirms(self.design_share) or self._confirms(self.calibrated_share)
+
+    def _confirms(self, share: float) -> bool:
+        return abs(math.log(share)) < abs(math.log(self.design_px / self.calibrated_px)) / 2
 
 
 @dataclass(frozen=True)
@@ -350,6 +359,8 @@ def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photo
     for image in (model.image(number) for number in model.reg_image_ids()):
         if image.name in fit.names and above_start_m[image.name] > MIN_HEIGHT_M:
             seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+            if not seen:
+                continue
             ground, centre = fit.world_from_model(np.array(seen)), fit.world_from_model(image.projection_center()[None])
             shares.append((centre[0, 2] - np.median(ground[:, 2])) / above_start_m[image.name])
     if len(shares) < MIN_POSITIONS:
@@ -393,10 +404,11 @@ def lens_notes(choice: LensChoice, photographs: Sequence[Photograph]) -> tuple[s
         calibrated = ("calibrated", heights.calibrated_px, heights.calibrated_share)
         design = ("design", heights.design_px, heights.design_share)
         used, other = (design, calibrated) if heights.prefers_design else (calibrated, design)
+        tell = "" if heights.can_tell else ", and cannot tell which one is right"
         notes.append(
             f"The maker states two focal lengths. With the {used[0]} one ({used[1]:.1f} px) the flight height is "
             f"{used[2]:.1%} of the drone's own, with the {other[0]} one ({other[1]:.1f} px) {other[2]:.1%}: the "
-            f"{used[0]} one was used. The drone's height is above take-off, not above the ground."
+            f"{used[0]} one was used. The drone's height is above take-off, not above the ground{tell}."
         )
     # Why there are no more terms of distortion, where positions were the reason.
     terms_of = TERMS | FISHEYE_TERMS
