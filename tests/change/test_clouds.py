@@ -33,6 +33,23 @@ def write_cloud(path: Path, crs: str, xyz: np.ndarray, sigma: np.ndarray | None 
     return path
 
 
+def write_old_cloud(path: Path, xyz: np.ndarray, keys: dict[int, int]) -> Path:
+    """A LAS 1.2 file with these GeoTIFF keys."""
+    laspy = pytest.importorskip("laspy")
+    from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
+
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.offsets, header.scales = xyz.mean(axis=0).round(), np.full(3, 0.001)
+    directory = GeoKeyDirectoryVlr()
+    directory.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in keys.items()]
+    directory.geo_keys_header.number_of_keys = len(keys)
+    header.vlrs.append(directory)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.write(str(path))
+    return path
+
+
 def square(rng: np.random.Generator, size_m: float, count: int = 2000) -> np.ndarray:
     """Points of a level square, the first four at its corners."""
     xy = np.concatenate([size_m * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]), rng.uniform(0, size_m, (count, 2))])
@@ -60,6 +77,50 @@ def test_feet_become_metres_of_the_utm_zone(tmp_path: Path):
     written = open_surface(tmp_path / "a.tif")
     assert written.crs is not None
     assert written.crs.to_epsg() == 26910
+
+
+@pytest.mark.parametrize(
+    ("keys", "unit", "zero", "remarked"),
+    [
+        ({4096: 6360}, US_FOOT, "North American Vertical Datum 1988", False),
+        ({4096: 5703, 4099: 9003}, US_FOOT, "North American Vertical Datum 1988", False),
+        ({4096: 5103, 4099: 9002}, 0.3048, None, False),
+        ({4099: 9001}, 1.0, None, False),
+        ({}, 1.0, None, True),
+    ],
+)
+def test_old_files_state_the_unit_of_their_heights_in_keys(
+    tmp_path: Path, keys: dict[int, int], unit: float, zero: str | None, remarked: bool
+):
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([980_000.0, 200_000.0, 10.0])
+    paths = [write_old_cloud(tmp_path / name, xyz, {1024: 1, 3072: 2263, **keys}) for name in ("a.las", "b.las")]
+    cloud = read_cloud(paths[0])
+    assert cloud.xyz[:, 2] == pytest.approx(10 * unit, abs=1e-3)
+    assert cloud.zero == zero
+    found = open_pair(paths[0], paths[1], tmp_path)
+    for name, survey in (("a.las", found.earlier), ("b.las", found.later)):
+        assert any(name in remark and "US survey foot" in remark for remark in survey.remarks) == remarked
+
+
+def test_a_projection_of_its_own_is_not_taken_for_degrees(tmp_path: Path):
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([980_000.0, 200_000.0, 10.0])
+    keys = {1024: 1, 2048: 4269, 3072: 32767, 3076: 9003, 4099: 9003}
+    cloud = read_cloud(write_old_cloud(tmp_path / "a.las", xyz, keys))
+    assert cloud.crs is None
+    assert np.abs(cloud.xyz - US_FOOT * xyz).max() < 0.001
+    assert "projected system of its own" in cloud.remarks[0]
+    with pytest.raises(ChangeError, match="degrees"):
+        read_cloud(write_old_cloud(tmp_path / "b.las", xyz * [1e-4, 1e-4, 1], {1024: 2, 2048: 4269}))
+
+
+def test_withheld_points_are_not_used(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([450_000.0, 5_930_000.0, 2.0])
+    xyz[:100, 2] = 900
+    las = laspy.read(write_cloud(tmp_path / "a.laz", "EPSG:25832", xyz))
+    las.withheld = np.arange(len(xyz)) < 100
+    las.write(tmp_path / "b.laz")
+    assert read_cloud(tmp_path / "b.laz").xyz[:, 2].max() == pytest.approx(2, abs=0.001)
 
 
 def test_distances_of_clouds_in_feet_are_written_where_the_clouds_are(tmp_path: Path):

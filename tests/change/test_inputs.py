@@ -122,6 +122,41 @@ def test_a_map_finds_its_files_and_states_its_frame(tmp_path: Path):
         assert LOCAL_NAME in dataset.crs.to_wkt()
 
 
+def test_the_surface_of_a_map_brings_its_filled_cells(tmp_path: Path):
+    heights = surfaces(tmp_path)[0]
+    folder = write_map(tmp_path / "map", heights, False, np.ones(heights.shape, np.uint8))
+    assert open_survey(folder / DSM).filled == open_survey(folder).filled == folder / FILLED
+    other = (folder / DSM).rename((folder / DSM).with_name("lidar.tif"))
+    assert open_survey(other).filled is None
+
+
+def test_an_orthophoto_without_colours_is_left_out_with_a_remark(tmp_path: Path):
+    from surveys_of_two_dates import write_surface
+
+    heights = np.random.default_rng(0).normal(size=(60, 60)).astype(np.float32)
+    for picture in (heights, np.stack([heights] * 3)):
+        write_surface(tmp_path / "map" / "dsm.tif", heights)
+        write_surface(tmp_path / "map" / "orthophoto.tif", picture)
+        found = open_survey(tmp_path / "map")
+        assert found.orthophoto is None
+        assert any("orthophoto.tif" in remark and "float32" in remark for remark in found.remarks)
+    write_surface(tmp_path / "map" / "orthophoto.tif", np.zeros((3, 60, 60), np.uint16))
+    assert open_survey(tmp_path / "map").orthophoto is not None
+
+
+def test_clouds_without_the_system_of_their_surfaces_are_refused_before_anything_is_measured(tmp_path: Path):
+    import laspy
+
+    heights = surfaces(tmp_path)[0]
+    one, two = (write_map(tmp_path / name, heights, True) for name in ("a", "b"))
+    for folder in (one, two):
+        las = laspy.read(folder / CLOUD)
+        las.header.vlrs.clear()
+        las.write(folder / CLOUD)
+    with pytest.raises(ChangeError, match="has no coordinate system"):
+        open_pair(one, two, tmp_path, with_clouds=True)
+
+
 def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
     from tidefield.change.measure import measure
 

@@ -1,16 +1,23 @@
 """Difference, level of detection, outlines and volumes against known changes."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
+from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
-from tidefield.change.measure import Change, Options, measure
+from tidefield.change.measure import Change, Options, Register, measure
 from tidefield.change.regions import Region, read_regions
-from tidefield.change.surfaces import ChangeError, common_grid, open_surface
+from tidefield.change.registration import Registration
+from tidefield.change.shift import Shift
+from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
+from tidefield.change.volumes import ErrorModel
 
 AREA = 0.25
 
@@ -172,6 +179,54 @@ def test_an_outline_has_the_systematic_error_of_its_own_cells(tmp_path: Path):
         inside = found.outlines.labels == number
         expected = found.errors.registration.deviation_of_sum(found.grid, inside) * AREA
         assert volume.systematic_m3 == pytest.approx(expected)
+
+
+def test_an_error_of_the_shift_adds_up_over_a_slope_and_cancels_out_over_a_hill():
+    error, slope, rows, columns = 0.02, 0.3, 60, 80
+    grid, none = Grid(None, 0.0, 0.0, 0.5, columns, rows), (0.0, 0.0, 0.0)
+    covariance = np.diag([0.003**2, 0.0, 0.0])
+    registration = Registration("none", none, covariance, (20.0, -15.0), 100, none, none, shift_error_m=error)
+    north, east = np.meshgrid(np.linspace(1, -1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    plane = np.stack([np.full(grid.shape, slope), np.zeros(grid.shape)]).astype(np.float32)
+    hill = np.stack([-slope * east, -slope * north]).astype(np.float32)
+    dz, every = np.zeros(grid.shape, np.float32), np.ones(grid.shape, bool)
+    part = every & (east > 0)
+    box = (slice(0, rows), slice(columns // 2, columns))
+    for region in (every, part):
+        area = float(region.sum()) * AREA
+        on_plane = ErrorModel(0.05, UNCORRELATED, registration, grid, slopes=plane).volume(dz, region)
+        assert on_plane.systematic_m3 == pytest.approx(math.hypot(0.003 * area, slope * error * area))
+        assert on_plane.random_m3 == pytest.approx(0.05 * math.sqrt(region.sum()) * AREA)
+    on_hill = ErrorModel(0.05, UNCORRELATED, registration, grid, slopes=hill)
+    assert on_hill.volume(dz, every).systematic_m3 == pytest.approx(0.003 * every.sum() * AREA)
+    assert on_hill.systematic_of_sum(part[box], box) == pytest.approx(on_hill.systematic_of_sum(part))
+    assert on_hill.cell_sigma(slice(0, 1))[0, 0] == pytest.approx(math.hypot(0.05, 0.003, slope * error * math.sqrt(2)))
+
+
+@pytest.mark.parametrize("register", ["none", "vertical"])
+def test_the_error_of_a_shift_on_a_slope_is_what_the_vertical_registration_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
+):
+    earlier, later, _ = pair(tmp_path, 12, 0.0)
+    error, steep = 0.05, np.where(np.arange(240) < 120, 0.0, 0.4)
+    for path in (earlier, later):
+        with rasterio.open(path, "r+") as file:
+            file.write((file.read(1) + 0.5 * np.cumsum(steep)).astype(np.float32), 1)
+    monkeypatch.setattr("tidefield.change.measure.find_shift", lambda *_: Shift(0.0, 0.0, error, 50, 50, 0.5))
+    surveys = [replace(open_surface(path), orthophoto=path) for path in (earlier, later)]
+    flat = Region("flat", shapely.box(WEST, NORTH - 100, WEST + 58, NORTH))
+    rest = Region("rest", shapely.box(WEST + 62, NORTH - 100, WEST + 120, NORTH))
+    asked = Options(register=register, shift="images", datum_error_m=0.0)
+    found = measure(*surveys, asked, stable=lambda grid: [flat], regions=lambda grid: [flat, rest])
+    (_, level, *_), (_, slope, *_) = found.per_region
+    own = found.errors.registration.systematic_m
+    assert slope.systematic_m3 == pytest.approx(math.hypot(own, 0.4 * error) * slope.area_m2, rel=0.02)
+    assert level.systematic_m3 < 0.02 * slope.systematic_m3 + own * level.area_m2
+    everywhere = Region("both", shapely.box(WEST, NORTH - 100, WEST + 120, NORTH))
+    found = measure(*surveys, asked, stable=lambda grid: [everywhere])
+    whole = 0.2 * error * found.net.area_m2 if register == "none" else 0.0
+    own = found.errors.registration.systematic_m
+    assert found.net.systematic_m3 == pytest.approx(math.hypot(own * found.net.area_m2, whole), rel=0.03)
 
 
 def test_polygons_of_one_name_stay_apart_and_none_is_called_as_the_whole(tmp_path: Path):

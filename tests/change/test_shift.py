@@ -78,8 +78,13 @@ def test_the_later_survey_is_moved_and_its_error_enters_on_slopes(tmp_path: Path
     left = measure(*surveys, Options(shift="none"))
     assert moved.errors.registration.shift_m == pytest.approx((-east, -north), abs=0.04)
     assert np.nanstd(moved.dz) < 0.5 * np.nanstd(left.dz)
-    assert isinstance(moved.errors.sigma, np.ndarray)
-    assert moved.errors.sigma[:, 130:].mean() > moved.errors.sigma[:, :110].mean()
+    sigma = moved.errors.cell_sigma(slice(0, moved.grid.rows))
+    assert sigma[:, 130:].mean() > sigma[:, :110].mean()
+    # Stable ground is of all slopes: what the error of the shift does to their mean was subtracted with it.
+    assert moved.errors.slopes is not None
+    assert np.abs([part[moved.stable].mean() for part in moved.errors.slopes]).max() < 1e-3
+    plain = replace(moved.errors, slopes=None)
+    assert moved.net.systematic_m3 == pytest.approx(plain.systematic_of_sum(np.isfinite(moved.dz)) * 0.25, rel=0.05)
 
 
 def test_a_shift_that_must_be_known_is_refused_where_pictures_do_not_tell(tmp_path: Path):

@@ -1,5 +1,6 @@
 """Surfaces with all the grids, extents, nodata and systems that programs write."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,17 +51,76 @@ def test_the_same_pixels_are_copied_not_interpolated(tmp_path: Path):
     assert np.array_equal(read(two, grid), values[3:, 7:])
 
 
-@pytest.mark.parametrize(("nodata", "declared"), [(-10000.0, None), (-9999.0, -9999.0), (0.0, None), (np.nan, None)])
-def test_cells_without_heights_are_not_heights(tmp_path: Path, nodata: float, declared: float | None):
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("nodata", "declared"),
+    [
+        ((-10000.0,), None),
+        ((-9999.0,), -9999.0),
+        ((0.0,), None),
+        ((NAN,), None),
+        ((-9999.0,), NAN),
+        ((-9999.0,), -32767.0),
+        ((-9999.0, -10000.0), None),
+        ((-32768.0, NAN), -9999.0),
+    ],
+)
+def test_cells_without_heights_are_not_heights(tmp_path: Path, nodata: tuple[float, ...], declared: float | None):
     values = plane(40, 40, 0.5) + np.float32(50)
-    values[:12] = nodata
+    values[:12] = nodata[0]
+    values[:12, :10] = nodata[-1]
     path = write_surface(tmp_path / "a.tif", values, nodata=declared)
     found = read(path, common_grid([open_surface(path)], 0.7))
     assert np.isnan(found[:8]).all()
     assert np.isfinite(found[10:]).all()
     assert np.nanmin(found) > 45  # nothing is mixed with nodata at the border
-    said = any("declares no nodata" in remark for remark in open_surface(path).remarks)
-    assert said == (declared is None and np.isfinite(nodata))
+    undeclared = [value for value in nodata if np.isfinite(value) and value != declared]
+    remarks = [remark for remark in open_surface(path).remarks if "declares" in remark]
+    assert len(remarks) == (len(undeclared) > 0)
+    assert all(f"{value:g}" in remarks[0] for value in undeclared)
+
+
+@pytest.mark.parametrize("declared", [None, -9999.0])
+def test_a_mask_holds_besides_what_stands_for_no_height(tmp_path: Path, declared: float | None):
+    import rasterio
+
+    values = plane(40, 50, 0.5)
+    values[:, :20], values[:, 45:] = 50, -9999
+    path = write_surface(tmp_path / "a.tif", values, nodata=declared)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as file:
+        file.write_mask(np.broadcast_to(np.arange(50) >= 20, values.shape))
+    found = read(path, common_grid([open_surface(path)]))
+    assert np.array_equal(np.isfinite(found[0]), (np.arange(50) >= 20) & (np.arange(50) < 45))
+    assert np.array_equal(found[:, 20:45], values[:, 20:45])
+
+
+def test_zeros_around_a_survey_are_no_heights_and_zeros_in_it_are(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0, 0.6, (100, 100)).astype(np.float32)
+    values[40:45, 40:45] = 0
+    assert open_surface(write_surface(tmp_path / "a.tif", values)).remarks == []
+    values[:, :44] = 0
+    surface = open_surface(write_surface(tmp_path / "b.tif", values))
+    assert any("has 0 where no height can be" in remark for remark in surface.remarks)
+    with surface.on_grid(common_grid([surface], 0.7)) as rows:
+        found = rows(0, 71)
+    assert np.isnan(found[:, :31]).all()
+    assert np.isfinite(found[:, 33:]).all()
+
+
+def test_whole_numbers_may_be_zero_around_a_survey_and_reach_what_others_write_for_nodata(tmp_path: Path):
+    import rasterio
+
+    values = np.full((40, 40), 50, np.int16)
+    values[:, :10], values[0, 20] = 0, 9999
+    path = write_surface(tmp_path / "a.tif", values, nodata=-32768)
+    with rasterio.open(path, "r+") as file:
+        file.scales = (0.01,)
+    surface = open_surface(path)
+    assert surface.unknown == ()
+    assert surface.remarks == []
 
 
 def test_another_coordinate_system_is_converted(tmp_path: Path):
@@ -90,6 +150,30 @@ def test_feet_without_a_unit_of_heights_are_remarked(tmp_path: Path):
     assert any("US survey foot" in remark for remark in open_surface(plain).remarks)
     known = write_surface(tmp_path / "b.tif", np.full((30, 30), 100, np.float32), crs="EPSG:2263+6360")
     assert open_surface(known).remarks == []
+
+
+@pytest.mark.parametrize(
+    ("unit", "system", "metres", "remark"),
+    [
+        ("ft", "EPSG:32630", 0.3048, None),
+        ("US survey foot", "EPSG:2263", 1200 / 3937, None),
+        ("metre", "EPSG:2263", 1.0, None),
+        ("cm", None, 0.01, "no coordinate system"),
+        ("cubit", "EPSG:32630", 1.0, "heights in cubit, which is not known"),
+        ("m", "EPSG:6318+6360", 1200 / 3937, None),
+    ],
+)
+def test_the_unit_of_a_band_is_that_of_heights_whose_system_states_none(
+    tmp_path: Path, unit: str, system: str | None, metres: float, remark: str | None
+):
+    import rasterio
+
+    path = write_surface(tmp_path / "a.tif", np.full((30, 30), 100, np.float32), crs=system)
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    surface = open_surface(path)
+    assert surface.metres == pytest.approx(metres, rel=1e-9)
+    assert surface.remarks == [] if remark is None else remark in surface.remarks[0]
 
 
 @pytest.mark.parametrize("system", ["EPSG:4326", "EPSG:3857", "EPSG:3395"])
@@ -144,6 +228,39 @@ def test_heights_over_different_zeros_are_refused(tmp_path: Path):
         common_grid([open_surface(one), open_surface(two)])
 
 
+def test_ellipsoidal_heights_are_not_compared_with_those_over_a_geoid(tmp_path: Path):
+    one = write_surface(tmp_path / "a.tif", plane(20, 20, 1e-5, -4.4, 51.4), 1e-5, -4.4, 51.4, "EPSG:4979")
+    two = write_surface(tmp_path / "b.tif", plane(20, 20, 1e-5, -4.4, 51.4), 1e-5, -4.4, 51.4, "EPSG:4326+5773")
+    with pytest.raises(ChangeError, match=r"the ellipsoid of WGS 84.*EGM96"):
+        common_grid([open_surface(one), open_surface(two)])
+    assert common_grid([open_surface(one), open_surface(one)]).rows > 1
+
+
+def test_a_vertical_system_without_a_name_is_compared_with_any(tmp_path: Path):
+    vertical = 'VERT_CS["unknown",VERT_DATUM["Unknown",2005],UNIT["metre",1],AXIS["Up",UP]]'
+    nameless = f'COMPD_CS["both",{CRS("EPSG:27700").to_wkt("WKT1_GDAL")},{vertical}]'
+    one = write_surface(tmp_path / "a.tif", plane(20, 20, 0.5), crs="EPSG:27700+5701")
+    two = replace(open_surface(one), path=tmp_path / "b.tif", crs=CRS(nameless))
+    assert common_grid([open_surface(one), two]).rows == 20
+
+
+def test_surveys_of_one_datum_meet_in_its_own_zone(tmp_path: Path):
+    """GDA94 and GDA2020 are 1.8 m apart; WGS 84 is taken for either by PROJ, which loses the difference."""
+    longitude, latitude = 145.0, -38.0
+    x, y = Transformer.from_crs("EPSG:7844", "EPSG:7855", always_xy=True).transform(longitude, latitude)
+    old = Transformer.from_crs("EPSG:7844", "EPSG:4283", always_xy=True).transform(longitude, latitude)
+    heights = np.zeros((100, 100), np.float32)
+    one = open_surface(write_surface(tmp_path / "a.tif", heights, 5e-6, *old, "EPSG:4283"))
+    grid = common_grid([one, open_surface(write_surface(tmp_path / "b.tif", heights, 0.5, x, y, "EPSG:7855"))])
+    system = CRS(grid.crs)
+    assert system.name == "GDA94 / UTM zone 55S"
+    corners = [
+        Transformer.from_crs(of, system, always_xy=True).transform(*at)
+        for of, at in (("EPSG:4283", old), ("EPSG:7855", (x, y)))
+    ]
+    assert corners[0] == pytest.approx(corners[1], abs=0.01)
+
+
 def test_a_system_in_one_file_only_is_refused(tmp_path: Path):
     one = write_surface(tmp_path / "a.tif", plane(20, 20, 0.5))
     two = write_surface(tmp_path / "b.tif", plane(20, 20, 0.5), crs=None)
@@ -178,3 +295,18 @@ def test_a_file_that_is_cut_short_is_refused_when_it_is_read(tmp_path: Path):
 def test_dates_are_read_from_names(tmp_path: Path, name: str, date: str | None):
     path = write_surface(tmp_path / f"{name}.tif", plane(20, 20, 0.5))
     assert open_surface(path).date == date
+
+
+def test_the_date_in_a_name_is_believed_before_that_of_the_processing(tmp_path: Path):
+    import rasterio
+
+    path = write_surface(tmp_path / "flight_2023-05-01.tif", plane(20, 20, 0.5))
+    with rasterio.open(path, "r+") as file:
+        file.update_tags(TIFFTAG_DATETIME="2024:02:03 10:00:00")
+    found = open_surface(path)
+    assert found.date == "2023-05-01"
+    assert any("2024-02-03" in remark for remark in found.remarks)
+    assert open_surface(path, "2023-05-02").date == "2023-05-02"
+    assert open_surface(path, "2023-05-02").remarks == []
+    bare = path.rename(tmp_path / "flight.tif")
+    assert open_surface(bare).date == "2024-02-03"

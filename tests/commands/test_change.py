@@ -12,9 +12,14 @@ from surveys_of_two_dates import pair
 
 from tidefield import cli
 from tidefield.addresses import copy_of
+from tidefield.change.surfaces import ChangeError
 from tidefield.commands.change import _check_scenes, _view_folders
 from tidefield.config import PRESETS
-from tidefield.train.checkpoint import Run, write_run
+from tidefield.data.georeference import Georeference, Residuals
+from tidefield.errors import RunError
+from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.similarity import Similarity
+from tidefield.train.checkpoint import CHECKPOINT_FILE, Run, write_run
 
 
 def call(*words: object) -> None:
@@ -153,7 +158,16 @@ def test_mistakes_are_told_in_one_message(
     wrong = ("--dates", "2024-05-03", "2023-05-01")
     assert "earlier survey first" in fails(capsys, monkeypatch, "change", early, late, new, *wrong)
     assert "odd numbers" in fails(capsys, monkeypatch, "change", early, late, new, "--windows", 4)
-    assert "YYYY-MM-DD" in fails(capsys, monkeypatch, "change", early, late, new, "--dates", "May", "June")
+    for date in ("May", "2024-02-30", "20240501"):
+        message = fails(capsys, monkeypatch, "change", early, late, new, "--dates", "2023-05-01", date)
+        assert "YYYY-MM-DD" in message
+    for cell in (-1, "nan", 0):
+        assert "more than 0 metres" in fails(capsys, monkeypatch, "change", early, late, new, "--cell", cell)
+    (tmp_path / "file").write_text("")
+    with monkeypatch.context() as patch:
+        patch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
+        message = fails(capsys, patch, "change", early, late, tmp_path / "file" / "new")
+        assert "cannot be written" in message
     polygons = tmp_path / "polygons.geojson"
     polygons.write_text('{"type": "FeatureCollection", "features": [')
     assert "polygons" in fails(capsys, monkeypatch, "change", early, late, new, "--stable", polygons)
@@ -245,8 +259,12 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
 
 
 def test_views_from_photographs_of_one_name_have_folders_of_their_own(tmp_path: Path):
-    names = ["a/IMG_1.JPG", "a/IMG_1.PNG", "a_IMG_1.JPG", "IMG_2.JPG"]
-    assert len(set(_view_folders(names, tmp_path))) == len(names)
+    for names in (
+        ["a/IMG_1.JPG", "a/IMG_1.PNG", "a_IMG_1.JPG", "IMG_2.JPG"],
+        ["DJI.JPG", "DJI.png", "DJI (1).JPG", "DJI (2).JPG"],
+        ["DJI_1.JPG", "dji_1.jpg"],
+    ):
+        assert len({str(folder).casefold() for folder in _view_folders(names, tmp_path)}) == len(names)
     assert _view_folders(["a/IMG_1.JPG", "IMG_2.JPG"], tmp_path) == [tmp_path / "a_IMG_1", tmp_path / "IMG_2"]
 
 
@@ -255,7 +273,21 @@ def test_the_scenes_of_runs_may_be_at_addresses(tmp_path: Path, monkeypatch: pyt
     write_colmap(tmp_path / "flats", posed_photographs(PINHOLE))
     (tmp_path / "run").mkdir()
     write_run(tmp_path / "run", Run(copy_of(f"local://{tmp_path}/flats"), None, 0, PRESETS["swift"]))
+    with pytest.raises(RunError, match="a run that has trained"):
+        _check_scenes((tmp_path / "run", tmp_path / "run"), (), "cpu")
+    (tmp_path / "run" / CHECKPOINT_FILE).write_bytes(b"")
     _check_scenes((tmp_path / "run", tmp_path / "run"), (), "cpu")
+
+
+def test_scenes_of_which_one_has_no_georeference_are_refused_at_once(tmp_path: Path):
+    scene = posed_photographs(PINHOLE)
+    for name in ("local", "placed"):
+        write_colmap(tmp_path / name, scene)
+    frame, there = LocalFrame.at("EPSG:32630", (400_000.0, 5_700_000.0, 0.0)), Similarity(1.0, np.eye(3), np.zeros(3))
+    Georeference(frame, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(tmp_path / "placed")
+    with pytest.raises(ChangeError, match="one of the scenes is georeferenced"):
+        _check_scenes((tmp_path / "local", tmp_path / "placed"), (), "cpu")
+    _check_scenes((tmp_path / "placed", tmp_path / "placed"), (), "cpu")
 
 
 def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(

@@ -59,7 +59,7 @@ def simulate_noise(
 def repeat_choice(
     dz: Float32[np.ndarray, "rows columns"],
     sigma: Float32[np.ndarray, "rows columns"] | float,
-    systematic_m: float,
+    systematic_m: Float32[np.ndarray, "rows columns"] | float,
     variogram: Variogram,
     cell_m: float,
     outlines: Outlines,
@@ -76,11 +76,11 @@ def repeat_choice(
         random = np.random.default_rng([seed, number])
         part, labels = dz[box], outlines.labels[box]
         known = np.isfinite(part)
-        own = sigma[box] if isinstance(sigma, np.ndarray) else sigma
+        own, near = (of[box] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))
         found = np.where(known, _smoothed(part, labels), np.float32(np.nan))
         for k in range(_REPEATS):
             noise = simulate_noise(part.shape, variogram, cell_m, random) * np.asarray(own, np.float32)
-            again = find_outlines(found + noise, own, systematic_m, variogram, cell_m, outlines.windows)
+            again = find_outlines(found + noise, own, near, variogram, cell_m, outlines.windows)
             for side, sign in enumerate((-1, 1)):
                 sums[side, k] += float(noise.sum(where=again.cells(sign), dtype=np.float64))
     lower, higher = (Choice(float(s.mean()) * share, float(s.std(ddof=1)) * math.sqrt(share)) for s in sums)

@@ -11,13 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Transformer
-from pyproj.exceptions import ProjError
+from pyproj.crs import CompoundCRS
+from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, Grid, is_local, same_system
+from tidefield.change.surfaces import ChangeError, Grid, is_local, same_system, unstated_unit
 from tidefield.files import reading_from
-from tidefield.geometry.geodesy import horizontal, metres_per_height, metric_system, zero_of_heights
+from tidefield.geometry.geodesy import (
+    has_unstated_unit,
+    horizontal,
+    metres_per_height,
+    metric_system,
+    zero_of_heights,
+)
 from tidefield.maps.classes import NOISE, WATER
 
 if TYPE_CHECKING:
@@ -27,6 +34,12 @@ _MOST_POINTS = 200_000_000
 _POINTS_PER_CELL = 10.0
 """With fewer, cells without points are holes in the surface, and are missing in volumes."""
 _CHUNK = 2_000_000
+_PROJECTED, _PLAN_UNIT, _VERTICAL, _HEIGHT_UNIT = 3072, 3076, 4096, 4099
+"""GeoKeys of the plan's and the heights' system and unit (OGC GeoTIFF 1.1)."""
+_USER_DEFINED = 32767
+_UNITS_M = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+"""Lengths of EPSG's units of length."""
+_ASSIGN = "pdal translate --writers.las.a_srs"
 SIGMAS = ("sigma_z", "sigma")
 """Names of a dimension with the points' standard errors."""
 
@@ -40,6 +53,7 @@ class Cloud:
         xyz: east, north, up.
         sigma: standard errors of their heights, if the file has them.
         zero: name of the datum of the heights, if the file states one.
+        remarks: what a user should know of how it was read.
     """
 
     path: Path
@@ -47,6 +61,7 @@ class Cloud:
     xyz: Float64[np.ndarray, "N 3"]
     sigma: Float64[np.ndarray, " N"] | None
     zero: str | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def require_laspy() -> ModuleType:
@@ -65,7 +80,7 @@ def require_laspy() -> ModuleType:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read the points of a LAS or LAZ file without those that are classified as noise or water.
+    """Read the points of a LAS or LAZ file without those that are withheld or classified as noise or water.
 
     Those of systems in feet, or of Web Mercator, are converted to the UTM zone of their middle.
 
@@ -82,11 +97,12 @@ def read_cloud(path: Path) -> Cloud:
             header = reader.header
             if not 0 < header.point_count <= _MOST_POINTS or header.point_count > 100 * size:
                 raise ChangeError(f"{path} has {header.point_count} points: {expected}, or a part of it")
-            crs = header.parse_crs()
+            crs, keys = _system(header)
             extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
             parts, sigmas = [], []
             for points in reader.chunk_iterator(_CHUNK):
                 kept = ~np.isin(np.asarray(points.classification), (*NOISE, WATER))
+                kept &= ~np.asarray(points.withheld, bool)
                 xyz = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
                 kept &= np.isfinite(xyz).all(axis=1)
                 parts.append(xyz[kept])
@@ -98,24 +114,58 @@ def read_cloud(path: Path) -> Cloud:
         raise ChangeError(f"{path} cannot be read as a point cloud ({error}): {expected}") from error
     xyz = np.concatenate(parts)
     if len(xyz) == 0:
-        raise ChangeError(f"{path} has no points but noise and water: {expected}")
+        raise ChangeError(f"{path} has no points but noise, water and withheld ones: {expected}")
     if crs is not None and crs.is_geographic:
         raise ChangeError(f"{path} is in degrees: expected a projected system in metres; convert it first")
     sigma = np.concatenate(sigmas) if sigmas else None
-    if crs is None or is_local(crs):
-        return Cloud(path, None, xyz, sigma)
-    up = metres_per_height(crs)
+    up = _UNITS_M.get(keys.get(_HEIGHT_UNIT, 0), 1.0 if crs is None else metres_per_height(crs))
     xyz[:, 2] *= up
+    sigma = None if sigma is None else sigma * up
+    if crs is None or is_local(crs):
+        xyz[:, :2] *= _UNITS_M.get(keys.get(_PLAN_UNIT, 0), 1.0)
+        own_system = (
+            f"{path.name} has a projected system of its own, which is not read: that both surveys have the same one is "
+            f"taken for granted, and that heights without a unit are metres; assign a known one ({_ASSIGN})"
+        )
+        remarks = (own_system,) if crs is None and keys.get(_PROJECTED) == _USER_DEFINED else ()
+        return Cloud(path, None, xyz, sigma, remarks=remarks)
     try:
         metric = metric_system(crs, *xyz[:, :2].mean(axis=0).tolist())
     except ProjError as error:
         raise ChangeError(
             f"{path} lies outside of {crs.name} ({error}): expected coordinates of its system; assign the right one "
-            "(pdal translate --writers.las.a_srs)"
+            f"({_ASSIGN})"
         ) from error
-    own = crs if up == 1 else horizontal(crs)
-    cloud = Cloud(path, own, xyz, None if sigma is None else sigma * up, zero_of_heights(crs))
-    return in_system(cloud, metric)
+    unstated = has_unstated_unit(crs) and keys.get(_HEIGHT_UNIT) not in _UNITS_M
+    remarks = (unstated_unit(path, crs, _ASSIGN),) if unstated else ()
+    own = crs if metres_per_height(crs) == 1 else horizontal(crs)
+    return in_system(Cloud(path, own, xyz, sigma, zero_of_heights(crs), remarks), metric)
+
+
+def _system(header: Any) -> tuple[CRS | None, dict[int, int]]:
+    """The system of a LAS file, and its GeoTIFF keys, of which laspy reads those of the plan alone."""
+    vlrs = header.vlrs.get("GeoKeyDirectoryVlr")
+    keys = {key.id: key.value_offset for vlr in vlrs for key in vlr.geo_keys if key.tiff_tag_location == 0}
+    crs = header.parse_crs()
+    if crs is None or (crs.is_geographic and keys.get(_PROJECTED) == _USER_DEFINED):
+        return None, keys
+    if _VERTICAL in keys and not crs.is_compound and len(crs.axis_info) < 3:
+        try:
+            vertical = CRS.from_epsg(keys[_VERTICAL])
+        except CRSError:  # of GeoTIFF 1.0, which had numbers of its own, or of the user
+            return crs, keys
+        if vertical.is_vertical:
+            crs = CRS(CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical]).to_wkt())
+    return crs, keys
+
+
+def require_system(cloud: Cloud, crs: CRS | None) -> None:
+    """Raises: ChangeError when only one of a cloud and what it is compared with has a system."""
+    if (cloud.crs is None) != (crs is None):
+        lacks = cloud.path.name if cloud.crs is None else f"what {cloud.path.name} is compared with"
+        raise ChangeError(
+            f"{lacks} has no coordinate system: expected it in both surveys or in none; assign it ({_ASSIGN})"
+        )
 
 
 def in_system(cloud: Cloud, crs: CRS | None) -> Cloud:
@@ -124,15 +174,8 @@ def in_system(cloud: Cloud, crs: CRS | None) -> Cloud:
     Raises:
         ChangeError: only one of them has a system, or there is no way between them.
     """
-    if cloud.crs is None and crs is None:
-        return cloud
-    if cloud.crs is None or crs is None:
-        lacks = cloud.path.name if cloud.crs is None else f"what {cloud.path.name} is compared with"
-        raise ChangeError(
-            f"{lacks} has no coordinate system: expected it in both surveys or in none; assign it (pdal translate "
-            "--writers.las.a_srs)"
-        )
-    if same_system(cloud.crs, crs):
+    require_system(cloud, crs)
+    if cloud.crs is None or crs is None or same_system(cloud.crs, crs):
         return cloud
     xy = Transformer.from_crs(horizontal(cloud.crs), horizontal(crs), always_xy=True).transform(*cloud.xyz[:, :2].T)
     xyz = np.column_stack([*xy, cloud.xyz[:, 2]])

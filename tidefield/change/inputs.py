@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, write_surface
-from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, require_one_zero
+from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, require_system, write_surface
+from tidefield.change.shift import is_picture
+from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, opened, require_one_zero
 
 FILLED = "filled.tif"
 """Of `tidefield map --fill`, next to the surface."""
@@ -31,7 +32,9 @@ def open_survey(path: Path, date: str | None = None) -> Surface:
     if is_cloud(path):
         raise ChangeError(f"{path} is a point cloud: expected a surface; compare it with another cloud")
     if not path.is_dir():
-        return open_surface(path, date)
+        # Another surface in that folder is none of the map's.
+        mapped = path.name in {Path(name).name for name in SURFACES}
+        return replace(open_surface(path, date), filled=first_of(path.parent, (FILLED,)) if mapped else None)
     surface = first_of(path, SURFACES)
     if surface is None:
         raise ChangeError(
@@ -40,12 +43,22 @@ def open_survey(path: Path, date: str | None = None) -> Surface:
         )
     name = path.resolve().name
     found = open_surface(surface, date or date_in(name))
+    picture, remarks = first_of(path, ORTHOPHOTOS), []
+    if picture is not None:
+        with opened(picture) as dataset:
+            if not is_picture(dataset):
+                remarks.append(
+                    f"{picture.name} of {name} has {dataset.count} bands of {dataset.dtypes[0]}, not red, green and "
+                    "blue: it is not used"
+                )
+                picture = None
     return replace(
         found,
         filled=first_of(surface.parent, (FILLED,)),
-        orthophoto=first_of(path, ORTHOPHOTOS),
+        orthophoto=picture,
         cloud=first_of(path, CLOUDS),
         source=name,
+        remarks=[*found.remarks, *remarks],
     )
 
 
@@ -96,6 +109,9 @@ def open_pair(
             if paths[0] is None or paths[1] is None:
                 raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
             clouds = _both(paths[0], paths[1])
+            for k, cloud in enumerate(clouds):
+                require_system(cloud, surveys[0].crs)
+                surveys[k] = replace(surveys[k], remarks=[*surveys[k].remarks, *cloud.remarks])
         return Pair(*_distinguished(surveys[0], surveys[1], earlier, later), clouds)
     clouds = _both(earlier, later)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
@@ -104,7 +120,7 @@ def open_pair(
         path = work / f"{name}.tif"
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
-        surfaces.append(replace(opened, source=cloud.path.name, remarks=[]))
+        surfaces.append(replace(opened, source=cloud.path.name, remarks=list(cloud.remarks)))
     return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
 
 

@@ -190,13 +190,17 @@ def measure(
     model: Model = "vertical" if options.register == "auto" else options.register
     settled = _settle(dz, own, grid, given, model, options)
     registration, variogram, sigma, ground = settled
+    slopes = None
     if shift is not None and shift.known:
         registration = replace(registration, shift_m=moved, shift_error_m=shift.error_m, words=[shift.words()])
-        sigma = _with_slopes(sigma, earlier, grid, shift.error_m)
+        slopes = _slopes(earlier, grid)
+        if model != "none":
+            # The mean over stable ground of what an error of the shift does was subtracted there.
+            slopes -= np.stack([_sampled(part, ground).mean() for part in slopes])[:, None, None]
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
     degrees = variogram.degrees_of_freedom(float(ground.sum()) * grid.cell_area_m2)
-    errors = ErrorModel(sigma, variogram, registration, grid, degrees)
+    errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes)
     alarms = _false_alarms(dz, errors, ground)
     if area is not None:
         dz[~area] = np.nan
@@ -209,7 +213,7 @@ def measure(
             f"stable ground was found, not given: {100 * ground.sum() / max(known, 1):.0f}% of the cells, where no "
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
-    outlines = find_outlines(dz, sigma, registration.systematic_m, variogram, grid.cell_m, options.windows)
+    outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, options.windows)
     return _summed(earlier, later, dz, errors, ground, given is not None, outlines, alarms, regions, remarks)
 
 
@@ -235,20 +239,15 @@ def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remar
     return shift
 
 
-def _with_slopes(
-    sigma: Float32[np.ndarray, "rows columns"] | float, earlier: Surface, grid: Grid, error_m: float
-) -> Float32[np.ndarray, "rows columns"]:
-    """Standard errors with what an error of the horizontal shift does to heights on slopes."""
-    out = np.empty(grid.shape, np.float32)
-    with earlier.on_grid(grid) as read:
+def _slopes(surface: Surface, grid: Grid) -> Float32[np.ndarray, "2 rows columns"]:
+    """Slopes of a surface to the east and to the north; 0 where they are unknown."""
+    out = np.empty((2, *grid.shape), np.float32)
+    with surface.on_grid(grid) as read:
         for rows in grid.strips():
-            heights = read(max(0, rows.start - 1), min(grid.rows, rows.stop + 1))
-            north, east = np.gradient(heights, grid.cell_m)
-            inner = slice(rows.start - max(0, rows.start - 1), None)
-            slope = np.nan_to_num(np.hypot(north, east)[inner][: rows.stop - rows.start])
-            own = sigma[rows] if isinstance(sigma, np.ndarray) else np.float32(sigma)
-            out[rows] = np.hypot(own, slope * np.float32(error_m))
-    return out
+            first = max(0, rows.start - 1)
+            south, east = np.gradient(read(first, min(grid.rows, rows.stop + 1)), grid.cell_m)
+            out[:, rows] = np.stack([east, -south])[:, rows.start - first :][:, : rows.stop - rows.start]
+    return np.nan_to_num(out, copy=False)
 
 
 def _settle(
@@ -381,8 +380,7 @@ def _summed(
     lower, higher = outlines.cells(-1), outlines.cells(1)
     choices = None
     if len(outlines.signs):
-        systematic = errors.registration.systematic_m
-        choices = repeat_choice(dz, errors.sigma, systematic, errors.variogram, grid.cell_m, outlines)
+        choices = repeat_choice(dz, errors.sigma, errors.near_sigma(), errors.variogram, grid.cell_m, outlines)
 
     def chosen(inside: Bool[np.ndarray, "rows columns"]) -> tuple[Volume, Volume]:
         """Cut and fill of the outlines' cells in a region, with its share of what their choice adds."""
@@ -447,7 +445,7 @@ def _in_box(
             sign * float(values.sum()) * area,
             own.random * area,
             own.correlated * area,
-            errors.registration.deviation_of_sum(errors.grid, inside, box) * area,
+            errors.systematic_of_sum(inside, box) * area,
             len(values) * area,
             degrees_of_freedom=errors.degrees_of_freedom,
         ),

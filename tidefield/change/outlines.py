@@ -63,7 +63,7 @@ class Outlines:
 def find_outlines(
     dz: Float32[np.ndarray, "rows columns"],
     sigma: Float32[np.ndarray, "rows columns"] | float,
-    systematic_m: float,
+    systematic_m: Float32[np.ndarray, "rows columns"] | float,
     variogram: Variogram,
     cell_m: float,
     windows: tuple[int, ...] = WINDOWS,
@@ -73,7 +73,7 @@ def find_outlines(
     Args:
         dz: difference, NaN where unknown.
         sigma: one sigma of each cell's own error.
-        systematic_m: one sigma of the error that all cells share.
+        systematic_m: one sigma of the error that a cell shares with all around it.
         windows: cells along each side of the windows; odd.
     """
     z = _largest_z(dz, sigma, systematic_m, variogram, cell_m, windows)
@@ -123,7 +123,7 @@ def _limited(
 def _largest_z(
     dz: Float32[np.ndarray, "rows columns"],
     sigma: Float32[np.ndarray, "rows columns"] | float,
-    systematic_m: float,
+    systematic_m: Float32[np.ndarray, "rows columns"] | float,
     variogram: Variogram,
     cell_m: float,
     windows: tuple[int, ...],
@@ -134,12 +134,12 @@ def _largest_z(
     for rows in _strips(len(dz)):
         low, high = max(0, rows.start - halo), min(len(dz), rows.stop + halo)
         inner = slice(rows.start - low, rows.stop - low)
-        own = sigma[low:high] if isinstance(sigma, np.ndarray) else sigma
+        own, near = (of[low:high] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))
         limited = _limited(dz[low:high], own)
-        first = window_z(limited, own, systematic_m, variogram, cell_m, windows[0])[inner]
+        first = window_z(limited, own, near, variogram, cell_m, windows[0])[inner]
         z[rows] = first
         for window in windows[1:]:
-            other = window_z(limited, own, systematic_m, variogram, cell_m, window)[inner]
+            other = window_z(limited, own, near, variogram, cell_m, window)[inner]
             # A large window reaches beyond the edge of a change; the smallest one has to show a little of it, too.
             larger = (np.abs(other) > np.abs(z[rows])) & (first * np.sign(other) > _SHOWS)
             np.copyto(z[rows], other, where=larger)
@@ -163,7 +163,7 @@ def _strips(rows: int) -> list[slice]:
 def window_z(
     dz: Float32[np.ndarray, "rows columns"],
     sigma: Float32[np.ndarray, "rows columns"] | float,
-    systematic_m: float,
+    systematic_m: Float32[np.ndarray, "rows columns"] | float,
     variogram: Variogram,
     cell_m: float,
     window: int,
@@ -180,9 +180,9 @@ def window_z(
         share = uniform_filter(known.astype(np.float32), window, mode="constant")
         mean = uniform_filter(np.where(known, part, 0), window, mode="constant") / np.maximum(share, 1e-6)
         inner = slice(first - low, first - low + last - first)
-        own = sigma[first:last] if isinstance(sigma, np.ndarray) else sigma
+        own, near = (of[first:last] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))
         count = np.maximum(share[inner] * window**2, 1)
-        deviation = np.sqrt(np.square(own) * (variogram.nugget / count + correlated) + systematic_m**2)
+        deviation = np.sqrt(np.square(own) * (variogram.nugget / count + correlated) + np.square(near))
         z[first:last] = np.where(known[inner], mean[inner] / np.maximum(deviation, 1e-9), np.nan)
     return z
 

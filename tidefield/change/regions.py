@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from jaxtyping import Bool
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.change.surfaces import ChangeError, Grid, require_rasterio
+from tidefield.change.surfaces import ChangeError, Grid, is_local, require_rasterio
 
 _MOST_REGIONS = 10_000
 _LARGEST_FILE = 1 << 28
@@ -50,20 +51,40 @@ def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
     return np.stack(to.transform(points[:, 0], points[:, 1]), axis=1)
 
 
+def _layer(path: Path, layers: list[str], asked: str | None) -> str:
+    """The layer that is read of those with geometries."""
+    if asked is None and len(layers) == 1:
+        return layers[0]
+    if asked in layers:
+        return asked
+    if not layers:
+        raise ChangeError(f"{path} has no geometries: expected polygons or lines; name another file")
+    raise ChangeError(
+        f"{path} has {', '.join(layers)}: expected the name of one of these layers; write {path.name}:{layers[0]}"
+    )
+
+
 def read_regions(path: Path, grid: Grid) -> list[Region]:
-    """Read all geometries of a file's first layer, in the grid's system; no two have one name.
+    """Read all geometries of a file's layer, in the grid's system; no two have one name.
+
+    Args:
+        path: the file; "file.gpkg:layer" where it has several layers.
 
     Raises:
-        ChangeError: it cannot be read, is empty or too large, or has no geometry on the grid.
+        ChangeError: it cannot be read, is empty or too large, has several layers, or has no geometry on the grid.
     """
     try:
-        from pyogrio import raw, read_info
+        from pyogrio import list_layers, raw, read_info
         from pyogrio.errors import DataLayerError, DataSourceError
     except ImportError as error:
         raise ChangeError(
             "pyogrio is not installed: polygons are read with it; install it with `pip install 'tidefield[maps]'`"
         ) from error
     expected = "expected polygons as GeoJSON, GeoPackage or shapefile; name another file"
+    asked = None
+    if not path.is_file() and ":" in path.name:
+        name, asked = path.name.rsplit(":", 1)
+        path = path.with_name(name)
     if not path.is_file():
         raise ChangeError(f"{path} is not a file: {expected}")
     if path.stat().st_size > _LARGEST_FILE:
@@ -71,8 +92,9 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
             f"{path} has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}: {expected}"
         )
     try:
-        about = read_info(path)
-        meta, _, shapes, columns = raw.read(path, max_features=_MOST_REGIONS + 1, force_2d=True)
+        layer = _layer(path, [str(name) for name, kind in list_layers(path) if kind is not None], asked)
+        about = read_info(path, layer=layer)
+        meta, _, shapes, columns = raw.read(path, layer=layer, max_features=_MOST_REGIONS + 1, force_2d=True)
         geometries = shapely.from_wkb(shapes)
     except (DataSourceError, DataLayerError, ValueError, shapely.errors.ShapelyError) as error:
         raise ChangeError(f"{path} cannot be read as polygons ({error}): {expected}") from error
@@ -80,10 +102,18 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
         raise ChangeError(f"{path} has more than {_MOST_REGIONS} features: {expected}")
     fields = [str(name) for name in meta["fields"]]
     chosen = next((k for name in _NAMES for k, f in enumerate(fields) if f.lower() == name), None)
-    crs = CRS(about["crs"]) if about["crs"] else None
     to = None
-    if crs is not None and grid.crs is not None:
-        to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
+    if about["crs"] and grid.crs is not None:
+        try:
+            crs = CRS(about["crs"])
+            # A file without a place on Earth, which GeoPackages call undefined, is taken to lie as the surveys do.
+            if not is_local(crs):
+                to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
+        except ProjError as error:
+            raise ChangeError(
+                f"{path} cannot be converted to {CRS.from_wkt(grid.crs).name} ({error}): expected a system that fits "
+                "its place; assign it (ogr2ogr -a_srs)"
+            ) from error
     frame = shapely.box(*grid.bounds)
     found: list[Region] = []
     taken = {"all"}  # what tables call the whole survey

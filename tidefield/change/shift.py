@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,6 +74,11 @@ class Shift:
         )
 
 
+def is_picture(dataset: Any) -> bool:
+    """Whether a raster that is open has red, green and blue."""
+    return dataset.count >= 3 and dataset.dtypes[0] in ("uint8", "uint16")
+
+
 def picture_grid(paths: tuple[Path, Path], grid: Grid) -> Grid:
     """The grid that two orthophotos are compared on: their coarser pixels, on the ground of another grid.
 
@@ -82,7 +88,7 @@ def picture_grid(paths: tuple[Path, Path], grid: Grid) -> Grid:
     pixel = 0.0
     for path in paths:
         with opened(path) as dataset:
-            if dataset.count < 3 or dataset.dtypes[0] not in ("uint8", "uint16"):
+            if not is_picture(dataset):
                 raise ChangeError(f"{path} is no orthophoto: expected a GeoTIFF with red, green and blue")
             own = max(abs(dataset.transform.a), abs(dataset.transform.e))
             if dataset.crs is not None and dataset.crs.is_geographic:

@@ -9,15 +9,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
+from scipy.ndimage import label
 
 from tidefield.errors import TidefieldError
 from tidefield.files import reading_from
-from tidefield.geometry.geodesy import horizontal, in_metres, metres_per_height, metric_system, zero_of_heights
+from tidefield.geometry.geodesy import (
+    has_unstated_unit,
+    horizontal,
+    metres_per_height,
+    metric_system,
+    zero_of_heights,
+)
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -36,8 +44,19 @@ _SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
 """Values that programs write where they know no height; some do not declare them."""
 _IMPOSSIBLE_M = 20_000.0
 """No height on Earth is further from zero."""
+_UNLIKELY_M = 3_000.0
+"""No flat is further from zero; 9999 feet are."""
 _ZERO_SHARE = 0.01
-"""Exact zeros in more cells than this are no heights if the others are all far from zero."""
+"""Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
+_UNITS_M = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus"), 1200 / 3937),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
+    "units": 1.0,  # of a map without a georeference
+}
+"""Lengths of the units that bands state."""
 Read = Callable[[int, int], Float32[np.ndarray, "rows columns"]]
 
 
@@ -109,7 +128,8 @@ class Surface:
     Attributes:
         crs: None where the file states none.
         transform: from column and row to the file's own coordinates; whole numbers are corners of pixels.
-        nodata: value of pixels without a height, declared or found; None if there is none.
+        nodata: value of pixels without a height, as declared; None if there is none.
+        unknown: further values that stand for no height, whatever the file declares.
         metres: length of one unit of the heights.
         scale, offset: heights are the file's values times scale plus offset.
         sigma: raster of their standard errors, if there is one.
@@ -138,6 +158,7 @@ class Surface:
     date: str | None = None
     datum: str | None = None
     remarks: list[str] = field(default_factory=list)
+    unknown: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -154,7 +175,7 @@ class Surface:
         Yields:
             a function of first and last row that returns heights in metres, NaN where there are none.
         """
-        with warped(self.path, self.crs, grid, shift_m, nodata=self.nodata) as read:
+        with warped(self.path, self.crs, grid, shift_m, nodata=self.nodata, unknown=self.unknown) as read:
 
             def heights(first: int, last: int) -> Float32[np.ndarray, "rows columns"]:
                 values = read(first, last)[0]
@@ -174,9 +195,13 @@ def warped(
     shift_m: tuple[float, float] = (0.0, 0.0),
     *,
     nodata: float | None = None,
+    unknown: tuple[float, ...] = (),
     bands: tuple[int, ...] = (1,),
 ) -> Iterator[Callable[[int, int], Float32[np.ndarray, "bands rows columns"]]]:
     """Read rows of any raster on a grid as float32, NaN where it has no value.
+
+    Args:
+        unknown: further values of the first band that are none; the other bands are not read then.
 
     Raises:
         ChangeError: the file cannot be read to its end.
@@ -201,23 +226,26 @@ def warped(
         same = same and max(abs(own.a / moved.a - 1), abs(own.e / moved.e - 1)) * size < 0.01
         aligned = same and max(abs(o - round(o)) for o in offset) < 0.01
         resampling = Resampling.nearest if aligned else Resampling.bilinear
-        alpha = MaskFlags.alpha in dataset.mask_flag_enums[0]
+        alpha = MaskFlags.alpha in dataset.mask_flag_enums[0] and not unknown
         options: dict[str, Any] = {} if alpha else {"nodata": math.nan}
-        if nodata is not None and not alpha:
+        if nodata is not None and not alpha and not unknown:
             options["src_nodata"] = nodata
         if crs is not None or grid.crs is None:
             options["src_crs"] = source
-        with WarpedVRT(
-            dataset,
-            crs=target,
-            transform=moved,
-            width=grid.columns,
-            height=grid.rows,
-            resampling=resampling,
-            dtype="float32",
-            warp_mem_limit=64,
-            **options,
-        ) as vrt:
+        with (
+            _without(dataset, unknown) as cleared,
+            WarpedVRT(
+                cleared,
+                crs=target,
+                transform=moved,
+                width=grid.columns,
+                height=grid.rows,
+                resampling=resampling,
+                dtype="float32",
+                warp_mem_limit=64,
+                **options,
+            ) as vrt,
+        ):
 
             def read(first: int, last: int) -> Float32[np.ndarray, "bands rows columns"]:
                 window = Window(0, first, grid.columns, last - first)  # type: ignore[call-arg]
@@ -232,6 +260,26 @@ def warped(
                 return values
 
             yield read
+
+
+@contextmanager
+def _without(dataset: Any, values: tuple[float, ...]) -> Iterator[Any]:
+    """The first band of a raster, NaN where it is masked or has one of some values; the raster itself without any."""
+    if not values:
+        yield dataset
+        return
+    place = ",".join(map(repr, dataset.transform.to_gdal()))
+    source = str(dataset.name)
+    # GDAL leaves out one value in each layer, or what is masked.
+    for rule in ("<UseMaskBand>true</UseMaskBand>", *(f"<NODATA>{value!r}</NODATA>" for value in values)):
+        source = (
+            f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}"><GeoTransform>{place}'
+            '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><NoDataValue>nan</NoDataValue><ComplexSource>'
+            f"<SourceFilename>{escape(source)}</SourceFilename><SourceBand>1</SourceBand>{rule}</ComplexSource>"
+            "</VRTRasterBand></VRTDataset>"
+        )
+    with require_rasterio().open(source) as cleared:
+        yield cleared
 
 
 @contextmanager
@@ -272,7 +320,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                 f"{path} has no place on a map, or a turned one: expected a georeferenced GeoTIFF with north up; "
                 "warp it first (gdalwarp)"
             )
-        crs, metres = None, 1.0
+        crs, metres, heights = None, 1.0, False
         if dataset.crs is not None:
             try:
                 crs = CRS.from_wkt(dataset.crs.to_wkt())
@@ -281,28 +329,37 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                     f"the coordinate system of {path} is not known ({error}): expected one with an EPSG code; assign "
                     "it with gdal_edit.py -a_srs"
                 ) from error
-            metres = metres_per_height(crs)
+            metres, heights = metres_per_height(crs), crs.is_compound or len(crs.axis_info) == 3
             if is_local(crs):
                 crs = None
                 remarks.append(
                     f"{path.name} lies in a local frame: that both surveys have the same one is taken for granted"
                 )
-            elif crs.is_projected and zero_of_heights(crs) is None and not in_metres(crs):
-                remarks.append(
-                    f"the system of {path.name} counts in {crs.axis_info[0].unit_name} and states no unit of heights, "
-                    "which are taken as metres: where they are not, assign a compound system (gdal_edit.py -a_srs)"
-                )
         else:
             remarks.append(f"{path.name} states no coordinate system; its lengths are taken as metres")
+        unit = (dataset.units[0] or "").strip()
+        if unit and not heights:
+            metres = _UNITS_M.get(unit.lower(), 1.0)
+            if unit.lower() not in _UNITS_M:
+                remarks.append(f"{path.name} states heights in {unit}, which is not known: they are taken as metres")
+        elif crs is not None and has_unstated_unit(crs):
+            remarks.append(unstated_unit(path, crs, "gdal_edit.py -a_srs"))
         nodata = dataset.nodata
-        if nodata is None:
-            nodata = _undeclared(dataset)
-            if nodata is not None:
-                remarks.append(
-                    f"{path.name} declares no nodata, but has {nodata:g} where no height can be: read as such"
-                )
+        found = _undeclared(dataset, metres)
+        if found:
+            declared = "no nodata" if nodata is None else f"nodata {nodata:g}"
+            remarks.append(
+                f"{path.name} declares {declared}, but has {' and '.join(f'{value:g}' for value in found)} where no "
+                "height can be: read as such"
+            )
+        # Where a file has a mask, GDAL reads that or the declared value, not both.
+        if _masked(dataset) and nodata is not None and math.isfinite(nodata):
+            found.append(nodata)
         tags = dataset.tags()
-        date = date or date_in(tags.get("TIFFTAG_DATETIME", "")) or date_in(path.stem)
+        named, stated = date_in(path.stem), date_in(tags.get("TIFFTAG_DATETIME", ""))
+        if date is None and named and stated and named != stated:
+            remarks.append(f"{path.name} is of {named} by its name, of {stated} by its tags: its name is believed")
+        date = date or named or stated
         return Surface(
             path,
             crs,
@@ -317,7 +374,16 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
             date=date,
             datum=tags.get("VERTICAL_DATUM"),
             remarks=remarks,
+            unknown=tuple(found),
         )
+
+
+def unstated_unit(path: Path, crs: CRS, tool: str) -> str:
+    """A remark on heights in a system whose plan is in feet, which states no unit of heights."""
+    return (
+        f"the system of {path.name} counts in {horizontal(crs).axis_info[0].unit_name} and states no unit of heights, "
+        f"which are taken as metres: where they are not, assign a compound system ({tool})"
+    )
 
 
 def sigma_of(path: Path) -> Path | None:
@@ -326,19 +392,45 @@ def sigma_of(path: Path) -> Path | None:
     return next((name for name in names if name.is_file()), None)
 
 
-def _undeclared(dataset: Any) -> float | None:
-    """The value that stands for no height in a file that declares none, or None."""
+def _masked(dataset: Any) -> bool:
+    """Whether a raster has a mask of its own."""
+    from rasterio.enums import MaskFlags
+
+    return MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+
+
+def _undeclared(dataset: Any, metres: float) -> list[float]:
+    """Find the values that stand for no height where neither nodata nor a mask says so."""
     height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
-    values = dataset.read(1, out_shape=(height, width)).astype(np.float64)
-    counts = {value: float((values == value).mean()) for value in (*_SENTINELS, float(np.finfo(np.float32).min))}
-    value, share = max(counts.items(), key=lambda item: item[1])
-    if share > 0:
-        return value
-    zero, rest = float((values == 0).mean()), values[(values != 0) & np.isfinite(values)]
-    far = len(rest) > 0 and np.quantile(np.abs(rest), 0.01) * abs(dataset.scales[0]) > 1.0
-    if zero > _ZERO_SHARE and far and dataset.offsets[0] == 0:
-        return 0.0
-    return None
+    raw = dataset.read(1, out_shape=(height, width), masked=True)
+    values = raw.filled(0).astype(np.float64)
+    known = ~np.ma.getmaskarray(raw) & np.isfinite(values)
+    if dataset.nodata is not None:
+        known &= ~np.isclose(values, dataset.nodata)  # the lowest float is often declared with fewer digits
+    scale, offset = dataset.scales[0], dataset.offsets[0]
+    floats, found = np.issubdtype(raw.dtype, np.floating), []
+    for value in (*_SENTINELS, float(np.finfo(np.float32).min)):
+        # Whole numbers with a scale reach some of these values; where others are declared they may be heights.
+        unlikely = floats or abs(value * scale + offset) * metres > _UNLIKELY_M
+        if (unlikely or dataset.nodata is None) and (known & (values == value)).any():
+            found.append(value)
+    zero, rest = known & (values == 0), values[known & (values != 0) & ~np.isin(values, found)]
+    if offset != 0 or len(rest) == 0:
+        return found
+    far = np.quantile(np.abs(rest), 0.01) * abs(scale) > 1.0
+    # Heights of whole numbers are often zero, those of floats never in large areas: that is the frame of a survey.
+    framed = floats and _at_edge(zero).mean() > _ZERO_SHARE
+    if framed or (far and zero.mean() > _ZERO_SHARE):
+        found.append(0.0)
+    return found
+
+
+def _at_edge(cells: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """Those cells that are connected with the edge of a raster."""
+    numbered = np.zeros(cells.shape, np.int32)
+    label(cells, output=numbered)
+    edges = np.concatenate([numbered[0], numbered[-1], numbered[:, 0], numbered[:, -1]])
+    return np.isin(numbered, edges[edges > 0])
 
 
 def date_in(text: str) -> str | None:

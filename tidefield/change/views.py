@@ -22,6 +22,7 @@ from tidefield.change.surfaces import ChangeError, Grid
 from tidefield.data.georeference import read_georeference
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.geometry.geodesy import LocalFrame
 from tidefield.maps.grid import MapFrame, map_frame
 from tidefield.model.rendering import Render, Rendering
 from tidefield.render.stills import MIN_OPACITY, colour_picture
@@ -68,13 +69,18 @@ def carried(
     return replace(camera, T_world_camera=made, names=())
 
 
-def _between(one: MapFrame, other: MapFrame) -> Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, "N 3"]]:
-    """Conversion of easting, northing and height from one map's system to another's."""
-    if (one.frame is None) != (other.frame is None):
+def require_both_placed(one: LocalFrame | None, other: LocalFrame | None) -> None:
+    """Raises: ChangeError when only one of two scenes has a georeference."""
+    if (one is None) != (other is None):
         raise ChangeError(
             "one of the scenes is georeferenced, the other is not: expected both in one system; prepare both with "
             "positions or ground control"
         )
+
+
+def _between(one: MapFrame, other: MapFrame) -> Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, "N 3"]]:
+    """Conversion of easting, northing and height from one map's system to another's."""
+    require_both_placed(one.frame, other.frame)
     heights = np.array([1.0, 1.0, other.metre_up / one.metre_up])
     if one.frame is None or one.horizontal_wkt == other.horizontal_wkt:
         return lambda points: points * heights

@@ -92,6 +92,8 @@ class ErrorModel:
         variogram: how that is correlated.
         registration: the systematic error.
         degrees_of_freedom: of the correlated and the systematic part.
+        slopes: of the ground to the east and north, beyond what the vertical registration takes out of an error of the
+            horizontal shift; None where nothing was shifted.
     """
 
     sigma: Float32[np.ndarray, "rows columns"] | float
@@ -99,11 +101,41 @@ class ErrorModel:
     registration: Registration
     grid: Grid
     degrees_of_freedom: float = math.inf
+    slopes: Float32[np.ndarray, "2 rows columns"] | None = None
 
     def cell_sigma(self, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of a cell's whole error, for some rows."""
         own = self.sigma[rows] if isinstance(self.sigma, np.ndarray) else np.float32(self.sigma)
-        return np.hypot(own, self.registration.deviation(self.grid, rows)).astype(np.float32)
+        return np.hypot(own, self._shared(self.registration.deviation(self.grid, rows), rows)).astype(np.float32)
+
+    def near_sigma(self) -> Float32[np.ndarray, "rows columns"] | float:
+        """One sigma of the error that a cell shares with all around it."""
+        near = self.registration.systematic_m
+        return near if self.slopes is None else self._shared(np.float32(near), slice(0, self.grid.rows))
+
+    def _shared(self, deviation: Any, rows: slice) -> Any:
+        """What all cells share, with what an error of the shift does on slopes."""
+        if self.slopes is None:
+            return deviation
+        steepness = np.hypot(*self.slopes[:, rows])
+        return np.hypot(deviation, np.float32(self.registration.shift_error_m) * steepness)
+
+    def systematic_of_sum(
+        self, region: Bool[np.ndarray, "rows columns"], box: tuple[slice, slice] | None = None
+    ) -> float:
+        """One sigma of the systematic error of a sum of dz over a region, metres times cells.
+
+        One shift moves all cells, so that its error adds up over a slope and cancels out over a hill.
+
+        Args:
+            box: the rows and columns of the grid that the region covers; all if None.
+        """
+        own = self.registration.deviation_of_sum(self.grid, region, box)
+        if self.slopes is None:
+            return own
+        parts = self.slopes if box is None else self.slopes[:, *box]
+        east, north = (float(part.sum(where=region, dtype=np.float64)) for part in parts)
+        return math.hypot(own, self.registration.shift_error_m * math.hypot(east, north))
 
     def volume(
         self,
@@ -124,12 +156,11 @@ class ErrorModel:
             cells += int(inside.sum())
             total += float(dz[rows].sum(where=inside, dtype=np.float64))
         own = region_error(self.sigma, region, self.variogram, self.grid.cell_m)
-        systematic = self.registration.deviation_of_sum(self.grid, region)
         return Volume(
             scale * total * area,
             own.random * area,
             own.correlated * area,
-            systematic * area,
+            self.systematic_of_sum(region) * area,
             cells * area,
             degrees_of_freedom=self.degrees_of_freedom,
         )

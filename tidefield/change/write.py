@@ -363,6 +363,7 @@ def _survey(surface: Any) -> dict[str, Any]:
         "crs": surface.crs.name if surface.crs is not None else None,
         "pixel": [abs(surface.transform.a), abs(surface.transform.e)],
         "nodata": surface.nodata if surface.nodata is None or math.isfinite(surface.nodata) else str(surface.nodata),
+        "unknown": list(surface.unknown),
         "sigma": surface.sigma.name if surface.sigma is not None else None,
     }
 

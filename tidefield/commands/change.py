@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Verbosity, ZeroShot, open_source
 from tidefield.errors import RunError
-from tidefield.files import completed_folder, refuse_existing
+from tidefield.files import completed_folder, refuse_existing, require_writable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -95,6 +97,7 @@ class Change:
 def change(options: Change, console: Console) -> None:
     """Run `tidefield change`."""
     refuse_existing(options.out, replaceable=False)
+    require_writable(options.out)
     _check(options)
     if options.scenes is not None:
         _check_scenes(options.scenes, options.cameras, options.device)
@@ -155,8 +158,15 @@ def _series(options: Change, console: Console, work: Path) -> None:
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Names, numbered where two are the same."""
-    return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
+    """Names, numbered where two are the same but for upper and lower case."""
+    found: list[str] = []
+    for name in names:
+        own, number, taken = name, 1, {other.casefold() for other in found}
+        while own.casefold() in taken:
+            number += 1
+            own = f"{name} ({number})"
+        found.append(own)
+    return found
 
 
 def _dates(options: Change, count: int) -> tuple[str | None, ...]:
@@ -294,18 +304,30 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
     """Find the mistakes that views would find only after everything is measured.
 
     Raises:
-        TidefieldError: a scene cannot be read, has no such photographs, one is named twice, or there is no such device.
+        TidefieldError: a scene cannot be read, has no such photographs, one is named twice, only one scene has a
+            georeference, a run has not been trained, or there is no such device.
     """
     from tidefield.addresses import pull
+    from tidefield.change.views import require_both_placed
+    from tidefield.config import Config, NerfConfig
+    from tidefield.data.georeference import read_georeference
     from tidefield.data.load import read_posed
     from tidefield.device import choose_device
     from tidefield.geometry.cameras import find_name
-    from tidefield.train.checkpoint import RUN_FILE, read_run
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE, read_run
 
     choose_device(device)
-    roots = [read_run(path).scene if (path / RUN_FILE).exists() else path for path in scenes]
+    roots = []
+    for path in scenes:
+        run = read_run(path) if (path / RUN_FILE).exists() else None
+        # Runs of other methods keep what they trained in files of their own.
+        if run is not None and isinstance(run.config, Config | NerfConfig) and not (path / CHECKPOINT_FILE).exists():
+            raise RunError(f"{path} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
+        roots.append(path if run is None else run.scene)
     for root in roots:
         pull(root)
+    georeferences = [read_georeference(root) for root in roots]
+    require_both_placed(*(None if known is None else known.frame for known in georeferences))
     earlier, _ = (read_posed(root, allow_missing=False) for root in roots)
     found = [find_name(name, earlier.names, str(roots[0])) for name in cameras]
     if len(set(found)) < len(found):
@@ -316,6 +338,8 @@ def _check(options: Change) -> None:
     """Raises: RunError when an option has no meaning."""
     if options.datum_error is not None and not 0 <= options.datum_error < 100:
         raise RunError(f"--datum-error {options.datum_error} was asked for: expected 0 to 100 metres; choose another")
+    if options.cell is not None and not 0 < options.cell < math.inf:
+        raise RunError(f"--cell {options.cell} was asked for: expected more than 0 metres; choose another")
     if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
         given = " ".join(map(str, options.windows))
         raise RunError(f"--windows {given} was asked for: expected odd numbers from 1 to 101; choose others")
@@ -330,6 +354,10 @@ def _check(options: Change) -> None:
     for level in (*(options.water or ()), *options.levels):
         if not -12_000 < level < 9_000:
             raise RunError(f"a level of {level} m was asked for: expected a height on the Earth; choose another")
-    for date in options.dates or ():
-        if len(date) != 10 or date[4] != "-" or date[7] != "-" or not date.replace("-", "").isdigit():
-            raise RunError(f"--dates {date} was given: expected YYYY-MM-DD; write it so")
+    for given_date in options.dates or ():
+        try:
+            known = date.fromisoformat(given_date).isoformat() == given_date  # it reads other forms, too
+        except ValueError:
+            known = False
+        if not known:
+            raise RunError(f"--dates {given_date} was given: expected a day of the calendar as YYYY-MM-DD; write it so")

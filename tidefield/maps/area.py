@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import shapely
 from jaxtyping import Bool
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
-from shapely.geometry.base import BaseGeometry
+from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from tidefield.errors import RunError
 from tidefield.files import reading_from
@@ -43,8 +44,12 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
     try:
         data = json.loads(text)
         features = data["features"] if data.get("type") == "FeatureCollection" else [data]
-        shapes = [(shapely.geometry.shape(f.get("geometry", f)), dict(f.get("properties") or {})) for f in features]
-        named = data.get("crs", {}).get("properties", {}).get("name")
+        shapes = [
+            (shapely.geometry.shape(geometry), dict(feature.get("properties") or {}))
+            for feature in features
+            if (geometry := feature.get("geometry", feature)) is not None  # RFC 7946, 3.2: a feature without a place
+        ]
+        named = (data.get("crs") or {}).get("properties", {}).get("name")
         crs = CRS.from_user_input(named) if named else CRS.from_user_input(WGS84)
     except (
         ValueError,
@@ -56,25 +61,32 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         shapely.errors.ShapelyError,
     ) as error:
         raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
-    shapes = [
-        (part, about)
-        for shape, about in shapes
-        for part in getattr(shape, "geoms", [shape])
-        if part.geom_type in kinds and not part.is_empty
-    ]
+    shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
+    if frame.frame is not None:
+        to_map = Transformer.from_crs(crs, CRS.from_wkt(frame.horizontal_wkt), always_xy=True)
+
+        def converted(xy: np.ndarray) -> np.ndarray:
+            return np.column_stack(to_map.transform(*xy.T))
+
+        shapes = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
+        if not all(np.isfinite(shape.bounds).all() for shape, _ in shapes):
+            raise RunError(
+                f"{path} has coordinates outside of {frame.name}: expected longitude and latitude of the survey"
+            )
+    # An outline that crosses itself, as drawn by hand, has an inside all the same.
+    shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
     if not shapes:
         raise RunError(f"{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON")
-    if frame.frame is None:
-        return shapes
-    to_map = Transformer.from_crs(crs, CRS.from_wkt(frame.horizontal_wkt), always_xy=True)
+    return shapes
 
-    def converted(xy: np.ndarray) -> np.ndarray:
-        return np.column_stack(to_map.transform(*xy.T))
 
-    moved = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
-    if not all(np.isfinite(shape.bounds).all() for shape, _ in moved):
-        raise RunError(f"{path} has coordinates outside of {frame.name}: expected longitude and latitude of the survey")
-    return moved
+def _parts(shape: BaseGeometry, kinds: tuple[str, ...]) -> Iterator[BaseGeometry]:
+    """The geometries of these kinds in a collection of collections."""
+    if isinstance(shape, BaseMultipartGeometry):
+        for part in shape.geoms:
+            yield from _parts(part, kinds)
+    elif shape.geom_type in kinds and not shape.is_empty:
+        yield shape
 
 
 def inside(area: BaseGeometry | None, tile: Tile) -> Bool[np.ndarray, "H W"]:

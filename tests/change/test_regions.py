@@ -1,0 +1,63 @@
+"""Polygons of a user, in whatever files programs write."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from pyproj import CRS
+from surveys_of_two_dates import NORTH, WEST
+
+from tidefield.change.regions import read_regions
+from tidefield.change.surfaces import ChangeError, Grid
+
+raw = pytest.importorskip("pyogrio").raw
+GRID = Grid(CRS("EPSG:32630").to_wkt(), WEST, NORTH, 0.5, 200, 200)
+CREEK, ROAD = (shapely.box(WEST + x, NORTH - 50, WEST + x + 20, NORTH - 10) for x in (10, 40))
+
+
+def write_layers(path: Path, layers: dict[str, shapely.Geometry | None], crs: str = "EPSG:32630") -> Path:
+    """A GeoPackage with one feature in each layer, some without geometries."""
+    for k, (name, shape) in enumerate(layers.items()):
+        raw.write(
+            path,
+            geometry=None if shape is None else np.array([shapely.to_wkb(shape)], object),
+            field_data=[np.array([name], object)],
+            fields=["name"],
+            geometry_type=None if shape is None else "Polygon",
+            crs=None if shape is None else crs,
+            driver="GPKG",
+            layer=name,
+            append=k > 0,
+        )
+    return path
+
+
+def names(path: Path) -> list[str]:
+    return [region.name for region in read_regions(path, GRID)]
+
+
+def test_of_several_layers_one_is_named(tmp_path: Path):
+    path = write_layers(tmp_path / "a.gpkg", {"notes": None, "creeks": CREEK, "roads": ROAD})
+    with pytest.raises(ChangeError, match="creeks, roads: expected the name of one"):
+        read_regions(path, GRID)
+    assert names(tmp_path / "a.gpkg:roads") == ["roads"]
+    with pytest.raises(ChangeError, match="creeks, roads: expected the name of one"):
+        read_regions(tmp_path / "a.gpkg:notes", GRID)
+    with pytest.raises(ChangeError, match="is not a file"):
+        read_regions(tmp_path / "b.gpkg:roads", GRID)
+
+
+def test_the_only_layer_with_geometries_is_read(tmp_path: Path):
+    assert names(write_layers(tmp_path / "a.gpkg", {"notes": None, "creeks": CREEK})) == ["creeks"]
+
+
+def test_polygons_of_an_undefined_system_lie_as_the_surveys_do(tmp_path: Path):
+    path = write_layers(tmp_path / "a.gpkg", {"creeks": CREEK}, 'LOCAL_CS["metres",UNIT["metre",1]]')
+    assert names(path) == ["creeks"]
+
+
+def test_a_table_without_geometries_is_refused(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ChangeError, match="no geometries"):
+        read_regions(tmp_path / "a.csv", GRID)

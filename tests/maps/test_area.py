@@ -1,0 +1,79 @@
+"""Areas and sections of GeoJSON files, as GIS programs write them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from pyproj import Transformer
+
+from tidefield.errors import RunError
+from tidefield.geometry.geodesy import LocalFrame, parse_crs
+from tidefield.maps.area import read_shapes
+from tidefield.maps.grid import MapFrame
+
+EAST, NORTH, SIDE = 400_000.0, 500_000.0, 80.0
+WKT = parse_crs("EPSG:27700").to_wkt()
+FRAME = MapFrame(LocalFrame.at("EPSG:27700", (EAST, NORTH, 10.0)), np.zeros(3), np.eye(3), WKT, WKT, "the sea")
+TO = Transformer.from_crs("EPSG:27700", "EPSG:4326", always_xy=True)
+
+
+def ring(*corners: tuple[float, float]) -> list[list[float]]:
+    return [list(TO.transform(EAST + SIDE * x, NORTH + SIDE * y)) for x, y in (*corners, corners[0])]
+
+
+SQUARE = ring((0, 0), (1, 0), (1, 1), (0, 1))
+BOW_TIE = ring((0, 0), (1, 1), (1, 0), (0, 1))
+
+
+def feature(geometry: Any) -> dict[str, Any]:
+    return {"type": "Feature", "properties": {"name": "a"}, "geometry": geometry}
+
+
+def polygon(*rings: list[list[float]]) -> dict[str, Any]:
+    return {"type": "Polygon", "coordinates": rings}
+
+
+def write(path: Path, *geometries: Any, **members: Any) -> Path:
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature(g) for g in geometries], **members}))
+    return path
+
+
+def area(path: Path) -> float:
+    return shapely.union_all([shape for shape, _ in read_shapes(path, FRAME, ("Polygon",))]).area
+
+
+@pytest.mark.parametrize(
+    ("geometries", "members"),
+    [
+        ([None, polygon(SQUARE)], {}),
+        ([polygon(SQUARE)], {"crs": None}),
+        ([{"type": "GeometryCollection", "geometries": [{"type": "MultiPolygon", "coordinates": [[SQUARE]]}]}], {}),
+        ([polygon(BOW_TIE), polygon(SQUARE)], {}),
+    ],
+    ids=["null geometry", "null crs", "nested", "bow tie and square"],
+)
+def test_all_valid_forms_of_an_area_are_read(tmp_path: Path, geometries: list[Any], members: dict[str, Any]):
+    assert area(write(tmp_path / "a.geojson", *geometries, **members)) == pytest.approx(SIDE**2, rel=1e-4)
+
+
+@pytest.mark.parametrize("frame", [FRAME, MapFrame(None, np.zeros(3), np.eye(3), WKT, WKT, "local")])
+def test_an_outline_that_crosses_itself_has_the_inside_of_both_its_parts(tmp_path: Path, frame: MapFrame):
+    path = write(tmp_path / "a.geojson", polygon(BOW_TIE))
+    shapes = [shape for shape, _ in read_shapes(path, frame, ("Polygon",))]
+    assert [shape.geom_type for shape in shapes] == ["Polygon", "Polygon"]
+    assert all(shape.is_valid for shape in shapes)
+    box = shapely.box(*shapely.union_all(shapes).bounds)
+    assert sum(shape.area for shape in shapes) == pytest.approx(box.area / 2, rel=0.1)
+
+
+def test_lines_keep_their_vertices(tmp_path: Path):
+    line = {"type": "LineString", "coordinates": BOW_TIE}
+    ((found, about),) = read_shapes(write(tmp_path / "a.geojson", line), FRAME, ("LineString",))
+    assert len(found.coords) == 5
+    assert about == {"name": "a"}
+    spot = {"type": "LineString", "coordinates": [SQUARE[0], SQUARE[0]]}
+    with pytest.raises(RunError, match="has no LineString"):
+        read_shapes(write(tmp_path / "a.geojson", spot), FRAME, ("LineString",))
