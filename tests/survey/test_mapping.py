@@ -164,7 +164,14 @@ def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_ch
 
 @pytest.mark.parametrize(
     ("calibrated_share", "prefers_design", "can_tell"),
-    [(1.0, False, True), (1.02, True, True), (1.005, False, True), (1.10, False, False), (0.90, False, False)],
+    [
+        (1.0, False, True),
+        (1.005, False, True),
+        (1.02, True, True),
+        (1.035, True, True),
+        (1.10, False, False),
+        (0.90, False, False),
+    ],
 )
 def test_ground_below_the_place_of_take_off_does_not_choose_the_focal_length(
     calibrated_share: float, prefers_design: bool, can_tell: bool
@@ -175,6 +182,7 @@ def test_ground_below_the_place_of_take_off_does_not_choose_the_focal_length(
     (note,) = lens_notes(choice, ())
     assert ("cannot tell which one is right" in note) == (not can_tell)
     assert f"the {'design' if prefers_design else 'calibrated'} one was used" in note
+    assert Heights(1964.4, 1913.3, 1.050, 1.023).prefers_design, "as on turin_lot, whose ground is level"
 
 
 def test_a_photograph_without_points_has_no_flight_height():

@@ -9,8 +9,8 @@ distortion from curved ground, and the reduction may come from a bowl-shaped mod
 distinguish them: a lens model with more terms is chosen only if the cameras fit their positions as well as before.
 
 Two focal lengths: some makers state one focal length of this lens and one of its design. The flight height is
-proportional to the focal length, so that of the design is chosen where the drone's own height confirms it: within half
-of what the two differ by. Ground that rises or falls from the place of take-off changes heights by more, in both
+proportional to the focal length, so that of the design is chosen where the drone's own height confirms it: closer than
+the other's, and within what the two differ by. Ground that rises or falls from the place of take-off changes heights by more, in both
 directions, and then the calibration stays.
 """
 
@@ -92,14 +92,15 @@ class Heights:
 
     @property
     def prefers_design(self) -> bool:
-        return self._confirms(self.design_share)
+        closer = abs(math.log(self.design_share)) < abs(math.log(self.calibrated_share))
+        return closer and self._confirms(self.design_share)
 
     @property
     def can_tell(self) -> bool:
         return self._confirms(self.design_share) or self._confirms(self.calibrated_share)
 
     def _confirms(self, share: float) -> bool:
-        return abs(math.log(share)) < abs(math.log(self.design_px / self.calibrated_px)) / 2
+        return abs(math.log(share)) < abs(math.log(self.design_px / self.calibrated_px))
 
 
 @dataclass(frozen=True)
