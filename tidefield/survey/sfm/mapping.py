@@ -10,8 +10,8 @@ distinguish them: a lens model with more terms is chosen only if the cameras fit
 
 Two focal lengths: some makers state one focal length of this lens and one of its design. The flight height is
 proportional to the focal length, so that of the design is chosen where the drone's own height confirms it: closer than
-the other's, and within what the two differ by. Ground that rises or falls from the place of take-off changes heights by more, in both
-directions, and then the calibration stays.
+the other's, and within what the two differ by. Ground that rises or falls from the place of take-off changes heights
+by more, in both directions, and then the calibration stays.
 """
 
 from __future__ import annotations
