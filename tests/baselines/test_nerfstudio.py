@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from pickle import UnpicklingError
 from subprocess import CompletedProcess
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import nerfstudio_standin
 import numpy as np
@@ -25,7 +25,7 @@ from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.evaluation.curves import make_curve
+from tidefield.evaluation.curves import SHARES, make_curve
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.rendering import Rendering
 
@@ -101,7 +101,11 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
     assert (done.step, done.seconds) == (3, 30.0)
     ((seconds, psnr),) = json.loads((run / "curve.json").read_text())
     assert seconds == 20.0
-    factor = torch.tensor(json.loads((run / "job.json").read_text())["factor"])
+    job = json.loads((run / "job.json").read_text())
+    assert job["seconds"] == 30.0
+    assert job["curve_seconds"] == pytest.approx([30 * share for share in SHARES])
+    assert len(job["curve_cameras"]) == len(curve.cameras)
+    factor = torch.tensor(job["factor"])
     assert factor.min() < 0.9, "a scene whose factor matters"
     expected = []
     for truth, camera in zip(curve.truths, curve.cameras, strict=True):
@@ -116,6 +120,42 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert not (run / "rendering.npz").exists()
     assert driver.progress_of(run).step == 3
+
+
+def test_the_time_that_a_worker_renders_the_curve_in_is_not_that_of_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A step takes a second, and each of the curve's two pictures takes 100."""
+    clock, said = [0.0], []
+
+    def pass_time(seconds: float) -> None:
+        clock[0] += seconds
+
+    def train() -> None:
+        for step in range(100):
+            pass_time(1.0)
+            for callback in trainer.callbacks:
+                callback(step)
+
+    rays = SimpleNamespace(get_train_rays_per_batch=lambda: 1024)
+    trainer = SimpleNamespace(callbacks=[], train=train, save_checkpoint=lambda step: None, checkpoint_dir=tmp_path)
+    trainer.pipeline = SimpleNamespace(train=lambda: None, datamanager=rays)
+    (tmp_path / "step-1.ckpt").touch()
+    callbacks = ModuleType("nerfstudio.engine.callbacks")
+    callbacks.TrainingCallback = lambda _, function: function  # type: ignore[attr-defined]
+    callbacks.TrainingCallbackLocation = SimpleNamespace(AFTER_TRAIN_ITERATION=0)  # type: ignore[attr-defined]
+    for module in (ModuleType("nerfstudio"), ModuleType("nerfstudio.engine"), callbacks):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(worker, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(worker, "make_trainer", lambda job: trainer)
+    monkeypatch.setattr(worker, "ModelCamera", lambda *_: SimpleNamespace(render=lambda path: pass_time(100.0)))
+    monkeypatch.setattr(worker, "answer", lambda **values: said.append(values))
+    job = {"curve_cameras": [{}, {}], "curve_seconds": [3.0], "seconds": 10.0, "out": str(tmp_path)}
+    worker.train(job)
+    assert [one["seconds"] for one in said] == [*map(float, range(1, 11)), 10.0]
+    assert [one["step"] for one in said] == [*range(1, 11), 10]
+    assert [one["step"] for one in said if "curve" in one] == [3]
+    assert clock[0] == 210.0
 
 
 @pytest.mark.parametrize(("visible", "expected"), [(None, "1"), ("4,7", "7")])

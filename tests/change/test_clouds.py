@@ -123,6 +123,27 @@ def test_withheld_points_are_not_used(tmp_path: Path):
     assert read_cloud(tmp_path / "b.laz").xyz[:, 2].max() == pytest.approx(2, abs=0.001)
 
 
+def test_points_of_noise_and_of_water_are_not_used(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    heights = {2: 1.0, 1: 2.0, 7: 50.0, 18: 60.0, 9: 0.0}
+    xyz = np.array([[400_000.0 + k, 5_700_000.0, height] for k, height in enumerate(heights.values())])
+    las = laspy.read(write_cloud(tmp_path / "a.laz", "EPSG:32630", xyz))
+    las.classification = np.array(list(heights), np.uint8)
+    las.write(tmp_path / "b.laz")
+    assert read_cloud(tmp_path / "b.laz").xyz[:, 2] == pytest.approx([1, 2], abs=0.002)
+
+
+def test_the_surface_of_a_cloud_lies_where_its_points_do(tmp_path: Path):
+    rasterio = pytest.importorskip("rasterio")
+    xyz = np.array([[0.5, 0.5, 1.0], [0.7, 0.4, 3.0], [3.5, 2.5, 7.0]])
+    write_surface(Cloud(Path("a.laz"), None, xyz, None), 1.0, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as file:
+        heights = file.read(1)
+        assert heights[file.index(0.5, 0.5)] == 2.0, "the mean of the two points in one cell"
+        assert heights[file.index(3.5, 2.5)] == 7.0
+    assert np.isfinite(heights).sum() == 2
+
+
 def test_distances_of_clouds_in_feet_are_written_where_the_clouds_are(tmp_path: Path):
     laspy = pytest.importorskip("laspy")
     rng = np.random.default_rng(0)

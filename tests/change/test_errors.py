@@ -1,10 +1,13 @@
 """The error model against Anderson's printed figures, brute force over all pairs, and simulated fields."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
+from tidefield.change.choice import simulate_noise
 from tidefield.change.errors import (
     UNCORRELATED,
     Variogram,
@@ -15,6 +18,12 @@ from tidefield.change.errors import (
     p_values,
     region_error,
 )
+from tidefield.change.outlines import window_z
+from tidefield.change.registration import Registration, centre, covariance, offsets
+from tidefield.change.surfaces import Grid
+from tidefield.change.volumes import Volume
+
+GRID = Grid(None, 100.0, 200.0, 0.5, 26, 20)
 
 
 def test_andersons_terms_are_those_that_the_geological_survey_prints():
@@ -100,6 +109,83 @@ def test_the_error_of_a_region_that_is_reduced_to_blocks_is_andersons():
 
 def test_nothing_summed_has_no_error():
     assert region_error(1.0, np.zeros((4, 4), bool), UNCORRELATED, 1.0).total == 0
+
+
+def test_intervals_are_wider_where_the_errors_were_measured_on_few_pieces_of_ground():
+    """Of 25 parts of the variance, 16 were measured: Satterthwaite's degrees of freedom are 4 (25 / 16)^2."""
+    volume = Volume(10.0, 3.0, 4.0, 0.0, 1.0, degrees_of_freedom=4.0)
+    assert volume.factor == pytest.approx(stdtrit(4 * (25 / 16) ** 2, 0.975))
+    assert volume.factor > 2.2
+    assert volume.interval_m3 == pytest.approx((10 - 5 * volume.factor, 10 + 5 * volume.factor))
+    assert replace(volume, degrees_of_freedom=math.inf).factor == pytest.approx(1.959963984540054)
+    assert replace(volume, correlated_m3=0.0).factor == pytest.approx(1.959963984540054)
+
+
+def test_the_choice_of_outlines_adds_what_the_cells_own_errors_do_not_explain():
+    volume = Volume(10.0, 3.0, 4.0, 0.0, 1.0)
+    larger, smaller = volume.chosen(2.0, 13.0), volume.chosen(-2.0, 1.0)
+    assert (larger.value_m3, larger.choice_m3, larger.sigma_m3) == pytest.approx((8, 12, 13))
+    assert (smaller.value_m3, smaller.choice_m3, smaller.sigma_m3) == pytest.approx((12, 0, 5))
+
+
+def test_degrees_of_freedom_are_the_independent_pieces_of_an_area_less_one():
+    """Of a range r, a piece has the area pi r^2 / 5; of two ranges, Satterthwaite's sum of sill r^2."""
+    area = 200 * math.pi
+    assert Variogram((0.5,), (10.0,)).degrees_of_freedom(area) == pytest.approx(9)
+    both = Variogram((0.6, 0.2), (2.0, 10.0)).degrees_of_freedom(area)
+    assert both == pytest.approx((2.4 + 20) ** 2 / (2.4**2 / 249 + 20**2 / 9))
+
+
+def test_the_covariance_of_a_registration_is_the_sum_over_all_pairs_of_stable_cells():
+    rng = np.random.default_rng(2)
+    stable = rng.random(GRID.shape) < 0.6
+    stable[:8, :10] = False
+    variogram = Variogram((0.5, 0.2), (6.0, 30.0))
+    sigma = rng.uniform(0.5, 2, GRID.shape).astype(np.float32)
+    x, y = offsets(GRID, centre(GRID), slice(0, GRID.rows))
+    rows, columns = np.nonzero(stable)
+    design = np.stack([np.ones(len(rows)), x[columns], y[rows]], axis=1)
+    distance = np.hypot(x[columns][:, None] - x[columns], y[rows][:, None] - y[rows])
+    own = sigma[stable].astype(float)
+    pairs = own[:, None] * own * (variogram.correlation(distance) + variogram.nugget * (distance == 0))
+    inverse = np.linalg.inv(design.T @ design)
+    brute = inverse @ design.T @ pairs @ design @ inverse
+    found = covariance("tilt", stable, sigma, variogram, GRID, 0.0, None)
+    assert (np.abs(found - brute) < 0.02 * np.sqrt(np.outer(brute.diagonal(), brute.diagonal()))).all()
+    shift = covariance("vertical", stable, sigma, variogram, GRID, 0.0, None)
+    assert shift[0, 0] == pytest.approx(pairs.sum() / len(rows) ** 2, rel=0.01)
+    with_datum = covariance("vertical", stable, sigma, variogram, GRID, 0.0, 0.3)
+    assert with_datum[0, 0] - shift[0, 0] == pytest.approx(0.09)
+
+
+def test_deviations_of_a_registration_are_those_of_its_whole_covariance():
+    rng, none = np.random.default_rng(2), (0.0, 0.0, 0.0)
+    region, factor = rng.random(GRID.shape) < 0.6, rng.normal(size=(3, 3))
+    whole = factor @ factor.T
+    own = Registration("tilt", none, whole, centre(GRID), 100, none, none)
+    x, y = offsets(GRID, own.centre_m, slice(0, GRID.rows))
+    design = np.stack(np.broadcast_arrays(np.ones(GRID.shape), x[None], y[:, None]), axis=-1)
+    each = np.sqrt(np.einsum("rci,ij,rcj->rc", design, whole, design))
+    np.testing.assert_allclose(own.deviation(GRID, slice(0, GRID.rows)), each, rtol=1e-4)
+    summed = design[region].sum(0)
+    assert own.deviation_of_sum(GRID, region) == pytest.approx(math.sqrt(summed @ whole @ summed))
+    box = (slice(5, 15), slice(3, 20))
+    summed = design[box][region[box]].sum(0)
+    assert own.deviation_of_sum(GRID, region[box], box) == pytest.approx(math.sqrt(summed @ whole @ summed))
+
+
+def test_simulated_noise_has_its_variogram():
+    field = simulate_noise((300, 300), Variogram((0.6,), (5.0,)), 1.0, np.random.default_rng(0)).astype(float)
+    assert field.var() == pytest.approx(1, rel=0.05)
+    spherical = 1 - 1.5 * (2 / 5) + 0.5 * (2 / 5) ** 3
+    assert (field[:, 2:] * field[:, :-2]).mean() == pytest.approx(0.6 * spherical, rel=0.15)
+    assert (field[2:] * field[:-2]).mean() == pytest.approx(0.6 * spherical, rel=0.15)
+
+
+def test_a_window_averages_the_cells_own_errors_and_not_the_systematic_one():
+    change = np.full((40, 40), 0.1, np.float32)
+    found = window_z(change, 0.01, 0.05, UNCORRELATED, 1.0, 5)
+    assert found[20, 20] == pytest.approx(0.1 / math.sqrt(0.01**2 / 25 + 0.05**2), rel=1e-4)
 
 
 def test_deviations_of_normal_values_are_their_standard_deviation():

@@ -12,7 +12,7 @@ from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
-from tidefield.change.measure import Change, Options, Register, measure
+from tidefield.change.measure import Change, Options, Register, _slopes, measure
 from tidefield.change.regions import Region, read_regions
 from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
@@ -201,6 +201,16 @@ def test_an_error_of_the_shift_adds_up_over_a_slope_and_cancels_out_over_a_hill(
     assert on_hill.volume(dz, every).systematic_m3 == pytest.approx(0.003 * every.sum() * AREA)
     assert on_hill.systematic_of_sum(part[box], box) == pytest.approx(on_hill.systematic_of_sum(part))
     assert on_hill.cell_sigma(slice(0, 1))[0, 0] == pytest.approx(math.hypot(0.05, 0.003, slope * error * math.sqrt(2)))
+
+
+def test_slopes_are_those_to_the_east_and_to_the_north_without_seams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    east, north = np.broadcast_arrays(0.5 * np.arange(40), 0.5 * np.arange(30)[::-1, None])
+    bowl = (0.3 * east - 0.1 * north + 0.01 * east**2 + 0.02 * north**2).astype(np.float32)
+    surface = open_surface(write_surface(tmp_path / "bowl.tif", bowl))
+    monkeypatch.setattr(Grid, "strips", lambda self: [slice(k, k + 10) for k in (0, 10, 20)])
+    found = _slopes(surface, common_grid([surface]))
+    for slopes, expected in zip(found, (0.3 + 0.02 * east, -0.1 + 0.04 * north), strict=True):
+        np.testing.assert_allclose(slopes[1:-1, 1:-1], expected[1:-1, 1:-1], atol=1e-4)
 
 
 @pytest.mark.parametrize("register", ["none", "vertical"])

@@ -136,6 +136,18 @@ def test_the_table_marks_differences_within_the_noise(flats: Scene):
     assert table.rows[1][-2:] == ["1.00", "1.00"]
 
 
+def test_the_table_has_steps_and_speeds_relative_to_the_whole_networks():
+    def measured(steps: int, rays_per_second: float) -> Result:
+        trained = {"steps": steps, "seconds": 60.0}
+        mean = {"psnr_seen_cc": 20.0}
+        own = {"mean": mean, "rays_per_second": rays_per_second, "configuration": {"trained": trained}}
+        return Result(own, {"settings": {"minutes": 10}})
+
+    by = {("flats", "tidefield"): measured(100, 1000.0), ("flats", "views-2"): measured(150, 4000.0)}
+    (table,) = ablation_tables(Results(("flats",), ("tidefield", "views-2"), by))
+    assert table.rows[1][-2:] == ["1.50", "4.00"]
+
+
 def test_without_other_seeds_small_differences_are_noise(flats: Scene):
     own = {"tidefield": 30.0, "views-2": 30.04, "degree-0": 30.06}
     (table,) = ablation_tables(results(flats, {"flats": own}))

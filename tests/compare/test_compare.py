@@ -213,6 +213,20 @@ def test_the_best_is_bold_and_means_need_every_scene(disk: Path, tmp_path: Path)
     assert len(cost_table(results).rows) == 3
 
 
+def test_the_least_is_bold_where_less_is_better():
+    values = {"tidefield": (20.0, 0.3), "nearest": (18.0, 0.2)}
+    by = {
+        ("flats", name): Result({"mean": {"psnr": psnr, "lpips_vgg": lpips}}) for name, (psnr, lpips) in values.items()
+    }
+    tables = quality_tables(Results(("flats",), tuple(values), by))
+    psnr, lpips = (
+        next(table for table in tables if table.title.startswith(f"{metric}, all pixels ("))
+        for metric in ("PSNR, dB", "LPIPS, VGG")
+    )
+    assert psnr.bold == {(0, 1), (1, 1)}
+    assert lpips.bold == {(0, 2), (1, 2)}
+
+
 def test_the_last_of_several_comparisons_counts(disk: Path, tmp_path: Path):
     run = Children(load_scene(disk, width=48))
     for out, methods in (("one", ("tidefield", "nearest")), ("two", ("tidefield",))):

@@ -113,6 +113,19 @@ def test_forming_the_normal_matrix_and_iterating_find_the_same(monkeypatch: pyte
     torch.testing.assert_close(*lit, atol=0.01 * NOISE, rtol=0)
 
 
+def test_shading_that_is_known_is_not_estimated_again():
+    value, cameras, points = observed(planted())
+    known = torch.zeros(COUNT, 15, 3)
+    known[:, 1] = 0.05
+    with_known = value + light(cameras, points, known) - light(cameras, points, None)
+    lit = replace(cameras, shading=known)
+    found = estimate_shading(seen_in(TRAIN, with_known, points), lit, points, LENSES, TRAIN)
+    plain = estimate_shading(seen_in(TRAIN, value, points), cameras, points, LENSES, TRAIN)
+    assert found is not None
+    assert plain is not None
+    torch.testing.assert_close(light(cameras, points, found), light(cameras, points, plain), atol=1e-4, rtol=0)
+
+
 def test_photographs_in_one_light_get_no_shading(caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.DEBUG, "tidefield")
     value, cameras, points = observed(None)

@@ -137,6 +137,20 @@ def test_a_perfect_method_scores_the_best_values(scene, tmp_path):
     assert mean["flip"] == pytest.approx(0, abs=1e-6)
 
 
+def test_masked_pixels_do_not_count(scene, tmp_path):
+    masked = wall.with_left_halves_masked(scene, (1,))
+
+    def wrong_on_the_left(camera: Cameras) -> Rendering:
+        colour = perfect(camera).colour
+        colour[:, : camera.width // 2] = 0
+        return replace(perfect(camera), colour=colour)
+
+    mean = evaluate(wrong_on_the_left, masked, tmp_path / "masked", configuration={}, console=quiet()).mean
+    assert mean["psnr"] == mean["psnr_seen"] == PSNR_LIMIT_DB
+    plain = evaluate(wrong_on_the_left, scene, tmp_path / "plain", configuration={}, console=quiet()).mean
+    assert plain["psnr"] < 15
+
+
 def test_an_evaluation_that_dies_leaves_no_older_report_beside_its_pictures(tmp_path):
     scene = wall.scene(wall.cameras(5), test=(1, 3))
     settings = {"configuration": {}, "console": quiet(), "overwrite": True}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes_on_disk as disk
 
 from tidefield.data.georeference import Georeference, Residuals, read_georeference
 from tidefield.data.load import load_scene
@@ -13,7 +14,7 @@ from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
-from tidefield.maps.check_points import check, read_check_points, remark, summary
+from tidefield.maps.check_points import _intersected, check, read_check_points, remark, summary
 from tidefield.maps.grid import Grid, MapFrame, map_frame
 from tidefield.maps.rasters import Raster, raster_writer
 from tidefield.survey.io.gcp_file import write_check_points
@@ -99,6 +100,31 @@ def test_errors_are_those_of_the_surface_and_of_the_marks(scene: Scene, frame: M
     assert found["vertical"]["mean"] == pytest.approx(np.mean([one.error[2] for one in checked]))
     assert found["remark"] == "2 check points: indicative, under ASPRS' 30"
     assert remark(30) == "30 check points"
+
+
+def test_marks_are_of_the_photographs_as_they_were_taken(tmp_path: Path):
+    """Twice as wide as the scene's, and distorted by their lens."""
+    truth = disk.survey(disk.BARREL)
+    disk.write_colmap(tmp_path / "scene", truth)
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    Georeference(FRAME, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", width=32, hold_out=False, calibrate=False, cache=tmp_path / "cache")
+
+    def marks_of(point: np.ndarray) -> dict[str, np.ndarray]:
+        """Distorted pixels in the photographs that show a point."""
+        each = zip(truth.names, truth.lenses, truth.T_world_camera, strict=True)
+        shown = {name: disk.observe(lens, pose, point[None]) for name, lens, pose in each}
+        return {name: uv[0] for name, (uv, inside) in shown.items() if inside[0]}
+
+    point = max(truth.ground[::7], key=lambda one: len(marks_of(one)))
+    east, north, up = place = FRAME.to_crs(point[None])[0]
+    lines = [f"{east:.6f} {north:.6f} {up:.6f} {u:.4f} {v:.4f} {n} peg" for n, (u, v) in marks_of(point).items()]
+    assert len(lines) > 3
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", *lines]))
+    own = map_frame(scene, read_georeference(scene.root))
+    [found] = read_check_points(tmp_path / "check.txt", scene, own)
+    assert len(found.marks) == len(lines)
+    np.testing.assert_allclose(_intersected(found, scene, own), place, atol=2e-3)
 
 
 def test_points_without_marks_have_a_height_only_and_those_outside_have_none(

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import textured_wall as wall
+import torch
 from pyproj import CRS
 
+from tidefield.data.georeference import Georeference, Residuals
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.grid import Grid, MapFrame, _vertical, feather
+from tidefield.geometry.similarity import Similarity
+from tidefield.maps.grid import Grid, MapFrame, _vertical, feather, map_frame
+from tidefield.maps.orthophoto import camera_above
 
 FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
 
@@ -35,6 +40,19 @@ def test_cell_centres_lie_where_rasterio_puts_them():
     east, north = (x.astype(np.float64) for x in tile.offsets())
     x, y = rasterio.transform.xy(rasterio.transform.Affine(*own.transform), tile.row + 5, tile.column + 9)
     assert (tile.centre[0] + east[0, 9], tile.centre[1] + north[5, 0]) == pytest.approx((x, y), abs=1e-4)
+
+
+def test_the_camera_above_a_tile_sees_its_cells_at_the_centres_of_its_pixels():
+    tile = grid().tiles(96, 16)[3]
+    height = np.random.default_rng(0).uniform(-3, 3, (tile.side, tile.side)).astype(np.float32)
+    camera, _ = camera_above(tile, height)
+    east, north = np.broadcast_arrays(*tile.offsets())
+    cells = np.stack([east, north, height, np.ones(height.shape)], axis=-1).reshape(-1, 4) @ tile.affine().T
+    uv = camera.project(torch.from_numpy(cells).float())[0][0].numpy().reshape(tile.side, tile.side, 2)
+    centres = np.arange(tile.side) + 0.5
+    off = uv - np.stack(np.meshgrid(centres, centres), axis=-1)
+    assert np.abs(off).max() < 0.2
+    assert np.abs(off.mean(axis=(0, 1))).max() < 0.02
 
 
 @pytest.mark.parametrize(("columns", "rows", "side"), [(1000, 700, 480), (100, 90, 96), (96, 97, 96)])
@@ -66,6 +84,18 @@ def test_lengths_and_heights_have_units_of_their_own(system: str, units: tuple[s
     metre = 1 / horizontal.axis_info[0].unit_conversion_factor
     frame = MapFrame(LocalFrame.at(system, origin), np.zeros(3), np.eye(3), "", "", "", metre, 1 / up)
     assert (frame.unit, frame.unit_up) == units
+
+
+@pytest.mark.parametrize(("system", "up"), [("EPSG:2263+6360", 3937 / 1200), ("EPSG:2263+5703", 1.0)])
+def test_a_map_in_feet_has_a_metre_of_as_many_feet(system: str, up: float):
+    there = LocalFrame.at(system, (987_000.0, 211_000.0, 30.0))
+    similarity = Similarity(1.0, np.eye(3), np.zeros(3))
+    given = Georeference(there, "GPS", similarity, Residuals(), Residuals(), Residuals(), (), ())
+    own = map_frame(wall.scene(wall.cameras(3)), given)
+    assert (own.metre, own.metre_up) == pytest.approx((3937 / 1200, up))
+    origin, east, above = own.to_map(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]))
+    assert np.linalg.norm((east - origin)[:2]) == pytest.approx(3937 / 1200, rel=1e-3)
+    assert (above - origin)[2] == pytest.approx(up)
 
 
 def test_heights_in_metres_are_not_stated_in_feet():

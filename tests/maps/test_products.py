@@ -104,6 +104,17 @@ def test_points_of_a_local_frame_are_as_fine_as_its_cells(tmp_path: Path, cell: 
     assert len(np.unique(np.asarray(cloud.x).round(9))) == 30
 
 
+def test_points_of_the_cloud_lie_at_the_centres_of_the_cells(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    small = replace(GRID, columns=3, rows=2)
+    values = {"height": np.full((2, 3), 2.0), "sigma": np.zeros((2, 3)), "views": np.full((2, 3), 3)}
+    with cloud_writer(tmp_path / "cloud.laz", small) as writer:
+        writer.write(0, **values, colour=np.zeros((3, 2, 3), np.uint8), classes=np.full((2, 3), 2))
+    cloud = laspy.read(tmp_path / "cloud.laz")
+    assert np.asarray(cloud.x) == pytest.approx([10.05, 10.15, 10.25] * 2, abs=1e-6)
+    assert np.asarray(cloud.y) == pytest.approx([89.95] * 3 + [89.85] * 3, abs=1e-6)
+
+
 def test_hillshade_is_that_of_a_plane():
     y, x = np.mgrid[:20, :20].astype(float)
     slope = hillshade(0.5 * x, 1.0)[5:15, 5:15]  # rises to the east
@@ -111,6 +122,31 @@ def test_hillshade_is_that_of_a_plane():
     sun = np.array([-0.5, 0.5, np.sqrt(0.5)])
     np.testing.assert_allclose(slope, normal @ sun, atol=1e-6)
     assert hillshade(0.0 * y, 1.0).mean() == pytest.approx(np.sqrt(0.5))
+
+
+def test_terrain_and_hillshade_of_a_map_in_feet_are_those_of_the_map_in_metres(tmp_path: Path):
+    """A plant and a low mound, with all in metres, lengths alone in feet, and heights alone in feet."""
+    foot = 1200 / 3937
+    lengths = replace(LOCAL, metre=1 / foot, metre_up=1.0)
+    in_feet = replace(GRID, frame=lengths, west=GRID.west / foot, north=GRID.north / foot, cell=GRID.cell / foot)
+    tall = replace(GRID, frame=replace(LOCAL, metre=1.0, metre_up=1 / foot))
+    rows, columns = np.ogrid[: GRID.rows, : GRID.columns]
+    plant, mound = (np.hypot(rows - 150, columns - middle) < 10 for middle in (100, 300))
+    surface, found = (ground() + 1.0 * plant + 0.2 * mound).astype(np.float32), []
+    for number, (grid, scale) in enumerate([(GRID, 1.0), (in_feet, 1.0), (tall, 1 / foot)]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        dsm = written(folder / "dsm.tif", surface * scale, grid)
+        sigma = written(folder / "sigma.tif", np.full(surface.shape, 0.02 * scale), grid)
+        write_terrain(dsm, sigma, Raster(folder / "dtm.tif", ("terrain",)), grid)
+        write_hillshade(dsm, Raster(folder / "shade.tif", ("shade",), "uint8", 0.0), grid)
+        found.append((read_raster(folder / "dtm.tif")[0] / scale, read_raster(folder / "shade.tif")[0]))
+    (terrain, shade), *others = found
+    assert (surface - terrain)[plant].mean() > 0.9, "the plant is taken off"
+    assert 0.02 < (surface - terrain)[mound].mean() < 0.18, "the mound is partly ground: it shows every limit"
+    for other_terrain, other_shade in others:
+        np.testing.assert_allclose(other_terrain, terrain, atol=1e-4)
+        np.testing.assert_allclose(other_shade, shade, atol=1)
 
 
 def test_the_hillshade_s_strips_have_no_seams(tmp_path: Path):

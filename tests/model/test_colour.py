@@ -173,6 +173,29 @@ def test_the_printed_blend_is_eq_7_of_the_inputs_that_the_paper_names():
         torch.testing.assert_close(colour[t, p], mixed / total)
 
 
+def test_swifts_blend_has_a_logarithm_of_the_angle_the_blur_and_the_fading_of_views_besides():
+    """Shares exp(layers + angle * closeness) * blend_weight of one sample and view at a time, without a target's."""
+    own, (evidence, gathered, direction) = blend(3, AngularColourBlend), scene()
+    generator = torch.Generator().manual_seed(3)
+    blur, fading = torch.rand(2, T, N, P, generator=generator, dtype=torch.float64)
+    gathered = replace(gathered, octaves_coarser=blur - 0.5, blend_weight=0.1 + fading)
+    colour, logit = own(evidence, gathered, direction), own.target(evidence.density)[..., 0]
+    target = target_of(own, evidence, direction, 0.0)
+    for t, p in [(0, 0), (0, 1), (1, 0), (1, 4)]:
+        total, mixed = torch.zeros(1).double(), torch.zeros(3).double()
+        for i in range(N):
+            if gathered.valid[t, i, p]:
+                apart = 1 - gathered.cosine[t, i, p]
+                closeness = -torch.log(apart.clamp(min=0) + 1e-4)
+                offset = 5 * (direction[t, p] - gathered.directions[t, i, p])
+                angles = torch.stack([*offset, -20 * apart, evidence.view_weight[t, i, p], closeness / 4])
+                numbers = torch.cat([angles, gathered.octaves_coarser[t, i, p][None]])
+                hidden = F.relu(own.view(evidence.per_view[t, i, p]) + own.direction.weight @ numbers)
+                share = torch.exp(own.logit(hidden)[0] + own.angle * closeness) * gathered.blend_weight[t, i, p]
+                total, mixed = total + share, mixed + share * gathered.colours[t, i, p]
+        torch.testing.assert_close(colour[t, p], mixed / total + torch.sigmoid(logit[t, p]) * target[t, p])
+
+
 def test_in_swift_the_targets_share_starts_at_twelve_per_cent():
     own, (evidence, _, direction) = AngularColourBlend(H, 3).double(), scene()
     logit = own.target_colour(evidence, direction, 0.0)[0]

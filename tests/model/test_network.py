@@ -308,6 +308,11 @@ def test_the_papers_network_has_nothing_that_the_paper_does_not_have():
     assert all(any(part in n for n in found) for part in ours)
 
 
+def test_only_swifts_maps_are_returned_to_where_they_were_computed():
+    assert [step.aligned for step in network(SMALL_PAPER).encoder.up] == [False, False]
+    assert all(step.aligned for step in network(SWIFT.network).encoder.up)
+
+
 def test_densities_come_from_each_sample_alone_without_the_ray_transformer():
     own = network(replace(SMALL_PAPER, without=("ray transformer",)), stir=0.05)
     assert not [name for name, _ in own.named_parameters() if "transformer" in name]
@@ -337,6 +342,25 @@ def test_what_lies_behind_empty_space_is_rendered_at_the_gain_of_the_camera():
     assert not view.opacity.any()
     assert view.colour.min() > 0.2
     torch.testing.assert_close(darker.colour, view.colour * gain[0], atol=1e-5, rtol=0)
+
+
+def test_behind_empty_space_a_scene_has_its_background_at_every_gain():
+    at, background = scene(), (1.0, 0.5, 0.25)
+    pose = at.cameras.T_world_camera.clone()
+    pose[TARGET, 0, 3] += 100  # nothing is seen there
+    config = replace(PAPER, network=SMALL_PAPER)
+    away = replace(at, cameras=replace(at.cameras, T_world_camera=pose), points=None, background_rgb=background)
+    darker = replace(away.cameras[TARGET], gain=torch.tensor([[0.5, 0.75, 1.0]]))
+    view = Renderer(network(SMALL_PAPER).eval(), away, config, CPU)(darker)
+    assert not view.opacity.any()
+    torch.testing.assert_close(view.colour, torch.tensor(background).expand(48, 64, 3))
+
+
+@pytest.mark.parametrize(("background", "opaque"), [(None, True), ((1.0, 1.0, 1.0), False)])
+def test_only_a_scene_with_a_background_lets_light_through(background: tuple[float, ...] | None, opaque: bool):
+    at = replace(scene(), background_rgb=background)
+    view = Renderer(network(SWIFT.network).eval(), at, SWIFT, CPU)(at.cameras[TARGET])
+    assert (view.opacity.min() > 1 - 1e-3) == opaque
 
 
 def test_the_papers_density_is_per_mean_interval_of_the_ray():

@@ -97,6 +97,25 @@ def test_control_points_are_not_added_to_the_model(flight):
     assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
 
 
+def test_errors_of_control_are_what_the_model_has_minus_what_was_surveyed(flight):
+    survey = with_control(flight)
+    assert survey.control is not None
+    east, north, up = survey.control.points["G2"]
+    raised = survey.control.points | {"G2": (east + 0.2, north, up + 0.3)}
+    control, check = [], []
+    for points in (survey.control.points, raised):
+        _, found = located(flight, replace(survey, control=replace(survey.control, points=points)))
+        assert found.left_out == ()
+        control.append(found.control.error_m[found.control.names.index("G2")])
+        check.append(found.check.error_m[found.check.names.index("G2")])
+    # The model that a point is checked with does not know of it.
+    assert check[1] - check[0] == pytest.approx([-0.2, 0, -0.3], abs=0.01)
+    # The one that is fitted to all points gives way, more in height than in plan.
+    moved = control[1] - control[0]
+    assert -0.2 < moved[0] < -0.05
+    assert -0.2 < moved[2] < -0.01
+
+
 def test_a_common_shift_of_all_positions_is_reported_and_ignored(flight):
     lifted = tuple(
         replace(p, position=replace(p.position, height_m=p.position.height_m + 48)) for p in flight.survey.photographs

@@ -93,6 +93,18 @@ def test_pixels_without_weight_change_nothing():
     assert before[1].item() == pytest.approx(after[1].item(), rel=1e-6)
 
 
+def test_the_photometric_terms_are_weighted_means_unless_hardly_a_pixel_has_weight():
+    weight = torch.ones(TILES, SIDE**2)
+    weight[:, ::2] = 0.2
+    few = torch.zeros(TILES, SIDE**2)
+    few[0, :3] = 1
+    for given, divisor in ((weight, weight.sum()), (few, 0.1 * few.numel())):
+        rendering, batch = made(weight=given)
+        squares = (rendering.colour - batch.colours).square().mean(-1)
+        _, error = photometric(rendering, batch, GRIDS, SIDE)
+        assert error.item() == pytest.approx(float((squares * given).sum() / divisor), rel=1e-5)
+
+
 def test_the_depth_term_is_hubers_penalty_of_the_relative_error_in_both_passes():
     rendering, batch = made()
 

@@ -159,6 +159,12 @@ def test_real_scenes_take_part_at_every_width_that_their_files_have(tmp_path: Pa
     assert int(whole.cameras.size_px[0, 0]) == 64
 
 
+def test_pretraining_leaves_the_held_out_photographs_of_real_scenes_out(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "flats", survey(PINHOLE))
+    for scene in stream.at_several_widths(tmp_path / "flats", (32, 48, 256)):
+        assert (scene.test, scene.train) == ((0, 8), tuple(range(1, 8)))
+
+
 def test_networks_that_encode_whole_photographs_learn_from_smaller_ones(tmp_path: Path, monkeypatch) -> None:
     asked = []
     monkeypatch.setattr(stream, "at_several_widths", lambda path, widths: asked.append(widths) or [])

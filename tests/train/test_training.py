@@ -13,6 +13,7 @@ import weakref
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -322,6 +323,28 @@ def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path
     assert all(torch.equal(v, weights(again)[n]) for n, v in weights(trainer).items())
 
 
+def test_only_steps_count_as_time_of_training(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes 3 seconds and draws the next batch in 1; preparing, pictures and callbacks take far longer."""
+    clock = [0.0]
+
+    def pass_time(seconds: float) -> torch.Tensor:
+        clock[0] += seconds
+        return torch.tensor(0.1)
+
+    def read() -> float:
+        return clock[0]
+
+    monkeypatch.setattr("tidefield.train.loop.time", SimpleNamespace(perf_counter=read, monotonic=read))
+    monkeypatch.setattr("tidefield.train.loop._write_picture", lambda *_: pass_time(70.0))
+    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    monkeypatch.setattr(trainer, "prepare", lambda progress: pass_time(50.0))
+    monkeypatch.setattr(trainer, "backward", lambda: pass_time(3.0))
+    monkeypatch.setattr(trainer, "draw_ahead", lambda: pass_time(1.0))
+    assert train(trainer, tmp_path, Budget(minutes=0.5), Console(quiet=True), lambda *_: pass_time(100.0)) is None
+    assert (trainer.progress.step, trainer.progress.seconds) == (8, 32.0)
+    assert clock[0] > 50 + 8 * 104, "this test would notice"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interruption_saves_before_it_stops(number: signal.Signals, scene: Scene, tmp_path: Path) -> None:
     trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
@@ -384,6 +407,12 @@ def test_a_budget_is_a_time_or_a_number_of_steps_above_0(budget: dict[str, Any])
     (name,) = budget
     with pytest.raises(RunError, match=f"--{name} .* was asked for: expected"):
         Budget(**budget).checked()
+
+
+def test_the_share_of_a_budget_is_that_of_its_minutes_or_of_its_steps() -> None:
+    by_time, by_steps = Budget(minutes=10.0), Budget(steps=8)
+    assert [by_time.share(5, seconds) for seconds in (0.0, 300.0, 600.0, 900.0)] == [0.0, 0.5, 1.0, 1.0]
+    assert [by_steps.share(step, 900.0) for step in (0, 2, 8, 9)] == [0.0, 0.25, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("seed", [-1, 1 << 63, 1 << 70])
