@@ -157,11 +157,11 @@ def test_a_background_shows_where_nothing_is(scene: Scene):
 
 
 def test_a_view_that_is_not_wanted_any_more_ends_at_the_next_rays(scene: Scene):
-    begun = []
+    started = []
 
     def check() -> None:
-        begun.append(1)
-        if len(begun) == 2:
+        started.append(1)
+        if len(started) == 2:
             raise TimeoutError
 
     with interruptible(check), pytest.raises(TimeoutError):

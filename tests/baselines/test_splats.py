@@ -103,11 +103,11 @@ def test_what_is_nearer_covers_what_is_farther():
 
 
 def test_a_view_that_is_not_wanted_any_more_ends_at_the_next_tile():
-    begun = []
+    started = []
 
     def check() -> None:
-        begun.append(1)
-        if len(begun) == 3:
+        started.append(1)
+        if len(started) == 3:
             raise TimeoutError
 
     with interruptible(check), pytest.raises(TimeoutError):

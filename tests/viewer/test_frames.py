@@ -221,16 +221,16 @@ def test_closing_waits_for_no_method_that_does_not_hear_of_it(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     monkeypatch.setattr(frames, "END_SECONDS", 0.1)
-    begun, may_go = threading.Event(), threading.Event()
+    started, may_go = threading.Event(), threading.Event()
 
     def method(camera: Cameras) -> Rendering:
-        begun.set()
+        started.set()
         may_go.wait(PATIENCE)
         raise FileNotFoundError("what it renders with is gone")
 
     with serving(method) as server:
         server.ask("a", camera(), Shown())
-        assert begun.wait(PATIENCE)
+        assert started.wait(PATIENCE)
         start = time.monotonic()
         server.close()
         assert time.monotonic() - start < PATIENCE / 4

@@ -314,15 +314,15 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
     from tidefield.data.load import read_posed
     from tidefield.device import choose_device
     from tidefield.geometry.cameras import find_name
-    from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE, read_run
+    from tidefield.train.checkpoint import RUN_FILE, read_run, require_checkpoint
 
     choose_device(device)
     roots = []
     for path in scenes:
         run = read_run(path) if (path / RUN_FILE).exists() else None
         # Runs of other methods keep what they trained in files of their own.
-        if run is not None and isinstance(run.config, Config | NerfConfig) and not (path / CHECKPOINT_FILE).exists():
-            raise RunError(f"{path} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
+        if run is not None and isinstance(run.config, Config | NerfConfig):
+            require_checkpoint(path)
         roots.append(path if run is None else run.scene)
     for root in roots:
         pull(root)

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Export a run, or with --zero-shot a scene, as Gaussians (PLY, in the layout of 3D Gaussian
-    splatting).
+    """Export a run, or with --zero-shot a scene, as Gaussians (PLY, as in 3D Gaussian splatting).
 
     Every pixel of the training photographs' views becomes a flat Gaussian, unless other views see through it; nothing
     is optimised. Lost are colours that change with the direction (mirrors of water), what is finer than a pixel of

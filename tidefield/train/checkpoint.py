@@ -183,13 +183,23 @@ def _named(network: nn.Module) -> dict[str, Tensor]:
     return {f"network.{name}": value for name, value in network.state_dict().items()}
 
 
-def _read_checkpoint(folder: Path) -> tuple[TrainingProgress, dict[str, Tensor]]:
-    """The progress in a run's checkpoint, and its tensors."""
+def require_checkpoint(folder: Path) -> Path:
+    """Return the checkpoint of a run.
+
+    Raises:
+        RunError: there is none.
+    """
     path = folder / CHECKPOINT_FILE
     with reading_from(path):
         there = path.is_file()
     if not there:
         raise RunError(f"{folder} has no {CHECKPOINT_FILE}: expected a run that has trained; train it with --resume")
+    return path
+
+
+def _read_checkpoint(folder: Path) -> tuple[TrainingProgress, dict[str, Tensor]]:
+    """The progress in a run's checkpoint, and its tensors."""
+    path = require_checkpoint(folder)
     header, tensors = _read_tensors(path, "a checkpoint that `tidefield train` wrote; train again into a new folder")
     if header.get("run") != _run_id(folder):
         raise RunError(
