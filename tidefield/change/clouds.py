@@ -19,6 +19,8 @@ from tidefield.change.registration import Registration
 from tidefield.change.surfaces import ChangeError, Grid, is_local, same_system, unstated_unit
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
+    FOOT_M,
+    US_SURVEY_FOOT_M,
     has_unstated_unit,
     horizontal,
     metres_per_height,
@@ -37,7 +39,7 @@ _CHUNK = 2_000_000
 _PROJECTED, _PLAN_UNIT, _VERTICAL, _HEIGHT_UNIT = 3072, 3076, 4096, 4099
 """GeoKeys of the plan's and the heights' system and unit (OGC GeoTIFF 1.1)."""
 _USER_DEFINED = 32767
-_UNITS_M = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+_UNITS_M = {9001: 1.0, 9002: FOOT_M, 9003: US_SURVEY_FOOT_M}
 """Lengths of EPSG's units of length."""
 _ASSIGN = "pdal translate --writers.las.a_srs"
 SIGMAS = ("sigma_z", "sigma")

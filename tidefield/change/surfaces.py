@@ -20,6 +20,8 @@ from scipy.ndimage import label
 from tidefield.errors import TidefieldError
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
+    FOOT_M,
+    US_SURVEY_FOOT_M,
     has_unstated_unit,
     horizontal,
     metres_per_height,
@@ -50,8 +52,8 @@ _ZERO_SHARE = 0.01
 """Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
-    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus"), 1200 / 3937),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
+    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus"), US_SURVEY_FOOT_M),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
     "units": 1.0,  # of a map without a georeference

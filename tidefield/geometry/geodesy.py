@@ -30,6 +30,7 @@ from pyproj.exceptions import CRSError, ProjError
 WGS84 = "EPSG:4326"
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius, for distances on a sphere that may be wrong by half a per cent."""
+FOOT_M, US_SURVEY_FOOT_M = 0.3048, 1200 / 3937
 _TRUE_AREA = 0.01
 """By how much areas on a map may differ from those on the ground; lengths in one direction may by twice as much."""
 _NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")

@@ -17,6 +17,8 @@ from pyproj import Transformer
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import (
     EARTH_RADIUS_M,
+    FOOT_M,
+    US_SURVEY_FOOT_M,
     WGS84,
     horizontal,
     metres_per_degree,
@@ -53,9 +55,8 @@ _ZEROS: dict[str, VerticalDatum] = {
     **dict.fromkeys(("sea", "msl", "amsl", "orthometric", "navd", "egm"), "mean sea level"),
 }
 _BRACKETS = re.compile(r"[\[(](.*?)[\])]")
-_FOOT_M, _US_SURVEY_FOOT_M = 0.3048, 1200 / 3937
 _METRES = ("m", "metre", "metres", "meter", "meters")
-_UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), _FOOT_M), **dict.fromkeys(_METRES, 1.0)}
+_UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), FOOT_M), **dict.fromkeys(_METRES, 1.0)}
 # Words of a title beside that of the quantity. "Geoid" is none of them: the height of the geoid is another quantity.
 _OF_DEGREES = ("deg", "degree", "degrees", "decimal", "dd")
 _OF_LENGTHS = (*_ZEROS, *_UNITS_M, "us", "survey", "wgs", "above", "over", "mean", "level")
@@ -197,7 +198,7 @@ def _unit_m(title: str) -> float:
     """Length of the unit in a title; metres without one."""
     words = _words(title)
     unit_m = next((_UNITS_M[word] for word in words if word in _UNITS_M), 1.0)
-    return _US_SURVEY_FOOT_M if unit_m == _FOOT_M and {"us", "survey"} & {*words} else unit_m
+    return US_SURVEY_FOOT_M if unit_m == FOOT_M and {"us", "survey"} & {*words} else unit_m
 
 
 def _read_table(
