@@ -23,10 +23,16 @@ def write_map(folder: Path, colour: tuple[int, int, int], heights: np.ndarray | 
     return folder
 
 
-def write_change(folder: Path, dz: np.ndarray, sigma: float = 0.03, systematic_m: float = 0.01) -> Path:
+def write_change(
+    folder: Path,
+    dz: np.ndarray,
+    sigma: float = 0.03,
+    systematic_m: float = 0.01,
+    crs: str | None = "EPSG:32630",
+) -> Path:
     """A change whose errors are independent from cell to cell, besides one that all share."""
     bands = np.stack([dz, np.full_like(dz, sigma), np.ones_like(dz)]).astype(np.float32)
-    write_surface(folder / "change.tif", bands, CELL, nodata=float("nan"))
+    write_surface(folder / "change.tif", bands, CELL, crs=crs, nodata=float("nan"))
     numbers = {
         "earlier": {"date": "2023-05-01"},
         "later": {"date": "2024-05-03"},

@@ -83,6 +83,17 @@ def test_lengths_are_metres_where_a_system_knows_them(
     assert tuple(atlas.describe()[name] for name in ("length", "area", "volume")) == measures
 
 
+def test_a_change_of_surfaces_without_a_system_is_shown_in_metres(tmp_path: Path):
+    change = write_change(tmp_path / "change", np.full(SHAPE, 0.4, np.float32), crs=None)
+    atlas = Atlas([change])
+    assert (atlas.unit, atlas.name) == ("m", "no coordinate system")
+    assert atlas.tile(0, "change", 0, 0, 0) is not None
+    (volumes,) = atlas.area(box(10, 10, 20, 20))["sheets"]
+    assert volumes["net"]["value_m3"] == pytest.approx(40 * CELL**2, rel=1e-4)
+    beside = Atlas([change, write_map(tmp_path / "map", (1, 2, 3))])
+    assert beside.crs.to_epsg() == 32630
+
+
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
     heights = np.ones(SHAPE, np.float32)
     heights[40:, 40:] = -9999

@@ -1,7 +1,7 @@
 """Maps and changes to look at from straight above: layers, tiles, values, sections and volumes, in one system.
 
-All is shown in the coordinate system of the first folder. Tiles are squares of `TILE_PX` pixels; those of level z have
-2^-z of the side of the whole area, and are counted from its north-western corner.
+All is shown in the first coordinate system that a folder states. Tiles are squares of `TILE_PX` pixels; those of level
+z have 2^-z of the side of the whole area, and are counted from its north-western corner.
 """
 
 from __future__ import annotations
@@ -162,10 +162,7 @@ class Atlas:
     def __init__(self, folders: Sequence[Path]) -> None:
         rasterio = need("rasterio")
         self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
-        with _opened(self.sheets[0].layers[0].path) as file:
-            self.crs = file.crs
-        if self.crs is None:
-            raise RunError(f"{self.sheets[0].title} states no coordinate system: expected one in its files")
+        self.crs = next(filter(None, (_system(sheet) for sheet in self.sheets)), None)
         boxes, cells = [], []
         for sheet in self.sheets:
             for layer in sheet.layers:
@@ -356,6 +353,8 @@ class Atlas:
         """Metres in a unit of the plan and of heights, both units, and the system's name."""
         from pyproj import CRS
 
+        if self.crs is None:  # changes between surfaces that state none, whose lengths `tidefield change` took as metres
+            return 1.0, 1.0, "m", "m", "no coordinate system"
         crs = CRS.from_wkt(self.crs.to_wkt())
         if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
             return 1.0, 1.0, "units", "units", crs.name
@@ -371,6 +370,11 @@ class Atlas:
     def _measures(self) -> tuple[str, str, str]:
         """What lengths, areas and volumes are in: metres in every system that knows how long they are."""
         return ("units", "square units", "cubic units") if self.unit == "units" else ("m", "m²", "m³")
+
+
+def _system(sheet: Sheet) -> Any:
+    with _opened(sheet.layers[0].path) as file:
+        return file.crs
 
 
 @contextmanager
