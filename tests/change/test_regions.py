@@ -1,5 +1,6 @@
 """Polygons of a user, in whatever files programs write."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -61,3 +62,15 @@ def test_a_table_without_geometries_is_refused(tmp_path: Path):
     (tmp_path / "a.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ChangeError, match="no geometries"):
         read_regions(tmp_path / "a.csv", GRID)
+
+
+def test_whole_numbers_are_names_as_they_are_written(tmp_path: Path):
+    """With one missing, the column is read as floats."""
+    features = [
+        {"type": "Feature", "properties": {"id": number}, "geometry": shapely.geometry.mapping(shape)}
+        for number, shape in ((7, CREEK), (None, ROAD))
+    ]
+    system = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32630"}}
+    path = tmp_path / "a.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": system, "features": features}))
+    assert names(path) == ["7", "2"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -49,6 +51,13 @@ def rasterised(regions: list[Region], grid: Grid) -> Bool[np.ndarray, "rows colu
 
 def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
     return np.stack(to.transform(points[:, 0], points[:, 1]), axis=1)
+
+
+def _name(value: Any) -> str:
+    """A name in a column; empty where there is none. Whole numbers beside missing ones are read as floats."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
 def _layer(path: Path, layers: list[str], asked: str | None) -> str:
@@ -125,7 +134,7 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
         if not np.isfinite(geometry.bounds).all():
             raise ChangeError(f"{path} has a geometry at no place of the surveys' system: {expected}")
         value = columns[chosen][k] if chosen is not None else None
-        name = own = str(k + 1) if value is None or value == "" else str(value)
+        name = own = _name(value) or str(k + 1)
         times = 1
         while name in taken:
             times += 1
