@@ -6,6 +6,7 @@ table itself imports nothing heavy, so that `--help` can list it.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from tidefield.train.checkpoint import Run, TrainingProgress
     from tidefield.train.loop import Trainer
 
+log = logging.getLogger(__name__)
 Kind = Literal["preset", "zero-shot", "nerf", "nerfstudio", "opensplat", "untrained"]
 
 
@@ -145,7 +147,7 @@ def zero_shot(
 def trained(
     folder: Path, run: Run, scene: Scene, device: torch.device, sampling: Sampling = USUAL_SAMPLING
 ) -> Iterator[tuple[Render, TrainingProgress]]:
-    """The method of a run, while the block lasts, and how far it was trained.
+    """The method of a run, while the block lasts, and how far it was trained. Warns of a scene that was made anew.
 
     Raises:
         RunError: the run has not been trained, or is damaged.
@@ -153,6 +155,11 @@ def trained(
     from tidefield.model.rendering import with_rays
     from tidefield.train.checkpoint import load_network
 
+    if run.poses not in (None, scene.poses_key()):
+        log.warning(
+            f"{scene.root} has other photographs or poses than when {folder} was trained: expected the same; train it "
+            "again"
+        )
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver
 

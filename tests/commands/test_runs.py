@@ -6,7 +6,9 @@ import io
 import json
 import logging
 import os
+import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -267,6 +269,25 @@ def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Pat
     write_run(run, checkpoint.Run(scene, 48, 0, SMALL))
     with pytest.raises(RunError, match="of another run"):
         read_evaluation(run)
+
+
+def test_a_run_whose_scene_was_made_anew_does_not_go_on(
+    tmp_path: Path, scene: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    again, run = tmp_path / "scene", tmp_path / "run"
+    shutil.copytree(scene, again)
+    start(again, run)
+    evaluate(Evaluate(run, device="cpu"), QUIET)
+    start(again, run, steps=4, resume=True)
+    assert not caplog.messages
+    other = survey(PINHOLE)
+    other.T_world_camera[:, :, 3] *= 1.01
+    write_colmap(again, replace(other, ground=1.01 * other.ground))
+    with pytest.raises(RunError, match=r"has other photographs or poses than when .* was started"):
+        start(again, run, steps=5, resume=True)
+    assert read_run(run).budget == Budget(steps=4)
+    evaluate(Evaluate(run, device="cpu", overwrite=True), QUIET)
+    assert [text for text in caplog.messages if "other photographs or poses than when" in text]
 
 
 def test_a_pretraining_that_died_before_its_first_save_starts_again(

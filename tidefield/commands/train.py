@@ -142,6 +142,11 @@ def _train(options: Train, console: Console, again: str) -> None:
                 progress = opensplat.train(program, scene, folder, budget, device, curve, show)
         stopped = None
     else:
+        if options.resume and not options.allow_missing and run.poses not in (None, scene.poses_key()):
+            raise RunError(
+                f"{options.scene} has other photographs or poses than when {folder} was started: expected the same; "
+                "train again, with --overwrite"
+            )
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
             trainer.resume(folder)
@@ -198,7 +203,7 @@ def _start(folder: Path, run: Run, scene: Scene) -> None:
     driver.delete_training(folder)
     opensplat.delete_training(folder)
     delete_evaluation(folder, scene.names)
-    write_run(folder, run)
+    write_run(folder, replace(run, poses=scene.poses_key()))
 
 
 def _require_its_options(options: Train, run: Run) -> None:

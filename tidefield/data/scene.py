@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -97,6 +99,15 @@ class Scene:
             SceneError: no photograph has this name.
         """
         return find_name(name, self.names, str(self.root))
+
+    def poses_key(self, split: bool = False) -> str:
+        """Identify the photographs, their poses and, if asked for, the split: those of a scene made anew differ.
+
+        Poses are rounded to 1e-5, so that the rounding of another machine does not count.
+        """
+        poses = self.cameras.T_world_camera.double().cpu().round(decimals=5) + 0.0  # no -0.0
+        about = [self.names, *((self.train, self.test) if split else ()), poses.tolist()]
+        return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
     def sources(self, camera: Cameras) -> tuple[int, ...]:
         """List the photographs that one camera's view may be made from: the training photographs, but not its own.

@@ -5,8 +5,6 @@ A method is only a function `render(camera) -> Rendering` here, so every method 
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import sys
 import time
@@ -116,7 +114,7 @@ def evaluate(
         "version": __version__,
         "commit": commit(),
         "protocol": PROTOCOL,
-        "poses": _poses_key(scene),
+        "poses": scene.poses_key(split=True),
         "held_out_of_poses": (scene.root / HOLDOUT_FILE).exists(),
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
@@ -126,13 +124,6 @@ def evaluate(
     for remark in _remarks(report, out):
         console.print(remark, soft_wrap=True)
     return Evaluation(path, report)
-
-
-def _poses_key(scene: Scene) -> str:
-    """Identifies the photographs, their poses and the split, to tell results on different ones apart."""
-    poses = scene.cameras.T_world_camera.double().cpu().round(decimals=5) + 0.0  # no -0.0
-    about = [scene.names, scene.train, scene.test, poses.tolist()]
-    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 
 def delete_evaluation(out: Path, names: Sequence[str]) -> None:

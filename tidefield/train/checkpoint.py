@@ -43,6 +43,7 @@ _RUN = {
     "weights": str | None,
     "id": str | None,
     "budget": Budget | None,
+    "poses": str | None,
 }
 _PROGRESS = {
     "step": Annotated[int, Range(0, (1 << 63) - 1)],
@@ -66,6 +67,7 @@ class Run:
         version: of the program that started it.
         id: random; None in runs of version 0.1.
         budget: of the training, from its start; None in runs of version 0.1.
+        poses: identifies those it was trained on (`Scene.poses_key`); None in runs of version 0.1.
     """
 
     scene: Path
@@ -76,6 +78,7 @@ class Run:
     version: str = __version__
     id: str | None = field(default_factory=lambda: secrets.token_hex(8))
     budget: Budget | None = None
+    poses: str | None = None
 
 
 @dataclass
@@ -107,7 +110,7 @@ def read_run(folder: Path) -> Run:
             f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
         )
     keys = {*_RUN, "config"}
-    if not isinstance(data, dict) or not keys - {"id", "budget"} <= set(data) <= keys:
+    if not isinstance(data, dict) or not keys - {"id", "budget", "poses"} <= set(data) <= keys:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
