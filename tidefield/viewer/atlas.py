@@ -353,7 +353,7 @@ class Atlas:
         """Metres in a unit of the plan and of heights, both units, and the system's name."""
         from pyproj import CRS
 
-        if self.crs is None:  # changes between surfaces that state none, whose lengths `tidefield change` took as metres
+        if self.crs is None:  # changes between surfaces without one, whose lengths `tidefield change` took as metres
             return 1.0, 1.0, "m", "m", "no coordinate system"
         crs = CRS.from_wkt(self.crs.to_wkt())
         if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
