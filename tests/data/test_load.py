@@ -180,9 +180,10 @@ def test_a_split_next_to_a_colmap_model_is_kept_where_it_lists_its_photographs(
     scene = load_scene(tmp_path)
     assert scene.test == (0, 8)
     assert "a split of other photographs than the COLMAP model next to it: every eighth is held out" in caplog.text
-    (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(SceneError, match=r"transforms\.json is damaged"):
-        load_scene(tmp_path)
+    for content, fault in (("{", "is damaged"), (json.dumps({**top, "train_filenames": [5]}), "not a list of file")):
+        (tmp_path / "transforms.json").write_text(content)
+        with pytest.raises(SceneError, match=rf"transforms\.json .*{fault}"):
+            load_scene(tmp_path)
 
 
 def test_a_blender_scene_keeps_alpha_split_and_background(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import posixpath
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from tidefield.data.readers.files import naming, read_json, reading
 from tidefield.data.readers.llff import SUFFIXES, read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
-from tidefield.data.readers.transforms import read_blender, read_transforms
+from tidefield.data.readers.transforms import read_blender, read_split, read_transforms
 from tidefield.data.scene import Scene, SparsePoints, every_eighth
 from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
@@ -345,22 +344,14 @@ def _split_beside(root: Path, names: tuple[str, ...]) -> tuple[frozenset[str], f
     file = root / "transforms.json"
     if not file.is_file():
         return None
-    top = read_json(file)
-    train, test, val = (_listed(top.get(f"{part}_filenames")) for part in ("train", "test", "val"))
-    train, test = train & {*names}, ((test or val) - train) & {*names}
+    split = read_split(read_json(file), file)
+    if split is None:
+        return None
+    train, test = (frozenset(name.removeprefix("images/") for name in part) & {*names} for part in split)
     if train and test and len(train) + len(test) == len(names):
         return train, test
-    if any(top.get(f"{part}_filenames") for part in ("train", "test", "val")):
-        _log.warning(
-            f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out"
-        )
+    _log.warning(f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out")
     return None
-
-
-def _listed(files: object) -> frozenset[str]:
-    """Names of the photographs that a list of transforms.json has, as a COLMAP model has them."""
-    paths = files if isinstance(files, list) else []
-    return frozenset(posixpath.normpath(path).removeprefix("images/") for path in paths if isinstance(path, str))
 
 
 def own_lens(path: Path, lens: LensModel) -> tuple[LensModel, bool]:

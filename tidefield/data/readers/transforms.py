@@ -52,9 +52,7 @@ def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
     """
     file = root / _FILE
     top = read_json(file)
-    train, test = _listed(top, "train_filenames", file), _listed(top, "test_filenames", file)
-    test = test or _listed(top, "val_filenames", file)
-    split = (train, test - train) if train and test else None
+    split = read_split(top, file)
     keys, posed = _photographs(top, root, file, allow_missing, split and (split[0] | split[1]))
     if split is not None:
         named = dict(zip(keys, posed.names, strict=True))
@@ -194,6 +192,17 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, file: Path) -> float
     if not 1e-9 < angle < math.pi:  # the tangent of the least is not 0
         raise SceneError(f"{file} has camera_angle_{axis} = {angle}: expected radians between 0 and pi; correct it")
     return 0.5 * size / math.tan(0.5 * angle)
+
+
+def read_split(top: Mapping[str, Any], file: Path) -> tuple[frozenset[str], frozenset[str]] | None:
+    """Names of the photographs that a transforms.json lists for training, and those that it holds out, if it has both.
+
+    Raises:
+        SceneError: what it has is no list of names.
+    """
+    train, test, val = (_listed(top, f"{part}_filenames", file) for part in ("train", "test", "val"))
+    test = test or val
+    return (train, test - train) if train and test else None
 
 
 def _listed(top: Mapping[str, Any], key: str, file: Path) -> frozenset[str]:
