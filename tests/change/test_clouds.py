@@ -113,6 +113,12 @@ def test_a_projection_of_its_own_is_not_taken_for_degrees(tmp_path: Path):
         read_cloud(write_old_cloud(tmp_path / "b.las", xyz * [1e-4, 1e-4, 1], {1024: 2, 2048: 4269}))
 
 
+def test_a_geocentric_cloud_is_refused(tmp_path: Path):
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([3_871_000.0, 400_000.0, 5_035_000.0])
+    with pytest.raises(ChangeError, match=r"is geocentric, without heights \(WGS 84\): expected a projected system"):
+        read_cloud(write_cloud(tmp_path / "a.laz", "EPSG:4978", xyz))
+
+
 def test_withheld_points_are_not_used(tmp_path: Path):
     laspy = pytest.importorskip("laspy")
     xyz = square(np.random.default_rng(0), 100.0) + np.array([450_000.0, 5_930_000.0, 2.0])

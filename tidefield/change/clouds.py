@@ -87,7 +87,7 @@ def read_cloud(path: Path) -> Cloud:
     Those of systems in feet, or of Web Mercator, are converted to the UTM zone of their middle.
 
     Raises:
-        ChangeError: the file is damaged, empty or too large, in degrees, or outside of its system.
+        ChangeError: the file is damaged, empty or too large, in degrees, geocentric, or outside of its system.
     """
     laspy = require_laspy()
     expected = "expected a LAS or LAZ file with points; name another"
@@ -117,8 +117,9 @@ def read_cloud(path: Path) -> Cloud:
     xyz = np.concatenate(parts)
     if len(xyz) == 0:
         raise ChangeError(f"{path} has no points but noise, water and withheld ones: {expected}")
-    if crs is not None and crs.is_geographic:
-        raise ChangeError(f"{path} is in degrees: expected a projected system in metres; convert it first")
+    if crs is not None and (crs.is_geographic or crs.is_geocentric):
+        found = "in degrees" if crs.is_geographic else "geocentric, without heights"
+        raise ChangeError(f"{path} is {found} ({crs.name}): expected a projected system in metres; convert it first")
     sigma = np.concatenate(sigmas) if sigmas else None
     up = _UNITS_M.get(keys.get(_HEIGHT_UNIT, 0), 1.0 if crs is None else metres_per_height(crs))
     xyz[:, 2] *= up
