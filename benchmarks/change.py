@@ -164,41 +164,20 @@ def _st_leonards(folder: Path) -> list[dict[str, Any]]:
 def store(runs: Path, part: str, found: Any) -> None:
     """Keep what was measured of one part in RUNS/change.json."""
     record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
-    write_json(runs / CHANGE_FILE, {**record, part: found, **describe()})
+    write_json(runs / CHANGE_FILE, {**record, part: {"found": found, **describe()}})
 
 
-def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all parts, and store them in RUNS/change.json as they are done."""
-    record: dict[str, Any] = read_json(runs / CHANGE_FILE) or {}
-    record |= {"command": "python -m benchmarks change", **describe()}
+def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> None:
+    """Measure what was published and built-in pairs, and store each in RUNS/change.json as it is done."""
     if data is not None:
         say("published figures")
-        record["published"] = published(data)
-        write_json(runs / CHANGE_FILE, record)
+        store(runs, "published", published(data))
     if pairs:
         say(f"{pairs} pairs of built-in surveys for each amount of change")
         seeds = range(FIRST_SEED, FIRST_SEED + pairs)
         measured = measure_pairs(seeds, say) + measure_pairs(seeds, say, FOUND_AMOUNTS_M, given=False)
-        record["pairs"] = [
-            {key: found[key] for key in ("change_m", "stable_ground")} | summarise(found) for found in measured
-        ]
-        write_json(runs / CHANGE_FILE, record)
-    return record
-
-
-def tables(record: dict[str, Any]) -> list[Table]:
-    """What was measured, for the page."""
-    made = []
-    if "published" in record:
-        made += _published_tables(record["published"])
-    if "pairs" in record:
-        made.append(_pairs_table(record["pairs"]))
-    for part, table in (("cover", _cover_tables), ("chain", _chain_tables), ("null", _null_tables)):
-        if part in record:
-            made += table(record[part])
-    if "size" in record:
-        made.append(_size_table(record["size"]))
-    return made
+        kept = ("change_m", "stable_ground")
+        store(runs, "pairs", [{key: found[key] for key in kept} | summarise(found) for found in measured])
 
 
 def _published_tables(found: dict[str, Any]) -> list[Table]:
@@ -260,7 +239,7 @@ def _published_tables(found: dict[str, Any]) -> list[Table]:
     ]
 
 
-def _pairs_table(pairs: list[dict[str, Any]]) -> Table:
+def _pairs_tables(pairs: list[dict[str, Any]]) -> list[Table]:
     rows = []
     for of in pairs:
         n, nothing = of["pairs"], of["change_m"] == 0
@@ -277,7 +256,7 @@ def _pairs_table(pairs: list[dict[str, Any]]) -> Table:
         )
     header = ["change, stable ground", "false alarms", "detected from", "cells found", "outlined", "bias where changed"]
     header += ["net", "cut in outlines", "fill in outlines", "all cut", "all fill"]
-    return Table("Pairs of built-in surveys: 95% intervals that contain the truth", header, rows)
+    return [Table("Pairs of built-in surveys: 95% intervals that contain the truth", header, rows)]
 
 
 def _cover_tables(pairs: list[dict[str, Any]]) -> list[Table]:
@@ -421,14 +400,14 @@ def _null_tables(found: dict[str, Any]) -> list[Table]:
     ]
 
 
-def _size_table(found: dict[str, Any]) -> Table:
+def _size_tables(found: dict[str, Any]) -> list[Table]:
     rows = [
         ["time", f"{found['seconds'] / 60:.1f} minutes"],
         ["time of the processor", f"{found['processor_seconds'] / 60:.1f} minutes on {found['cores']} cores"],
         ["peak memory", f"{found['peak_memory_bytes'] / 1e9:.2f} GB"],
         ["files written", f"{found['written_bytes'] / 1e9:.2f} GB"],
     ]
-    return Table(f"`tidefield change` on {found['million_cells']:.0f} million cells", ["", ""], rows)
+    return [Table(f"`tidefield change` on {found['million_cells']:.0f} million cells", ["", ""], rows)]
 
 
 def _volume(volume: dict[str, Any]) -> str:
@@ -439,6 +418,17 @@ def _volume(volume: dict[str, Any]) -> str:
 
 def _step(step: dict[str, Any]) -> str:
     return " to ".join(f"{d[:4]}-{d[4:6]}-{d[6:]}" for d in (step["earlier"], step["later"]))
+
+
+PARTS: dict[str, Callable[[Any], list[Table]]] = {
+    "published": _published_tables,
+    "pairs": _pairs_tables,
+    "cover": _cover_tables,
+    "chain": _chain_tables,
+    "null": _null_tables,
+    "size": _size_tables,
+}
+"""What is measured, in the order of the page."""
 
 
 def write_page(runs: Path, out: Path) -> None:
@@ -452,6 +442,10 @@ def write_page(runs: Path, out: Path) -> None:
         raise ChangeError(
             f"{runs / CHANGE_FILE} is not there: expected figures; run `python -m benchmarks change` first"
         )
-    parts = [INTRODUCTION, *(table.markdown() for table in tables(record))]
-    machine = f"Measured on {record['date']}, version {record['version']}, on {record['machine']['processor']}."
-    write_text(out, "\n\n".join([*parts, machine]) + "\n")
+    parts = [INTRODUCTION]
+    for part, tables in PARTS.items():
+        if part in record:
+            own = record[part]
+            parts += [table.markdown() for table in tables(own["found"])]
+            parts.append(f"Measured on {own['date']}, version {own['version']}, on {own['machine']['processor']}.")
+    write_text(out, "\n\n".join(parts) + "\n")

@@ -1,5 +1,7 @@
 """The figures of `python -m benchmarks change`."""
 
+import json
+
 import numpy as np
 import pytest
 from shared_data import SHARED
@@ -99,6 +101,9 @@ def test_parts_that_were_measured_are_on_the_page(tmp_path):
 
     size = {"million_cells": 100.0, "seconds": 600.0, "processor_seconds": 900.0, "peak_memory_bytes": 3e9}
     store(tmp_path, "size", size | {"written_bytes": 1e9, "cores": 2})
+    record = json.loads((tmp_path / "change.json").read_text())
+    record["size"]["date"] = "2020-02-02"
+    (tmp_path / "change.json").write_text(json.dumps(record))
     area = {"value_m2": 10.0, "low_m2": 8.0, "high_m2": 12.0, "true_m2": 11.0}
     water = {"land_gained_m2": 5.0, "true_gained_m2": 6.0, "land_lost_m2": 0.0, "true_lost_m2": 0.0}
     of = {"category": "vegetation", "seed": 1, "cover": dict.fromkeys(("earlier", "later", "gained", "lost"), area)}
@@ -108,3 +113,4 @@ def test_parts_that_were_measured_are_on_the_page(tmp_path):
     assert "10 (8 to 12); 11" in page
     assert "+1.00 (+0.50 to +1.50)" in page
     assert "3.00 GB" in page
+    assert page.index("Measured on 20") < page.index("3.00 GB") < page.index("Measured on 2020-02-02, version")
