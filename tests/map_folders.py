@@ -29,9 +29,17 @@ def write_change(
     sigma: float = 0.03,
     systematic_m: float = 0.01,
     crs: str | None = "EPSG:32630",
+    shared: np.ndarray | None = None,
 ) -> Path:
-    """A change whose errors are independent from cell to cell, besides one that all share."""
-    bands = np.stack([dz, np.full_like(dz, sigma), np.ones_like(dz)]).astype(np.float32)
+    """A change whose errors are independent from cell to cell, besides one that all share.
+
+    Args:
+        shared: that one, as a band of the raster, which older ones lack; sigma is then without it.
+    """
+    bands = [dz, np.full_like(dz, sigma), np.ones_like(dz)]
+    if shared is not None:
+        bands = [dz, np.hypot(bands[1], shared), bands[2], shared]
+    bands = np.stack(bands).astype(np.float32)
     write_surface(folder / "change.tif", bands, CELL, crs=crs, nodata=float("nan"))
     numbers = {
         "earlier": {"date": "2023-05-01"},

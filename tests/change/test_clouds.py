@@ -109,6 +109,7 @@ def test_a_projection_of_its_own_is_not_taken_for_degrees(tmp_path: Path):
     assert cloud.crs is None
     assert np.abs(cloud.xyz - US_FOOT * xyz).max() < 0.001
     assert "projected system of its own" in cloud.remarks[0]
+    assert "multiplied by 0.304801 to be metres" in cloud.remarks[0]
     with pytest.raises(ChangeError, match="degrees"):
         read_cloud(write_old_cloud(tmp_path / "b.las", xyz * [1e-4, 1e-4, 1], {1024: 2, 2048: 4269}))
 

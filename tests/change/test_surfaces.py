@@ -110,6 +110,28 @@ def test_zeros_around_a_survey_are_no_heights_and_zeros_in_it_are(tmp_path: Path
     assert np.isfinite(found[:, 33:]).all()
 
 
+@pytest.mark.parametrize("nodata", [None, -9999.0])
+def test_a_sea_that_is_levelled_to_zero_has_heights(tmp_path: Path, nodata: float | None):
+    shore = np.maximum(0, np.broadcast_to(0.02 * (np.arange(100) - 40.0), (100, 100))).astype(np.float32)
+    surface = open_surface(write_surface(tmp_path / "a.tif", shore, nodata=nodata))
+    assert surface.unknown == ()
+    assert surface.remarks == []
+    frame = np.where(shore == 0, shore, shore + 0.5)  # its heights end
+    path = write_surface(tmp_path / "b.tif", frame, nodata=nodata)
+    assert open_surface(path).unknown == ((0.0,) if nodata is None else ())
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("mm", 0.001), ("cm", 0.01)])
+def test_heights_in_small_units_are_heights(tmp_path: Path, unit: str, metre: float):
+    import rasterio
+
+    path = write_surface(tmp_path / "a.tif", np.full((20, 20), 252 / metre, np.float32))
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    found = read(path, common_grid([open_surface(path)]))
+    assert found[5, 5] == pytest.approx(252)
+
+
 def test_whole_numbers_may_be_zero_around_a_survey_and_reach_what_others_write_for_nodata(tmp_path: Path):
     import rasterio
 
@@ -234,6 +256,8 @@ def test_ellipsoidal_heights_are_not_compared_with_those_over_a_geoid(tmp_path: 
     with pytest.raises(ChangeError, match=r"the ellipsoid of WGS 84.*EGM96"):
         common_grid([open_surface(one), open_surface(two)])
     assert common_grid([open_surface(one), open_surface(one)]).rows > 1
+    third = write_surface(tmp_path / "c.tif", plane(20, 20, 1e-5, -4.4, 51.4), 1e-5, -4.4, 51.4, "EPSG:4937")  # ETRS89
+    assert common_grid([open_surface(one), open_surface(third)]).rows > 1
 
 
 def test_a_vertical_system_without_a_name_is_compared_with_any(tmp_path: Path):

@@ -50,7 +50,7 @@ def test_the_rasters_are_cloud_optimized_and_have_what_their_bands_say(compared:
     for name in ("change.tif", "significant.tif"):
         assert cog_validate(str(out / name))[0]
     with rasterio.open(out / "change.tif") as file:
-        dz, sigma, p = file.read()
+        dz, sigma, p, shared = file.read()
         assert file.crs.to_epsg() == 32630
         assert file.tags()["EARLIER"] == "2023-05-01"
     with rasterio.open(out / "significant.tif") as file:
@@ -60,6 +60,9 @@ def test_the_rasters_are_cloud_optimized_and_have_what_their_bands_say(compared:
     assert (outlined[truth < 0] == -1).mean() > 0.95
     assert (outlined[truth > 0] == 1).mean() > 0.95
     assert sigma.mean() == pytest.approx(np.hypot(0.015, 0.01) * np.sqrt(2), rel=0.1)
+    assert (shared < sigma).all()
+    systematic = json.loads((out / "change.json").read_text())["registration"]["systematic_m"]
+    assert np.median(shared) == pytest.approx(systematic, rel=0.2)
 
 
 def test_tables_and_the_geopackage_have_the_same_outlines(compared: tuple[Path, np.ndarray]):

@@ -141,6 +141,15 @@ def test_the_volume_of_a_change_and_its_interval_are_the_closed_form(tmp_path: P
     assert beyond["fill"] == volumes["fill"]
 
 
+def test_what_is_systematic_on_a_slope_adds_up_in_its_volume(tmp_path: Path):
+    dz, steep = np.full(SHAPE, 0.4, np.float32), np.linspace(0, 0.05, SHAPE[1], dtype=np.float32)
+    shared = np.broadcast_to(steep, SHAPE)
+    atlas = Atlas([write_change(tmp_path / "change", dz, sigma=0.03, systematic_m=0.001, shared=shared)])
+    net = atlas.area(box(10, 10, 40, 20))["sheets"][0]["net"]
+    half = 1.96 * CELL**2 * math.hypot(0.03 * math.sqrt(300), float(shared[10:20, 10:40].sum()))
+    assert net["high_m3"] - net["value_m3"] == pytest.approx(half, rel=1e-3)
+
+
 def test_a_heap_on_sloping_ground_has_its_volume_above_the_polygons_rim(tmp_path: Path):
     rows, columns = np.indices(SHAPE)
     ground = 5 + 0.01 * columns + 0.02 * rows

@@ -125,10 +125,12 @@ def read_cloud(path: Path) -> Cloud:
     xyz[:, 2] *= up
     sigma = None if sigma is None else sigma * up
     if crs is None or is_local(crs):
-        xyz[:, :2] *= _UNITS_M.get(keys.get(_PLAN_UNIT, 0), 1.0)
+        unit_m = _UNITS_M.get(keys.get(_PLAN_UNIT, 0), 1.0)
+        xyz[:, :2] *= unit_m
+        converted = "" if unit_m == 1 else f", its eastings and northings are multiplied by {unit_m:.6g} to be metres"
         own_system = (
             f"{path.name} has a projected system of its own, which is not read: that both surveys have the same one is "
-            f"taken for granted, and that heights without a unit are metres; assign a known one ({_ASSIGN})"
+            f"taken for granted, and that heights without a unit are metres{converted}; assign a known one ({_ASSIGN})"
         )
         remarks = (own_system,) if crs is None and keys.get(_PROJECTED) == _USER_DEFINED else ()
         return Cloud(path, None, xyz, sigma, remarks=remarks)

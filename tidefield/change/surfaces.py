@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
-from scipy.ndimage import label
+from scipy.ndimage import binary_dilation, label
 
 from tidefield.errors import TidefieldError
 from tidefield.files import reading_from
@@ -50,6 +50,8 @@ _UNLIKELY_M = 3_000.0
 """No flat is further from zero; 9999 feet are."""
 _ZERO_SHARE = 0.01
 """Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
+_STEP_M = 0.1
+"""The ground beside levelled water is not as high above it."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -181,10 +183,10 @@ class Surface:
 
             def heights(first: int, last: int) -> Float32[np.ndarray, "rows columns"]:
                 values = read(first, last)[0]
-                if (self.scale, self.offset) != (1, 0):
-                    values = values * np.float32(self.scale) + np.float32(self.offset)
+                if (self.scale, self.offset, self.metres) != (1, 0, 1):
+                    values = (values * np.float32(self.scale) + np.float32(self.offset)) * np.float32(self.metres)
                 values[np.abs(values) > _IMPOSSIBLE_M] = np.nan
-                return values * np.float32(self.metres) if self.metres != 1 else values
+                return values
 
             yield heights
 
@@ -347,12 +349,12 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
         elif crs is not None and has_unstated_unit(crs):
             remarks.append(unstated_unit(path, crs, "gdal_edit.py -a_srs"))
         nodata = dataset.nodata
-        found = _undeclared(dataset, metres)
+        found, share = _undeclared(dataset, metres)
         if found:
             declared = "no nodata" if nodata is None else f"nodata {nodata:g}"
             remarks.append(
                 f"{path.name} declares {declared}, but has {' and '.join(f'{value:g}' for value in found)} where no "
-                "height can be: read as such"
+                f"height can be, in {100 * share:.1f}% of its cells: read as such"
             )
         # Where a file has a mask, GDAL reads that or the declared value, not both.
         if _masked(dataset) and nodata is not None and math.isfinite(nodata):
@@ -401,8 +403,8 @@ def _masked(dataset: Any) -> bool:
     return MaskFlags.per_dataset in dataset.mask_flag_enums[0]
 
 
-def _undeclared(dataset: Any, metres: float) -> list[float]:
-    """Find the values that stand for no height where neither nodata nor a mask says so."""
+def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float]:
+    """Find the values that stand for no height where neither nodata nor a mask says so, and their share of cells."""
     height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
     raw = dataset.read(1, out_shape=(height, width), masked=True)
     values = raw.filled(0).astype(np.float64)
@@ -417,22 +419,27 @@ def _undeclared(dataset: Any, metres: float) -> list[float]:
         if (unlikely or dataset.nodata is None) and (known & (values == value)).any():
             found.append(value)
     zero, rest = known & (values == 0), values[known & (values != 0) & ~np.isin(values, found)]
-    if offset != 0 or len(rest) == 0:
-        return found
-    far = np.quantile(np.abs(rest), 0.01) * abs(scale) > 1.0
-    # Heights of whole numbers are often zero, those of floats never in large areas: that is the frame of a survey.
-    framed = floats and _at_edge(zero).mean() > _ZERO_SHARE
-    if framed or (far and zero.mean() > _ZERO_SHARE):
-        found.append(0.0)
-    return found
+    if offset == 0 and len(rest):
+        far = np.quantile(np.abs(rest), 0.01) * abs(scale) > 1.0
+        framed = floats and dataset.nodata is None and _is_frame(zero, known, values * abs(scale) * metres)
+        if framed or (far and zero.mean() > _ZERO_SHARE):
+            found.append(0.0)
+    return found, float((known & np.isin(values, found)).mean())
 
 
-def _at_edge(cells: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
-    """Those cells that are connected with the edge of a raster."""
-    numbered = np.zeros(cells.shape, np.int32)
-    label(cells, output=numbered)
+def _is_frame(
+    zero: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"], heights_m: np.ndarray
+) -> bool:
+    """Whether zeros along the edge of a raster lie around a survey: its heights end there, those of a shore run out.
+
+    A sea that was levelled is zero in large areas, too.
+    """
+    numbered = np.zeros(zero.shape, np.int32)
+    label(zero, output=numbered)
     edges = np.concatenate([numbered[0], numbered[-1], numbered[:, 0], numbered[:, -1]])
-    return np.isin(numbered, edges[edges > 0])
+    frame = np.isin(numbered, edges[edges > 0])
+    beside = binary_dilation(frame) & known & ~zero
+    return bool(frame.mean() > _ZERO_SHARE and beside.any() and np.median(np.abs(heights_m[beside])) > _STEP_M)
 
 
 def date_in(text: str) -> str | None:
@@ -572,7 +579,10 @@ def _require_same_heights(surfaces: list[Surface]) -> None:
 
 def require_one_zero(zeros: Sequence[tuple[Path, str | None]]) -> None:
     """Raises: ChangeError when files state heights over different zeros; None states none."""
-    heights = {zero: path for path, zero in zeros if zero is not None}
+    # Those of modern datums are within two metres of each other, which stable ground takes out.
+    ellipsoid = "the ellipsoid"
+    of = {ellipsoid if zero.startswith(ellipsoid) else zero: (zero, path) for path, zero in zeros if zero is not None}
+    heights = dict(of.values())
     if len(heights) > 1:
         (one, first), (other, second), *_ = heights.items()
         raise ChangeError(

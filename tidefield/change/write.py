@@ -34,6 +34,7 @@ CHANGE_BANDS = (
     "dz: later minus earlier height (m)",
     "sigma: one standard error of dz (m)",
     "p: two-sided p-value of dz",
+    "shared: the part of sigma that is systematic, which volumes do not average out (m)",
 )
 COVER_BANDS = ("plants: 1 gained, -1 lost, 2 at both dates, 0 at none",)
 SIGNIFICANT_BANDS = (
@@ -101,7 +102,7 @@ def cog(
 
 
 def write_rasters(change: Change, folder: Path) -> None:
-    """Write change.tif (dz, sigma, p) and significant.tif."""
+    """Write change.tif (`CHANGE_BANDS`) and significant.tif."""
     tags = {"EARLIER": change.earlier.name, "LATER": change.later.name}
     lookup = np.concatenate([[0], change.outlines.signs]).astype(np.int8)
     with (
@@ -112,7 +113,8 @@ def write_rasters(change: Change, folder: Path) -> None:
             dz = change.dz[rows]
             known = np.isfinite(dz)
             sigma = np.where(known, change.errors.cell_sigma(rows), np.float32(np.nan))
-            write(rows, np.stack([dz, sigma, p_values(dz / sigma)]))
+            shared = np.where(known, change.errors.shared_sigma(rows), np.float32(np.nan))
+            write(rows, np.stack([dz, sigma, p_values(dz / sigma), shared]))
             alone = np.where(np.abs(dz) > Z95 * sigma, np.sign(np.where(known, dz, 0)), 0).astype(np.int8)
             outlined = lookup[change.outlines.labels[rows]]
             write_signs(rows, np.where(known, np.stack([alone, outlined]), np.int8(UNKNOWN)))

@@ -278,11 +278,13 @@ class Atlas:
                 transform = _corner_at(file.transform, box)
                 cell = abs(transform.a) * self.metre
                 cell_area = cell * abs(transform.e) * self.metre
-                sigma = _band(file, 2, box) if sheet.kind == "change" else None
+                bands = (2, 4) if sheet.kind == "change" else ()
+                errors = [_band(file, band, box) for band in bands if band <= file.count]
             inside &= np.isfinite(values)
             if sheet.kind == "change":
-                results.append(_change_volumes(values, sigma, inside, cell, cell_area, sheet.numbers, detection_m))
+                results.append(_change_volumes(values, errors, inside, cell, cell_area, sheet.numbers, detection_m))
                 continue
+            sigma = None
             if sheet.sigma is not None:
                 with self._reader(sheet.sigma) as file:
                     error = _band(file, 1, box)
@@ -520,23 +522,42 @@ def _cells_in(file: Any, polygon: Any, rasterio: Any) -> tuple[Any, Bool[np.ndar
 
 
 def _change_volumes(
-    dz: Any, sigma: Any, inside: Any, cell_m: float, cell_area: float, numbers: dict[str, Any], detection_m: float
+    dz: Any,
+    errors: Sequence[Any],
+    inside: Any,
+    cell_m: float,
+    cell_area: float,
+    numbers: dict[str, Any],
+    detection_m: float,
 ) -> dict[str, Any]:
+    """Volumes in a polygon, with their intervals.
+
+    The systematic error is taken to have one sign in all cells, so that on a hill, where that of a shift cancels out,
+    intervals are wider than those of the report.
+
+    Args:
+        errors: one sigma of the cells, and of its systematic part, which files of earlier versions lack.
+    """
+    sigma = np.nan_to_num(errors[0])
+    if len(errors) > 1:
+        shared = np.nan_to_num(errors[1])
+        sigma = np.sqrt(np.maximum(sigma**2 - shared**2, 0))
+    else:
+        shared = np.full_like(sigma, numbers.get("registration", {}).get("systematic_m", 0.0))
     measured = numbers.get("variogram", {})
     variogram = Variogram(tuple(measured.get("sill_shares", ())), tuple(measured.get("ranges_m", ())))
-    systematic = float(numbers.get("registration", {}).get("systematic_m", 0.0))
     freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
     result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
     chosen = {"net": inside, "cut": inside & (dz < -detection_m), "fill": inside & (dz > detection_m)}
     for name, region in chosen.items():
-        error = region_error(np.nan_to_num(sigma).astype(np.float32), region, variogram, cell_m)
+        error = region_error(sigma.astype(np.float32), region, variogram, cell_m)
         area = float(region.sum()) * cell_area
         value = float(dz[region].sum()) * cell_area
         volume = Volume(
             value if name == "net" else abs(value),
             error.random * cell_area,
             error.correlated * cell_area,
-            systematic * area,
+            float(shared[region].sum()) * cell_area,
             area,
             degrees_of_freedom=freedom,
         )
