@@ -255,6 +255,17 @@ def test_heights_over_another_zero_do_not_tilt_the_model(first, accuracies, kept
     assert np.ptp(off) < math.tan(math.radians(0.1)) * spread_m, "the model is tilted"
 
 
+def test_a_few_differential_positions_on_one_line_do_not_push_out_the_others():
+    survey = fly(lines=5, each=9).survey
+    fixed = {"datum": "ellipsoid", "horizontal_m": 0.02, "vertical_m": 0.03}
+    given = given_positions(moved(survey, {p.name: fixed for p in survey.photographs[:9]}).photographs)
+    assert given.names == tuple(map(name_of, range(9, 45)))
+    given = given_positions(moved(survey, {p.name: fixed for p in survey.photographs[:27]}).photographs)
+    assert given.names == tuple(map(name_of, range(27)))
+    given = given_positions(moved(survey, {p.name: fixed for p in survey.photographs[::5]}).photographs)
+    assert given.names == tuple(map(name_of, range(0, 45, 5)))
+
+
 def test_the_ellipsoid_is_one_zero_whoever_names_it():
     flight = fly()
     sources = ("EXIF, RTK fixed", "EXIF, RTK float", "XMP", "gps.csv")

@@ -124,6 +124,20 @@ def test_a_position_that_was_corrected_in_exif_replaces_the_drones_own_in_xmp(tm
     assert math.isnan(read.vertical_m), "the accuracy is that of the drone's fix"
 
 
+@pytest.mark.parametrize(("far", "corrected"), [(1, False), (3, True)])
+def test_a_correction_of_a_good_share_of_the_positions_is_one_of_all(tmp_path, far, corrected):
+    """PPK moves some positions little, which are as little the drone's own as the others."""
+    for k in range(12):
+        up_m = 0.9 if k < far else 0.2
+        packet = xmp({"AbsoluteAltitude": "+112.30", **HERE, **RTK_FLOAT})
+        photograph(tmp_path / f"{k:02d}.jpg", table=exif(place=BRIGHTON, height_m=112.30 + up_m), packet=packet)
+    positions = [p.position for p in read_survey(tmp_path).photographs]
+    own = [p for p in positions if p is not None and p.datum == "ellipsoid"]
+    assert len(own) == (0 if corrected else 12 - far)
+    heights = [p.height_m for p in positions if p is not None]
+    assert heights == pytest.approx([113.2] * far + ([112.5] if corrected else [112.3]) * (12 - far))
+
+
 @pytest.mark.parametrize(
     ("height_m", "own_m"), [(112.345, "+112.35"), (12.5, "-12.50"), (4294954.796, "-12.50"), (9999.0, "8.00")]
 )

@@ -217,6 +217,15 @@ def test_masks_that_belong_to_no_photograph_are_counted(tmp_path: Path):
         assert any(f"{counted} (DJI_0001_mask.png, DJI_0002.JPG)" in remark for remark in survey.remarks)
 
 
+def test_photographs_in_the_folder_of_the_masks_are_none_of_them(tmp_path: Path):
+    survey_folder(tmp_path / "images")
+    for name in ("DJI_0000.JPG.png", "@eaDir/DJI_0001.jpg"):
+        mask(tmp_path / name)
+    survey = read_survey(tmp_path / "images", masks=tmp_path)
+    assert sum(p.mask is not None for p in survey.photographs) == 1
+    assert not any("belong to no photograph" in remark for remark in survey.remarks)
+
+
 def test_grey_photographs_of_a_camera_in_a_folder_called_masks_are_photographs(tmp_path: Path):
     survey_folder(tmp_path, 3)
     for k in range(3):

@@ -127,6 +127,14 @@ def test_heights_of_a_system_in_feet_without_a_vertical_one_are_metres_with_a_re
     assert read_gps_file(without, NAMES)[1] == []
 
 
+@pytest.mark.parametrize("name", ["geo.txt", "gps.csv"])
+@pytest.mark.parametrize("system", ["WGS 84", "EPSG:4326", "ETRS89"])
+def test_a_table_may_name_the_system_of_its_degrees(tmp_path, name, system):
+    text = f"{system}\nname,lat,lon,alt\nDJI_0001.JPG,54.5,-2.75,344\n"
+    position = read_gps_file(written(tmp_path, text, name), NAMES)[0]["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg, position.height_m) == (54.5, -2.75, 344)
+
+
 @pytest.mark.parametrize("name", ["geo.txt", "positions.csv"])
 @pytest.mark.parametrize("titles", ["#image\tx\ty\tz", "# image,lat,lon,z"])
 def test_titles_below_the_system_of_a_geo_txt_are_a_comment(tmp_path, name, titles):

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
-from tidefield.geometry.geodesy import WGS84, LocalFrame
+from tidefield.geometry.geodesy import WGS84, LocalFrame, metres_per_degree
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
 from tidefield.survey.survey import Photograph, Position
 
@@ -21,6 +21,8 @@ DIFFERENTIAL_M = 0.3
 """Positions with a stated standard deviation below this are from a differential receiver."""
 FEWEST_DIFFERENTIAL = 8
 """Positions of differential receivers that are enough to go by."""
+_LEAST_BREADTH = 0.25
+"""Differential positions are as broad as this share of all, or they are not enough."""
 _NOMINAL_M = 3.0
 """Standard deviation assumed for a receiver that states none: a good fix, so that only gross errors are rejected."""
 _LEAST_M = 0.01
@@ -119,16 +121,30 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
 
 
 def _of_one_zero(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[Photograph, Position]]:
-    """Select positions whose heights have one zero: that of the differential receiver, if there is one, or of most."""
+    """Select positions whose heights have one zero: that of most, or of a differential receiver that saw the survey.
+
+    A few differential positions at one place or on one line say less of the model's tilt than many others.
+    """
     by_zero = defaultdict(list)
     for pair in located:
         by_zero[_zero(pair[1])].append(pair)
+    least_m = _LEAST_BREADTH * _breadth_m([position for _, position in located])
 
     def worth(own: Sequence[tuple[Photograph, Position]]) -> tuple[bool, int]:
         accurate = [p for _, p in own if p.horizontal_m < DIFFERENTIAL_M and p.vertical_m < DIFFERENTIAL_M]
-        return len(accurate) >= FEWEST_DIFFERENTIAL, len(own)
+        return len(accurate) >= FEWEST_DIFFERENTIAL and _breadth_m(accurate) >= least_m, len(own)
 
     return max(by_zero.values(), key=worth, default=[])
+
+
+def _breadth_m(positions: Sequence[Position]) -> float:
+    """Deviation of positions across the line that they lie along."""
+    if len(positions) < 2:
+        return 0.0
+    degrees = np.array([(p.longitude_deg, p.latitude_deg) for p in positions])
+    degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180
+    variance = np.linalg.eigvalsh(np.cov((degrees * metres_per_degree(degrees[0, 1])).T))[0]
+    return math.sqrt(max(0.0, float(variance)))
 
 
 def _zero(position: Position) -> str:

@@ -90,20 +90,41 @@ class PhotographMetadata:
         return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
 
     @property
-    def position(self) -> Position | None:
+    def is_corrected(self) -> bool:
+        """Whether EXIF's position was written after the flight, by PPK for example: it is far from the drone's own."""
+        (latitude, longitude), own = self._degrees_of_exif, self._own_degrees
+        if not math.isfinite(latitude + longitude):
+            return False
+        east, north = metres_per_degree(latitude)
+        turned = (longitude - own[1] + 180) % 360 - 180
+        own_m, height_m = self.xmp_number("AbsoluteAltitude"), _exif_height_m(self)
+        return math.hypot(north * (latitude - own[0]), east * turned) > _CORRECTED_M or (
+            abs(height_m - own_m) > _CORRECTED_M and _is_plausible(height_m, own_m)
+        )
+
+    @property
+    def _degrees_of_exif(self) -> tuple[float, float]:
+        return _degrees(self.exif.gps, 1, "S"), _degrees(self.exif.gps, 3, "W")
+
+    @property
+    def _own_degrees(self) -> tuple[float, float]:
+        """Latitude and longitude of XMP."""
+        # DJI's early firmware misspells the longitude.
+        names = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
+        return self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude"), self.xmp_number(*names)
+
+    def position(self, corrected: bool) -> Position | None:
         """Position of the camera by its receiver, or None.
 
         The standard deviations are those of the maker (of the two horizontal ones of DJI's RTK, the larger; Pix4D's),
         or EXIF's positioning error.
+
+        Args:
+            corrected: whether EXIF's position was written after the flight; it is not the drone's own then.
         """
-        latitude, longitude = _degrees(self.exif.gps, 1, "S"), _degrees(self.exif.gps, 3, "W")
-        # DJI's early firmware misspells the longitude.
-        names = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
-        own = self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude"), self.xmp_number(*names)
-        corrected = _is_corrected(self, (latitude, longitude), own)
-        source = "EXIF"
+        (latitude, longitude), source = self._degrees_of_exif, "EXIF"
         if not math.isfinite(latitude + longitude):
-            (latitude, longitude), source = own, "XMP"
+            (latitude, longitude), source, corrected = self._own_degrees, "XMP", False
         if not math.isfinite(latitude + longitude):
             return None
         # After a correction, the drone's own fix and its accuracy are of the past.
@@ -198,23 +219,6 @@ def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> fl
     reference = gps.get(reference_tag, "")
     reference = reference.decode("ascii", "replace") if isinstance(reference, bytes) else str(reference)
     return -degrees if reference.strip("\0 ").upper().startswith(negative) else degrees
-
-
-def _is_corrected(metadata: PhotographMetadata, degrees: tuple[float, float], own: tuple[float, float]) -> bool:
-    """Whether EXIF's position was written after the flight, by PPK for example: it is not the drone's own.
-
-    Args:
-        degrees: latitude and longitude of EXIF.
-        own: those of XMP.
-    """
-    if not math.isfinite(sum(degrees)):
-        return False
-    east, north = metres_per_degree(degrees[0])
-    turned = (degrees[1] - own[1] + 180) % 360 - 180
-    own_m, height_m = metadata.xmp_number("AbsoluteAltitude"), _exif_height_m(metadata)
-    return math.hypot(north * (degrees[0] - own[0]), east * turned) > _CORRECTED_M or (
-        abs(height_m - own_m) > _CORRECTED_M and _is_plausible(height_m, own_m)
-    )
 
 
 def _exif_height_m(metadata: PhotographMetadata) -> float:

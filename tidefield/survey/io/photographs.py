@@ -7,7 +7,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from tidefield.survey.io.image_decoding import (
     upright_size,
 )
 from tidefield.survey.io.lens_prior import lens_prior
-from tidefield.survey.io.metadata import read_metadata
+from tidefield.survey.io.metadata import PhotographMetadata, read_metadata
 from tidefield.survey.io.positions import locate_photographs
 from tidefield.survey.io.text_files import find_file, normalise_name
 from tidefield.survey.survey import Photograph, Survey
@@ -48,6 +48,8 @@ _RAWS = (
 _OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp", ".gif")
 # Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
 _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
+_CORRECTED_SHARE = 0.1
+"""Of a survey's photographs."""
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
 
 
@@ -91,19 +93,19 @@ def read_survey(
         # Pillow warns of tags that it cannot read, without the name of the file; they count as unknown.
         warnings.simplefilter("ignore", UserWarning)
         read = list(pool.map(_read, paths, names, [mask_of.get(path) for path in paths]))
-    photographs = [photograph for photograph in read if isinstance(photograph, tuple)]
+    known = [one for one in read if isinstance(one, _Read)]
     unread = [f"Left out: {problem}" for problem in read if isinstance(problem, str)]
-    if len(photographs) < FEWEST:
+    if len(known) < FEWEST:
         raise SurveyError(
-            f"{folder} has {len(photographs)} photographs that can be read: expected at least {FEWEST} that overlap by "
+            f"{folder} has {len(known)} photographs that can be read: expected at least {FEWEST} that overlap by "
             "more than half; add more" + "".join(f"\n{problem}" for problem in unread)
         )
     remarks += unread
     for block in ("EXIF", "XMP"):
-        names = [photograph.name for photograph, damaged in photographs if block in damaged]
+        names = [one.photograph.name for one in known if block in one.metadata.damaged]
         if names:
             remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
-    kept, about_lenses = _drop_without_lens([photograph for photograph, _ in photographs])
+    kept, about_lenses = _drop_without_lens(_with_positions(known))
     located, about_positions = locate_photographs(folder, kept, gps)
     found = None if control or not find_control else find_file(folder, CONTROL_FILES)
     survey = Survey(folder, tuple(sorted(located, key=lambda photograph: photograph.name)), None)
@@ -121,6 +123,25 @@ def read_survey(
         control_was_found=found is not None,
         remarks=(*remarks, *about_lenses, *about_positions, *about_control),
     )
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A photograph, without its position, and its metadata."""
+
+    photograph: Photograph
+    metadata: PhotographMetadata
+
+
+def _with_positions(read: Sequence[_Read]) -> list[Photograph]:
+    """The photographs with their positions.
+
+    A correction such as PPK writes all positions of a survey into EXIF, also where it moves them little: all are taken
+    from there if a good share of them is far from the drone's own.
+    """
+    corrected = sum(one.metadata.is_corrected for one in read)
+    every = corrected > _CORRECTED_SHARE * len(read)
+    return [replace(one.photograph, position=one.metadata.position(every or one.metadata.is_corrected)) for one in read]
 
 
 def control_remark(error: SurveyError) -> str:
@@ -250,10 +271,14 @@ def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -
     found = {path: mask for path, mask in masked.items() if mask is not None}
     taken = set(found.values())
     count = len([path for path in photographs if path not in taken])
-    pictures = [path for path in sorted(home.rglob("[!.]*")) if path.suffix.casefold() in _PHOTOGRAPHS]
+    # Where the masks' folder holds that of the photographs, they are none of its masks.
+    others = {*photographs} - taken if folder.is_relative_to(home) else set()
+    there = sorted(_walk(home)) if home.is_dir() else []
+    pictures = [path for path in there if path.suffix.casefold() in _PHOTOGRAPHS and path not in others]
     strange = [] if home == folder else [path for path in pictures if path not in taken]
     if not found and (masks or 2 * sum(map(_is_mask, strange)) > len(strange)):
-        outside = [path for path in photographs if path not in strange] or photographs
+        inside = {*strange}
+        outside = [path for path in photographs if path not in inside] or photographs
         example = candidates[outside[0]][0].relative_to(home).as_posix()
         listed = f" (found: {list_names([path.relative_to(home).as_posix() for path in strange])})" if strange else ""
         todo = "give the folder of the masks, or leave --masks out" if masks else "rename them, or move the folder away"
@@ -284,8 +309,8 @@ def _is_mask(path: Path) -> bool:
         return False
 
 
-def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, tuple[str, ...]] | str:
-    """Read a photograph and which blocks of its metadata are damaged, or return why it cannot be read."""
+def _read(path: Path, name: str, mask: Path | None = None) -> _Read | str:
+    """Read a photograph and its metadata, or return why it cannot be read."""
     try:
         with open_image(path) as image:
             metadata = read_metadata(image)
@@ -305,7 +330,7 @@ def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, 
         focal_mm=metadata.exif.number(ExifTags.Base.FocalLength),
         lens=lens_prior(metadata, *stored, metadata.orientation),
         time_s=metadata.exif.time_s,
-        position=metadata.position,
+        position=None,
         relative_altitude_m=metadata.xmp_number("RelativeAltitude", "Camera:AboveGroundAltitude"),
         gimbal_deg=metadata.gimbal_deg,
         mask=mask,
@@ -313,4 +338,4 @@ def _read(path: Path, name: str, mask: Path | None = None) -> tuple[Photograph, 
     )
     if mask is not None:
         check_mask(mask, (width, height), path)
-    return photograph, metadata.damaged
+    return _Read(photograph, metadata)

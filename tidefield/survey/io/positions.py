@@ -27,8 +27,8 @@ from tidefield.geometry.geodesy import (
 )
 from tidefield.survey.io.text_files import (
     PhotographNames,
-    begins_with_crs,
     find_file,
+    first_system,
     leading_numbers,
     read_lines,
     read_list,
@@ -156,9 +156,13 @@ def read_gps_file(path: Path, names: PhotographNames) -> tuple[dict[str, GpsReco
         SurveyError: the file is neither, a line of it cannot be parsed, or it names none of the photographs.
     """
     lines = read_lines(path)
-    is_geo = begins_with_crs(lines)  # then titles of columns are a comment
+    system = first_system(lines)
     titles = (row for row, line in enumerate(lines) if all(name in _columns(line)[0] for name in _REQUIRED))
-    header = None if is_geo else next(titles, None)
+    header = next(titles, None)
+    # Titles in a geo.txt are a comment. A table may name the system of its degrees above them.
+    if system is not None and header is not None and (system.is_projected or lines[header].startswith("#")):
+        header = None
+    is_geo = system is not None and header is None
     if header is None and not is_geo and path.suffix.casefold() == ".csv":
         start = next((line.strip() for line in lines if line.strip()), "nothing")
         raise SurveyError(f"{path} begins with {start[:80]!r}: {_EXPECTED_TABLE}; write one")

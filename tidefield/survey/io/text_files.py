@@ -131,13 +131,12 @@ def _header(lines: Sequence[str]) -> tuple[str, str]:
     return header, f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}" if utm else header.strip()
 
 
-def begins_with_crs(lines: Sequence[str]) -> bool:
-    """Whether the first line that is no comment is a coordinate reference system."""
+def first_system(lines: Sequence[str]) -> CRS | None:
+    """The coordinate reference system that the first line that is no comment is; None where it is none."""
     try:
-        parse_crs(_header(lines)[1])
+        return parse_crs(_header(lines)[1])
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def unit_remarks(path: Path, system: CRS) -> list[str]:
