@@ -215,7 +215,8 @@ def _dated(record: Mapping[str, Any] | None, tables: Callable[[Mapping[str, Any]
     """Tables of a benchmark, after the code that they were measured with: others on the page have newer code."""
     if record is None:
         return ["Not measured."]
-    made = f"Measured {record['date']} at commit {record['commit'][:7]}: compare its columns with each other."
+    commit = (record["commit"] or "unknown")[:7]
+    made = f"Measured {record['date']} at commit {commit}: compare its columns with each other."
     return [made, *(table.markdown() for table in tables(record))]
 
 

@@ -98,9 +98,10 @@ def main() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except Exception as error:
-        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # PyTorch's, of a GPU
+        if _is_out_of_memory(error):
             reason = str(error).split("\n")[0].split(". ")[0] or "the system gave no more"
-            _end(2, f"not enough memory ({reason}): expected more; choose a smaller --width, or another --device")
+            todo = "choose a smaller --width or another --device, where the command has them, or end other programs"
+            _end(2, f"not enough memory ({reason}): expected more; {todo}")
         if isinstance(error, OSError) and error.filename is not None and user_can_mend(error):
             place = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else error.filename
             _end(2, f"{place} cannot be used ({error.strerror}): expected a place of yours; check name and permissions")
@@ -111,6 +112,14 @@ def main() -> None:
             f"  version: {__version__}, Python {sys.version.split()[0]}, {sys.platform}\n"
             f"  command: {shlex.join(sys.argv)}",
         )
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether an error is of Python's memory or of PyTorch's, whose text alone says so except on GPUs of NVIDIA."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    text = str(error).casefold()
+    return isinstance(error, RuntimeError) and ("can't allocate memory" in text or "out of memory" in text)
 
 
 def _end(status: int, message: str) -> NoReturn:

@@ -153,12 +153,12 @@ def trained(
         RunError: the run has not been trained, or is damaged.
     """
     from tidefield.model.rendering import with_rays
-    from tidefield.train.checkpoint import load_network
+    from tidefield.train.checkpoint import is_of, load_network
 
-    if run.poses not in (None, scene.poses_key()):
+    if not is_of(run, scene):
         log.warning(
-            f"{scene.root} has other photographs or poses than when {folder} was trained: expected the same; train it "
-            "again"
+            f"{scene.root} has other photographs or poses than when {folder} was trained, or holds out others: "
+            "expected the same; train it again"
         )
     if isinstance(run.config, NerfstudioConfig):
         from tidefield.baselines.nerfstudio import driver

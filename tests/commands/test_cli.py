@@ -93,6 +93,9 @@ def test_a_path_of_a_file_has_its_own_size_unless_another_in_its_proportion_is_g
     name = load_scene(scene).names[0]
     stretched = ["--camera", name, "--width", 32, "--height", 32]
     assert "the same proportion" in fails(capsys, "render", run, tmp_path / "a.png", *stretched)
+    call("render", run, tmp_path / "smallest.png", "--camera", name, "--width", 16, "--device", "cpu", "-q")
+    with Image.open(tmp_path / "smallest.png") as picture:
+        assert picture.size == (16, 16)  # of the least height
 
 
 def test_a_run_is_evaluated_at_another_width_than_its_own_and_with_several_rays(
@@ -358,6 +361,8 @@ def test_what_is_no_users_mistake_is_reported_as_a_defect(
     ("error", "reason"),
     [
         (MemoryError(), "the system gave no more"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "DefaultCPUAllocator: can't allocate memory"),
+        (RuntimeError("MPS backend out of memory (allocated: 9 GB)"), "MPS backend out of memory (allocated: 9 GB)"),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB. GPU 0 has\nmore"), "CUDA out of memory"),
     ],
 )

@@ -27,7 +27,7 @@ from tidefield.commands.pretrain import pretrain as pretrain_command
 from tidefield.commands.train import Train, train
 from tidefield.compare.run import read_evaluation
 from tidefield.config import PRESETS, Budget
-from tidefield.errors import RunError
+from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import only_writer
 from tidefield.model.network import make_network
@@ -79,6 +79,11 @@ def state(run: Path) -> dict[str, torch.Tensor]:
     network = make_network(SMALL.network)
     load_network(run, network)
     return network.state_dict()
+
+
+def load_progress(run: Path) -> int:
+    """Steps of a run so far."""
+    return checkpoint._read_checkpoint(run)[0].step
 
 
 def files(folder: Path) -> set[str]:
@@ -290,6 +295,36 @@ def test_a_run_whose_scene_was_made_anew_does_not_go_on(
     assert [text for text in caplog.messages if "other photographs or poses than when" in text]
 
 
+def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
+    tmp_path: Path, scene: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    again, run = tmp_path / "scene", tmp_path / "run"
+    shutil.copytree(scene, again)
+    start(again, run)
+    names = survey(PINHOLE).names
+    lists = {"train_filenames": names[2:], "test_filenames": names[:2]}
+    (again / "transforms.json").write_text(json.dumps({k: [f"images/{n}" for n in v] for k, v in lists.items()}))
+    with pytest.raises(RunError, match="or holds out others"):
+        start(again, run, steps=4, resume=True)
+    evaluate(Evaluate(run, device="cpu"), QUIET)
+    assert [text for text in caplog.messages if "or holds out others" in text]
+
+
+def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path) -> None:
+    for name, options in (
+        ("variant", {"variant": "no-neighbours"}),
+        ("nerf", {"method": "nerf", "preset": "paper"}),
+        ("again", {"overwrite": True}),
+    ):
+        start(scene, tmp_path / name, steps=1, **options)
+        start(scene, tmp_path / name, steps=2, resume=True, **options)
+        assert load_progress(tmp_path / name) == 2
+    with pytest.raises(RunError, match="was not started with --method nerf"):
+        start(scene, tmp_path / "again", steps=3, resume=True, method="nerf")
+    with pytest.raises(RunError, match="was not started with --variant no-neighbours"):
+        start(scene, tmp_path / "again", steps=3, resume=True, variant="no-neighbours")
+
+
 def test_a_pretraining_that_died_before_its_first_save_starts_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,6 +346,12 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     assert {name for name in os.listdir(tmp_path / "out") if name.startswith(".")} == set()
     assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
     assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
+    (tmp_path / "out" / PRETRAINING_FILE).unlink()  # as of an earlier version
+    pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
+    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
+    with pytest.raises(SceneError, match="typo"):
+        pretrain_command(Pretrain(tmp_path / "new", real=(tmp_path / "typo",), **options), QUIET)
+    assert not (tmp_path / "new" / PRETRAINING_FILE).exists()
     for others, was in (
         ({"seed": 3}, "seed 0, not 3"),
         ({"variant": "no-depth-loss"}, "variant None, not no-depth-loss"),

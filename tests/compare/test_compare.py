@@ -123,7 +123,13 @@ def test_results_on_a_scene_that_was_made_anew_are_not_mixed_in(disk: Path, tmp_
     for method, poses in zip(methods, ("first", "second", None), strict=True):
         file = out / "runs" / "flats" / method / "evaluation.json"
         write_json(file, {**json.loads(file.read_text()), "poses": poses})
-    require_one_state(["flats"], methods[1:], out)
+    require_one_state({"flats": "second"}, methods[1:], out)
+    with pytest.raises(RunError, match="flats has results of nearest, on other poses or another split than the scene"):
+        require_one_state({"flats": "third"}, methods[1:], out)
+    write_json(out / "runs" / "flats" / "nerf" / "run.json", {"poses": "first"})  # trained, and not yet evaluated
+    with pytest.raises(RunError, match="flats has results of nearest, and nerf, on different poses or splits"):
+        require_one_state({"flats": "second"}, methods[1:], out)
+    write_json(out / "runs" / "flats" / "nerf" / "run.json", {"poses": None})
     options = Compare((disk,), methods=methods, width=48, device="cpu", out=out)
     with pytest.raises(RunError, match="flats has results of tidefield, and nearest, on different poses or splits"):
         compare_command(options, Console(quiet=True))

@@ -174,6 +174,11 @@ def test_a_split_next_to_a_colmap_model_is_kept_where_it_lists_its_photographs(
     assert {scene.names[i] for i in scene.test} == set(truth.names[6:])
     assert len(scene.train) == 6
     assert load_scene(tmp_path, hold_out=False).test == ()
+    top = json.loads((tmp_path / "transforms.json").read_text())
+    for place in ("images_2/", "/home/me/flats/images/"):
+        smaller = {key: [name.replace("images/", place) for name in top[key]] for key in top if "_filenames" in key}
+        (tmp_path / "transforms.json").write_text(json.dumps(top | smaller))
+        assert len(load_scene(tmp_path).train) == 6
     assert caplog.messages == []
     top = json.loads((tmp_path / "transforms.json").read_text())
     (tmp_path / "transforms.json").write_text(json.dumps({**top, "val_filenames": files[7:]}))

@@ -130,6 +130,13 @@ def test_without_any_expected_depth_what_one_photograph_sees_lies_where_its_surr
     assert (alone / wall.true_depth(camera)[seen == 1]).log().abs().median() < math.log(1.25)
 
 
+def test_without_any_expected_depth_one_photograph_alone_leaves_all_of_the_range():
+    at = replace(wall.scene(wall.cameras(3, 128, 96, step=STEP), ()), points=None, train=(0, 1))
+    cells = surface_prior(at.cameras[0], None, at.cameras)
+    prior = Matcher(at)(at.cameras[0], cells)
+    assert torch.equal(prior.cells.nan_to_num(-1), cells.nan_to_num(-1))
+
+
 def test_the_interval_is_a_few_pixels_of_parallax_around_the_surface():
     at = scene()
     camera = at.cameras[TARGET]

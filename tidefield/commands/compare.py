@@ -156,11 +156,10 @@ def run_all(
     )
 
     require_writable(out / PROCESS_FILE, overwrite=True)
-    require_one_state(scenes, methods, out)
     # In a process of its own, because the memory of a scene would be charged to every process that this one starts.
     with worker_processes(1) as pool:
-        for scene in scenes.values():
-            pool.submit(check_scene, scene, settings.width).result()
+        states = {name: pool.submit(check_scene, scene, settings.width).result() for name, scene in scenes.items()}
+    require_one_state(states, methods, out)
     if elsewhere is None:
         quiet = ["--quiet"] if console.quiet else []
 
@@ -175,7 +174,7 @@ def run_all(
         for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
             pull(out / RUNS / name)
             print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
-    require_one_state(scenes, methods, out)
+    require_one_state(states, methods, out)
     return read_results(out, list(scenes), methods)
 
 

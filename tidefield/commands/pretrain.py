@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     import torch
     from rich.console import Console
 
+log = logging.getLogger(__name__)
 PRETRAINING_FILE = "pretraining.json"
 """What a training across scenes was started with."""
 
@@ -73,6 +75,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
 
 def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device, console: Console) -> None:
     from tidefield import machine
+    from tidefield.data.load import read_posed
     from tidefield.train import pretrain as across
     from tidefield.train.checkpoint import CHECKPOINT_FILE, WEIGHTS_FILE, write_weights
     from tidefield.train.loop import train
@@ -87,7 +90,9 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
     if across.is_main_process():
         names = (PRETRAINING_FILE, CHECKPOINT_FILE, WEIGHTS_FILE, across.VALIDATION_FILE)
         delete_partials(*(folder / name for name in names))
-        if not options.resume:
+        for scene in options.real:  # a name that is mistyped leaves the folder as it is
+            read_posed(scene, allow_missing=False)
+        if not (folder / PRETRAINING_FILE).exists():
             write_json(folder / PRETRAINING_FILE, _record(options))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
@@ -119,7 +124,12 @@ def _record(options: Pretrain) -> dict[str, Any]:
 
 def _require_same(folder: Path, record: dict[str, Any]) -> None:
     """Raises: RunError when the folder holds no training across scenes, or one with other options."""
+    from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
+
     found = read_json(folder / PRETRAINING_FILE)
+    if found is None and (folder / CHECKPOINT_FILE).exists() and not (folder / RUN_FILE).exists():
+        log.warning(f"{folder} does not state its options, as older ones do not: they are taken to be those given now")
+        return
     if not isinstance(found, dict):
         raise RunError(
             f"{folder} holds no training of `tidefield pretrain` (no {PRETRAINING_FILE}): expected one to continue; "

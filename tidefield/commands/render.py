@@ -119,7 +119,7 @@ def render(options: Render, console: Console) -> None:
 def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras:
     """Cameras in a size in their own proportion, if one is given."""
     own, size = cameras[0], _size(cameras[0], width, height)
-    if abs(size[0] * own.height - size[1] * own.width) > max(own.width, own.height):
+    if width and height and abs(size[0] * own.height - size[1] * own.width) > max(own.width, own.height):
         raise RunError(
             f"--width {width} --height {height} was given for views of {own.width} x {own.height} pixels: expected "
             "the same proportion; leave one of them out"

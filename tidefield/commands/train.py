@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, OpensplatProgram, Preset, TrainedMethod, Verbosity, load
-from tidefield.config import PRESETS, Budget, Config, NerfstudioConfig, OpensplatConfig, checked_seed, vary
+from tidefield.config import (
+    PRESETS,
+    AnyConfig,
+    Budget,
+    Config,
+    NerfstudioConfig,
+    OpensplatConfig,
+    checked_seed,
+    vary,
+)
 from tidefield.errors import RunError, SceneError
 from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
@@ -92,7 +101,7 @@ def _train(options: Train, console: Console, again: str) -> None:
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
     from tidefield.progress import ProgressBar
-    from tidefield.train.checkpoint import read_run, write_run
+    from tidefield.train.checkpoint import is_of, read_run, write_run
     from tidefield.train.loop import train as run_training
 
     budget, folder, weights = options.budget.checked(), options.run, None
@@ -142,10 +151,10 @@ def _train(options: Train, console: Console, again: str) -> None:
                 progress = opensplat.train(program, scene, folder, budget, device, curve, show)
         stopped = None
     else:
-        if options.resume and not options.allow_missing and run.poses not in (None, scene.poses_key()):
+        if options.resume and not options.allow_missing and not is_of(run, scene):
             raise RunError(
-                f"{options.scene} has other photographs or poses than when {folder} was started: expected the same; "
-                "train again, with --overwrite"
+                f"{options.scene} has other photographs or poses than when {folder} was started, or holds out others: "
+                "expected the same; train again, with --overwrite"
             )
         trainer = make_trainer(run.config, scene, run.seed, device, weights)
         if options.resume:
@@ -194,6 +203,7 @@ def _start(folder: Path, run: Run, scene: Scene) -> None:
     """Write run.json, after what an earlier run in the folder has left is deleted: it is not of this run."""
     from tidefield.baselines import opensplat
     from tidefield.baselines.nerfstudio import driver
+    from tidefield.data.scene import poses_key
     from tidefield.evaluation.curves import CURVE_FILE
     from tidefield.evaluation.evaluate import delete_evaluation
     from tidefield.train.checkpoint import CHECKPOINT_FILE, write_run
@@ -203,30 +213,32 @@ def _start(folder: Path, run: Run, scene: Scene) -> None:
     driver.delete_training(folder)
     opensplat.delete_training(folder)
     delete_evaluation(folder, scene.names)
-    write_run(folder, replace(run, poses=scene.poses_key()))
+    poses = poses_key(scene.names, scene.cameras.T_world_camera, scene.held_out)
+    write_run(folder, replace(run, poses=poses, held_out=scene.held_out))
 
 
 def _require_its_options(options: Train, run: Run) -> None:
     """Raises: RunError when a run is to be continued with options that are not its own."""
     from tidefield.train.checkpoint import weights_sha256
 
-    config = run.config
-    preset = config.preset if isinstance(config, Config) else None
+    network = options.method, options.preset, options.variant
+    same = network == ("tidefield", "swift", None) or _configuration(options) == run.config
     given = {
         "--width": (options.width, None, run.width),
         "--seed": (options.seed, 0, run.seed),
-        "--method": (options.method, "tidefield", config.method),
-        "--preset": (options.preset, "swift", preset),
+        **{
+            f"--{name}": (value, usual, value if same else usual)
+            for name, value, usual in zip(
+                ("method", "preset", "variant"), network, ("tidefield", "swift", None), strict=True
+            )
+        },
         "--from-scratch": (options.from_scratch, False, run.weights is None),
-        "--overwrite": (options.overwrite, False, False),
     }
     others = [
         name if value is True else f"{name} {value}"
         for name, (value, usual, own) in given.items()
         if value not in (usual, own)
     ]
-    if options.variant is not None and (preset is None or vary(PRESETS[preset], options.variant) != config):
-        others.append(f"--variant {options.variant}")
     if options.weights is not None and weights_sha256(options.weights) != run.weights:
         others.append(f"--weights {options.weights}")
     if others:
@@ -261,11 +273,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
-    weights, config = options.weights, configuration(options.method, options.preset, options.opensplat)
-    if options.variant is not None:
-        if not isinstance(config, Config):
-            raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
-        config = vary(config, options.variant)
+    weights, config = options.weights, _configuration(options)
     from_random = options.from_scratch or not isinstance(config, Config)
     if weights is not None and from_random:
         raise RunError(
@@ -278,6 +286,16 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     root = Path(os.path.realpath(options.scene))
     seed, budget = checked_seed(options.seed), options.budget.checked()
     return Run(root, options.width, seed, config, digest, budget=budget), weights
+
+
+def _configuration(options: Train) -> AnyConfig:
+    """What is to be trained."""
+    config = configuration(options.method, options.preset, options.opensplat)
+    if options.variant is None:
+        return config
+    if not isinstance(config, Config):
+        raise RunError(f"--variant changes our presets, not {options.method}: expected one of them; leave one out")
+    return vary(config, options.variant)
 
 
 def _require_free(folder: Path, overwrite: bool) -> None:

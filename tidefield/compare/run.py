@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -177,14 +177,26 @@ def tidefield(*words: object) -> list[str]:
     return [sys.executable, "-m", "tidefield.cli", *map(str, words)]
 
 
-def check_scene(scene: Path, width: int | None) -> None:
-    """Raises: SceneError when a scene cannot be compared on; reads its poses, and no photograph."""
+def check_scene(scene: Path, width: int | None) -> str:
+    """Identify the poses and the split of a scene (`poses_key`), without reading its photographs.
+
+    Raises:
+        SceneError: it cannot be compared on.
+    """
+    import torch
+
     from tidefield.data.load import read_posed, require_width
+    from tidefield.data.scene import every_eighth, poses_key
 
     require_width(width)
     posed = read_posed(scene, allow_missing=False)
-    if posed.split is not None and not posed.split[1]:
+    names = posed.names
+    held_out = {names[i] for i in every_eighth(len(names))[1]} if posed.split is None else posed.split[1]
+    if not held_out:
         raise SceneError(f"{scene} holds no photograph out: expected at least one to compare with; add photographs")
+    poses = posed.T_world_camera.copy()
+    poses[:, :, 3] -= poses[:, :, 3].mean(axis=0)
+    return poses_key(names, torch.from_numpy(poses).float(), held_out)
 
 
 def run_measured(command: Sequence[str], environment: Mapping[str, str], output: IO[bytes] | None = None) -> Usage:
@@ -316,19 +328,31 @@ def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], se
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
 
 
-def require_one_state(scenes: Iterable[str], methods: Sequence[str], out: Path) -> None:
-    """Raises: RunError when a scene's results are of different poses or splits: it was made anew in between."""
-    for name in scenes:
+def require_one_state(scenes: Mapping[str, str], methods: Sequence[str], out: Path) -> None:
+    """Raises: RunError when results are of other poses or splits than the scene has: it was made anew in between.
+
+    Args:
+        scenes: what `check_scene` returned, by the scenes' names.
+    """
+    for name, state in scenes.items():
         measured: dict[str, list[str]] = {}
         for method in methods:
-            poses = (read_evaluation(out / RUNS / name / method) or {}).get("poses")
-            if poses is not None:
+            folder = out / RUNS / name / method
+            # Not `read_run`: the memory of PyTorch would be charged to every process that this one starts.
+            run, evaluation = read_json(folder / RUN_FILE) or {}, read_evaluation(folder) or {}
+            for poses in {run.get("poses"), evaluation.get("poses")} - {None}:
                 measured.setdefault(poses, []).append(method)
         if len(measured) > 1:
             groups = ", and ".join(", ".join(group) for group in measured.values())
             raise RunError(
                 f"{out / RUNS / name} has results of {groups}, on different poses or splits of the scene: expected the "
                 "same for all; delete the older ones, or name another folder with --out"
+            )
+        if measured and state not in measured:
+            (older,) = measured.values()
+            raise RunError(
+                f"{out / RUNS / name} has results of {', '.join(older)}, on other poses or another split than the "
+                "scene has now: expected the same; delete them, or name another folder with --out"
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -90,6 +91,8 @@ LAYOUTS = (
 )
 """In this order; the first one found is read. A new layout is a line here and its reader in data/readers/."""
 _FEWEST = 3
+_IMAGES = re.compile(r"^(.*/)?images(_\d+)?/")
+"""Folder of the photographs in a path, in their own size or a smaller one."""
 _SMALLEST_WIDTH = 16
 _WHITE = (1.0, 1.0, 1.0)
 DOUBLED_BYTES = 4e9
@@ -347,7 +350,7 @@ def _split_beside(root: Path, names: tuple[str, ...]) -> tuple[frozenset[str], f
     split = read_split(read_json(file), file)
     if split is None:
         return None
-    train, test = (frozenset(name.removeprefix("images/") for name in part) & {*names} for part in split)
+    train, test = (frozenset(_IMAGES.sub("", name) for name in part) & {*names} for part in split)
     if train and test and len(train) + len(test) == len(names):
         return train, test
     _log.warning(f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out")

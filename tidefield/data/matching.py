@@ -164,7 +164,8 @@ class Matcher:
             found = _resized(found, small)
             if level >= last_coarse:
                 weight, views = self._views(small, found)
-            if not len(views):
+            # Without any expected depth one photograph fits at all of them: nothing matches.
+            if not len(views) or (reach and not ((weight > 0).sum(0) > 1).any()):
                 kept = _resized(start, camera)
                 return kept, torch.zeros_like(kept)
             steps = COARSE_STEPS if level >= last_coarse else STEPS

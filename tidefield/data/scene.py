@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -92,6 +93,11 @@ class Scene:
         parts += ["masks"] if self.photographs.masks else []
         return f"Scene({self.root.name!r}, {', '.join(parts)})"
 
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Names of the held-out photographs."""
+        return tuple(self.names[i] for i in self.test)
+
     def index(self, name: str) -> int:
         """Find a photograph's index by its name, with or without its folder and suffix.
 
@@ -99,15 +105,6 @@ class Scene:
             SceneError: no photograph has this name.
         """
         return find_name(name, self.names, str(self.root))
-
-    def poses_key(self, split: bool = False) -> str:
-        """Identify the photographs, their poses and, if asked for, the split: those of a scene made anew differ.
-
-        Poses are rounded to 1e-5, so that the rounding of another machine does not count.
-        """
-        poses = self.cameras.T_world_camera.double().cpu().round(decimals=5) + 0.0  # no -0.0
-        about = [self.names, *((self.train, self.test) if split else ()), poses.tolist()]
-        return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
     def sources(self, camera: Cameras) -> tuple[int, ...]:
         """List the photographs that one camera's view may be made from: the training photographs, but not its own.
@@ -118,6 +115,16 @@ class Scene:
         if own is None or not torch.equal(self.cameras.T_world_camera[own], camera.T_world_camera[0]):
             return self.train
         return tuple(i for i in self.train if i != own)
+
+
+def poses_key(names: Sequence[str], T_world_camera: Float[Tensor, "V 3 4"], held_out: Collection[str]) -> str:
+    """Identify photographs, their poses around their mean position, and which are held out.
+
+    That of a scene which was made anew differs. Poses are rounded to 1e-5: rounding on another machine does not count.
+    """
+    train, test = (tuple(i for i, name in enumerate(names) if (name in held_out) == out) for out in (False, True))
+    poses = T_world_camera.double().cpu().round(decimals=5) + 0.0  # no -0.0
+    return hashlib.sha256(json.dumps([names, train, test, poses.tolist()]).encode()).hexdigest()
 
 
 def every_eighth(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

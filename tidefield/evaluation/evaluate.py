@@ -22,7 +22,7 @@ from rich.table import Table
 from tidefield import __version__
 from tidefield.config import PROTOCOL
 from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
-from tidefield.data.scene import Scene
+from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
 from tidefield.evaluation.lpips import Lpips, load_lpips
@@ -114,7 +114,7 @@ def evaluate(
         "version": __version__,
         "commit": commit(),
         "protocol": PROTOCOL,
-        "poses": scene.poses_key(split=True),
+        "poses": poses_key(scene.names, scene.cameras.T_world_camera, scene.held_out),
         "held_out_of_poses": (scene.root / HOLDOUT_FILE).exists(),
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),

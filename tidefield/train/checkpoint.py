@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from tidefield import __version__
 from tidefield.addresses import address_of, path_of
 from tidefield.config import AnyConfig, Budget, Config, Range, Seed, config_from_json, config_to_json, from_json
+from tidefield.data.scene import Scene, poses_key
 from tidefield.errors import RunError
 from tidefield.files import completed_file, file_sha256, read_json, reading_from, write_json
 from tidefield.model.network import Network
@@ -44,6 +45,7 @@ _RUN = {
     "id": str | None,
     "budget": Budget | None,
     "poses": str | None,
+    "held_out": tuple[str, ...] | None,
 }
 _PROGRESS = {
     "step": Annotated[int, Range(0, (1 << 63) - 1)],
@@ -67,7 +69,8 @@ class Run:
         version: of the program that started it.
         id: random; None in runs of version 0.1.
         budget: of the training, from its start; None in runs of version 0.1.
-        poses: identifies those it was trained on (`Scene.poses_key`); None in runs of version 0.1.
+        poses: identifies those it was trained on (`poses_key`); None in runs of version 0.1.
+        held_out: photographs that it did not learn from; None in runs of version 0.1.
     """
 
     scene: Path
@@ -79,6 +82,7 @@ class Run:
     id: str | None = field(default_factory=lambda: secrets.token_hex(8))
     budget: Budget | None = None
     poses: str | None = None
+    held_out: tuple[str, ...] | None = None
 
 
 @dataclass
@@ -110,11 +114,19 @@ def read_run(folder: Path) -> Run:
             f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
         )
     keys = {*_RUN, "config"}
-    if not isinstance(data, dict) or not keys - {"id", "budget", "poses"} <= set(data) <= keys:
+    if not isinstance(data, dict) or not keys - {"id", "budget", "poses", "held_out"} <= set(data) <= keys:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
     return Run(**{**values, "scene": path_of(values["scene"])}, config=config)
+
+
+def is_of(run: Run, scene: Scene) -> bool:
+    """Whether a scene has the poses that a run was trained on, and holds out the same photographs, if any."""
+    if run.poses is None or run.held_out is None:
+        return True
+    key = poses_key(scene.names, scene.cameras.T_world_camera, run.held_out)
+    return run.poses == key and (not scene.test or {*scene.held_out} == {*run.held_out})
 
 
 def _run_id(folder: Path) -> str | None:

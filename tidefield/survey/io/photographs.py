@@ -84,8 +84,8 @@ def read_survey(
     remarks += about_files
     home = masks or folder / MASKS
     if mask_of:  # they are no photographs
-        own = set(mask_of.values())
-        paths = [path for path in paths if path not in own and (home == folder or not path.is_relative_to(home))]
+        own, apart = set(mask_of.values()), not folder.is_relative_to(home)
+        paths = [path for path in paths if path not in own and not (apart and path.is_relative_to(home))]
     _refuse_collisions([path.relative_to(folder).as_posix() for path in paths])
     _refuse_unreadable([path for path in paths if path.suffix.casefold() in HEIFS])
     names = [_name(path.relative_to(folder)) for path in paths]
