@@ -99,8 +99,8 @@ def _beach(folder: Path, grid: Grid, dates: tuple[str, str]) -> list[Region]:
     water = read_regions(vector / "watermasks.gpkg", grid)
     wet = [
         region.geometry
-        for region, date in zip(water, fields["raw_date"], strict=True)
-        if region.name == "leo" and str(date) in dates
+        for region, place, date in zip(water, fields["location"], fields["raw_date"], strict=True)
+        if place == "leo" and str(date) in dates
     ]
     return [Region("beach", beach.difference(shapely.union_all(wet)))]
 
