@@ -128,6 +128,19 @@ def test_the_choice_of_outlines_adds_what_the_cells_own_errors_do_not_explain():
     assert (smaller.value_m3, smaller.choice_m3, smaller.sigma_m3) == pytest.approx((12, 0, 5))
 
 
+def test_scattered_stable_ground_does_not_make_neighbours_independent():
+    """Points 20 m apart show nothing of what is shared by less, which volumes must not average out."""
+    residuals = np.full((400, 400), np.nan, np.float32)
+    residuals[10::20, 10::20] = np.random.default_rng(1).normal(0, 0.1, (20, 20))
+    scattered = fit_variogram(residuals, 1.0)
+    assert scattered.nugget == pytest.approx(0, abs=1e-9)
+    assert scattered.ranges_m[0] == pytest.approx(20, rel=0.1)
+    region = np.ones((60, 60), bool)
+    whole = np.random.default_rng(1).normal(0, 0.1, (200, 200)).astype(np.float32)
+    error = region_error(0.1, region, scattered, 1.0).total
+    assert error > 5 * region_error(0.1, region, fit_variogram(whole, 1.0), 1.0).total
+
+
 def test_degrees_of_freedom_are_the_independent_pieces_of_an_area_less_one():
     """Of a range r, a piece has the area pi r^2 / 5; of two ranges, Satterthwaite's sum of sill r^2."""
     area = 200 * math.pi

@@ -39,6 +39,8 @@ _LEAST_PAIRS = 200
 _LEAST_SHARE = 0.1
 """Of the pairs at a shorter distance in the same piece."""
 _LEAST_PATCHES = 12
+_RESOLVED_CELLS = 2.0
+"""Stable ground whose nearest pairs are further apart does not show what neighbours share."""
 _WORTH = 6.0
 """A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
 _CLIP = 4.0
@@ -201,7 +203,16 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
     every = 1 + math.isqrt(residuals.size // 1_000_000)
     thinned = residuals[::every, ::every] / np.float32(some.std())
-    return _with_patches(_fitted(lags, gammas, pairs), thinned, every * cell_m)
+    fitted = _fitted(lags, gammas, pairs)
+    if lags[0] > _RESOLVED_CELLS * cell_m:
+        fitted = _without_nugget(fitted, float(lags[0]))
+    return _with_patches(fitted, thinned, every * cell_m)
+
+
+def _without_nugget(fitted: Variogram, reach_m: float) -> Variogram:
+    """A variogram that was measured from a distance on: what seems random may be shared by all that is nearer."""
+    ordered = sorted(zip((*fitted.ranges_m, reach_m), (*fitted.sills, fitted.nugget), strict=True))
+    return replace(fitted, sills=tuple(s for _, s in ordered), ranges_m=tuple(a for a, _ in ordered))
 
 
 def _padded(rows: int, columns: int) -> tuple[int, int]:
