@@ -204,7 +204,6 @@ def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given
         ({"preset": "paper"}, "--preset paper: "),
         ({"method": "nerf", "from_scratch": True}, "--method nerf, --from-scratch: "),
         ({"variant": "views-2"}, "--variant views-2: "),
-        ({"overwrite": True}, "--overwrite: "),
     ],
 )
 def test_a_run_is_not_continued_with_the_options_of_another(
