@@ -1,5 +1,6 @@
 """Plants gained and lost, on pictures and on a built-in flat whose plants are known."""
 
+import cv2
 import numpy as np
 import pytest
 import shapely
@@ -13,9 +14,17 @@ MUD, PLANTS = np.array([125, 112, 92]), np.array([95, 110, 60])
 GRID = Grid(None, 0.0, 30.0, 0.1, 400, 300)
 
 
-def picture(rng: np.random.Generator, covered: np.ndarray, light: tuple[float, ...] = (1, 1, 1)) -> np.ndarray:
+def picture(
+    rng: np.random.Generator,
+    covered: np.ndarray,
+    light: tuple[float, ...] = (1, 1, 1),
+    rough: np.ndarray | None = None,
+) -> np.ndarray:
+    """Mud and plants; rough is where leaves, or stones, shade each other, by default where plants are."""
     colour = np.where(covered[..., None], PLANTS, MUD) * np.array(light)
     shade = 1 + 0.15 * np.sin(np.arange(400) / 40)[None, :, None]
+    leaves = cv2.resize(rng.normal(0, 0.3, (150, 200)).astype(np.float32), (400, 300))
+    shade = shade * (1 + np.where(covered if rough is None else rough, leaves, 0))[..., None]
     return (colour * shade + rng.normal(0, 5, (300, 400, 3))).clip(0, 255).astype(np.uint8)
 
 
@@ -76,6 +85,16 @@ def test_a_meadow_without_bare_ground_is_covered_at_both_dates():
     assert areas["earlier"].value_m2 == areas["later"].value_m2 == pytest.approx(1200)
     assert areas["gained"].high_m2 == areas["lost"].high_m2 == 0
     assert found.gains == pytest.approx((1 / 0.8, 1 / 0.75, 1 / 0.9), rel=0.02)
+
+
+def test_a_green_film_is_no_plant_and_grass_beside_gravel_is_one():
+    rng = np.random.default_rng(5)
+    film, grass = disc(10, 15, 5), disc(30, 15, 5)
+    for rough in (grass, ~film):
+        shown = picture(rng, film | grass, rough=rough)
+        classes = compare_cover(shown, shown, np.ones((300, 400), bool), GRID).classes
+        assert (classes[disc(10, 15, 4)] == 0).all()
+        assert (classes[disc(30, 15, 4)] == 2).all()
 
 
 def test_ground_that_only_one_picture_shows_is_unknown():

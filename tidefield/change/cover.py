@@ -1,21 +1,24 @@
 """Plants gained and lost, from the orthophotos of both surveys after evening their light.
 
-A place is covered where its mean colour over half a metre is greener than bare ground's by a margin. Bare ground is
-the lowest of the common values of greenness, unless that is a plant's, as in a meadow. Areas come with the range that
-they have when the margin is moved by what greenness scatters from date to date over ground that is bare at both; what
-changed by less than that did not change.
+A place is covered where its mean colour is greener than bare ground's by a margin, unless it lies in a patch that is as
+smooth as bare ground: green films and shallow water have no leaves that shade each other. Bare ground is the lowest of
+the common values of greenness, unless that is a plant's, as in a meadow. Areas come with the range that they have when
+the margin is moved by what greenness scatters from date to date over ground that is bare at both; what changed by less
+than that did not change.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int8
-from scipy.ndimage import label
+from scipy.ndimage import label, median
 
 from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, smoothed, with_light
@@ -27,6 +30,10 @@ MARGIN = 0.035
 """Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""
 WINDOW_M = 0.4
 """Deviation of the Gaussian window in which colours are averaged: tufts and the mud between them are one cover."""
+ROUGHER = 1.6
+"""Variation of light in a patch of plants, over the lower quartile of bare ground's."""
+ROUGH = 0.08
+"""Variation of light that is plants' whatever bare ground has, as of grass beside gravel."""
 LEAST_M2 = 1.0
 """Smaller patches that were gained or lost are left out."""
 _BIN = 0.004
@@ -131,11 +138,12 @@ def compare_cover(
     bare = _bare(np.concatenate([first[known], second[known]]))
     bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
     difference = (second - first)[_enough(bare_ground, known)]
+    rough = [_roughness(picture, known, sigma, bare_ground) for picture in (earlier, later)]
     scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
     inside = {"all": known} | {region.name: rasterised([region], grid) & known for region in regions or []}
-    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, least, grid) for k in (-1, 0, 1)}
+    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, least, grid, rough) for k in (-1, 0, 1)}
     for name, where in inside.items():
         areas[name] = {}
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
@@ -152,14 +160,43 @@ def _classes(
     threshold: float,
     least: float,
     grid: Grid,
+    rough: Sequence[Float32[np.ndarray, "rows columns"]],
 ) -> Int8[np.ndarray, "rows columns"]:
     """Classes as `Cover` has them; what changed too little, and patches that are too small, keep what they were."""
-    before, after = first > threshold, second > threshold
+    before, after = (_rough_patches(green > threshold, own) for green, own in zip((first, second), rough, strict=True))
     after = np.where(np.abs(second - first) > least, after, before)
     for moved in (after & ~before, before & ~after):
         after = np.where(small_patches(moved, grid, LEAST_M2), before, after)
     classes = np.where(after, np.where(before, 2, 1), np.where(before, -1, 0)).astype(np.int8)
     return np.where(known, classes, _UNKNOWN)
+
+
+def _roughness(
+    picture: np.ndarray,
+    known: Bool[np.ndarray, "rows columns"],
+    sigma: float,
+    bare_ground: Bool[np.ndarray, "rows columns"],
+) -> Float32[np.ndarray, "rows columns"]:
+    """Variation of a picture's light in a Gaussian window, over that from which a patch is one of plants."""
+    light = np.where(known, picture.mean(axis=-1), 0).astype(np.float32)
+    weight = np.maximum(cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma), np.float32(1e-3))
+    mean, square = (cv2.GaussianBlur(values, (0, 0), sigma) / weight for values in (light, light**2))
+    variation = np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, 1)
+    # Every patch counts without bare ground to compare with, and where pixels are too coarse to show leaves.
+    can_tell = _is_enough(bare_ground, known) and sigma >= 2
+    usual = float(np.quantile(variation[bare_ground], 0.25)) if can_tell else 0.0
+    return variation / np.float32(max(min(ROUGHER * usual, ROUGH), 1e-6))
+
+
+def _rough_patches(
+    green: Bool[np.ndarray, "rows columns"], roughness: Float32[np.ndarray, "rows columns"]
+) -> Bool[np.ndarray, "rows columns"]:
+    """Those connected parts of a region whose median roughness, which edges do not count for, is more than 1."""
+    numbers = np.empty(green.shape, np.int32)
+    count = label(green, output=numbers)
+    rough = np.zeros(count + 1, bool)
+    rough[1:] = median(roughness, numbers, np.arange(1, count + 1)) > 1
+    return rough[numbers]
 
 
 def small_patches(
@@ -185,9 +222,13 @@ def _bare(values: Float32[np.ndarray, " N"]) -> float:
     return min(_GREENEST, float(edges[at] + edges[at + 1]) / 2)
 
 
+def _is_enough(bare: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"]) -> bool:
+    return bool(bare.sum() > _LEAST_BARE * known.sum())
+
+
 def _enough(bare: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"]) -> np.ndarray:
     """Ground that is bare at both dates, or all ground if there is hardly any."""
-    return bare if bare.sum() > _LEAST_BARE * known.sum() else known
+    return bare if _is_enough(bare, known) else known
 
 
 def _resampled(cells: Bool[np.ndarray, "rows columns"], grid: Grid, to: Grid) -> Bool[np.ndarray, "rows columns"]:
