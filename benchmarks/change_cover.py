@@ -26,7 +26,7 @@ from tidefield.synthetic.two_dates import Difference, SurveyErrors, make_pair, s
 
 CATEGORIES = ("vegetation", "tidal_trees", "river_mouths")
 FIRST_SEED = 200
-"""The rules of cover were chosen on pairs 5 to 8 and 100 to 102."""
+"""The rules of cover were chosen on pairs 5 to 8, 100 to 102, 300 and 301."""
 HALF_M = (30.0, 25.0)
 CELL_M = 0.15
 COVERED = 0.25
