@@ -1,6 +1,8 @@
 """The figures of `python -m benchmarks change`."""
 
 import json
+import resource
+import sys
 
 import numpy as np
 import pytest
@@ -54,7 +56,9 @@ def test_the_command_is_measured_on_a_small_pair(tmp_path):
 
     found = measure_size(0.05, print)
     assert found["million_cells"] == pytest.approx(0.05, rel=0.02)
-    assert 50e6 < found["peak_memory_bytes"] < 4e9
+    # A process begins with the memory of the one that starts it, here of all tests so far.
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    assert 50e6 < found["peak_memory_bytes"] < max(4e9, 1.01 * own)
     assert found["processor_seconds"] > 0.5
     assert found["written_bytes"] > 10_000
 

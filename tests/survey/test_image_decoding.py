@@ -15,14 +15,14 @@ from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import SceneError, SurveyError
 from tidefield.survey.io import image_decoding
 from tidefield.survey.io.image_decoding import thumbnail, upright, upright_size, upright_uv
-from tidefield.survey.io.photographs import _read
+from tidefield.survey.io.photographs import _Read, _read
 from tidefield.survey.survey import Photograph
 
 
 def read(path: Path) -> Photograph:
     found = _read(path, path.name)
-    assert isinstance(found, tuple), found
-    return found[0]
+    assert isinstance(found, _Read), found
+    return found.photograph
 
 
 def unread(path: Path) -> Photograph:
