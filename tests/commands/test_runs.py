@@ -24,7 +24,7 @@ from tidefield.commands import demo
 from tidefield.commands.evaluate import Evaluate, evaluate
 from tidefield.commands.pretrain import PRETRAINING_FILE, Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
-from tidefield.commands.train import Train, train
+from tidefield.commands.train import Train, _configuration, _require_its_options, train
 from tidefield.compare.run import read_evaluation
 from tidefield.config import PRESETS, Budget
 from tidefield.errors import RunError, SceneError
@@ -79,11 +79,6 @@ def state(run: Path) -> dict[str, torch.Tensor]:
     network = make_network(SMALL.network)
     load_network(run, network)
     return network.state_dict()
-
-
-def load_progress(run: Path) -> int:
-    """Steps of a run so far."""
-    return checkpoint._read_checkpoint(run)[0].step
 
 
 def files(folder: Path) -> set[str]:
@@ -309,19 +304,17 @@ def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
     assert [text for text in caplog.messages if "or holds out others" in text]
 
 
-def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path) -> None:
-    for name, options in (
-        ("variant", {"variant": "no-neighbours"}),
-        ("nerf", {"method": "nerf", "preset": "paper"}),
-        ("again", {"overwrite": True}),
-    ):
-        start(scene, tmp_path / name, steps=1, **options)
-        start(scene, tmp_path / name, steps=2, resume=True, **options)
-        assert load_progress(tmp_path / name) == 2
-    with pytest.raises(RunError, match="was not started with --method nerf"):
-        start(scene, tmp_path / "again", steps=3, resume=True, method="nerf")
-    with pytest.raises(RunError, match="was not started with --variant no-neighbours"):
-        start(scene, tmp_path / "again", steps=3, resume=True, variant="no-neighbours")
+@pytest.mark.parametrize(
+    "options",
+    [{"variant": "no-neighbours"}, {"method": "nerf", "preset": "paper"}, {"variant": "views-2", "overwrite": True}],
+)
+def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path, options: dict[str, Any]) -> None:
+    started = Train(scene, tmp_path / "run", from_scratch=True, **options)
+    run = checkpoint.Run(scene, None, 0, _configuration(started))
+    _require_its_options(replace(started, resume=True), run)
+    for other, named in (({"method": "nerf"}, "--method nerf"), ({"variant": "views-2"}, "--variant views-2")):
+        with pytest.raises(RunError, match=f"was not started with .*{named}"):
+            _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=SMALL))
 
 
 def test_a_pretraining_that_died_before_its_first_save_starts_again(
