@@ -193,9 +193,9 @@ def _rough_patches(
 ) -> Bool[np.ndarray, "rows columns"]:
     """Those connected parts of a region whose median roughness, which edges do not count for, is more than 1."""
     numbers = np.empty(green.shape, np.int32)
-    count = label(green, output=numbers)
-    rough = np.zeros(count + 1, bool)
-    rough[1:] = median(roughness, numbers, np.arange(1, count + 1)) > 1
+    label(green, output=numbers)
+    rough = np.zeros(numbers.max() + 1, bool)
+    rough[1:] = median(roughness, numbers, np.arange(1, len(rough))) > 1
     return rough[numbers]
 
 
