@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int8
 from scipy.ndimage import label, median
@@ -178,9 +177,8 @@ def _roughness(
     bare_ground: Bool[np.ndarray, "rows columns"],
 ) -> Float32[np.ndarray, "rows columns"]:
     """Variation of a picture's light in a Gaussian window, over that from which a patch is one of plants."""
-    light = np.where(known, picture.mean(axis=-1), 0).astype(np.float32)
-    weight = np.maximum(cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma), np.float32(1e-3))
-    mean, square = (cv2.GaussianBlur(values, (0, 0), sigma) / weight for values in (light, light**2))
+    light = picture.mean(axis=-1, dtype=np.float32)
+    mean, square = np.moveaxis(smoothed(np.stack([light, light**2], axis=-1), known, sigma), -1, 0)
     variation = np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, 1)
     # Every patch counts without bare ground to compare with, and where pixels are too coarse to show leaves.
     can_tell = _is_enough(bare_ground, known) and sigma >= 2

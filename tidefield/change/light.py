@@ -53,8 +53,10 @@ def with_light(
 
 
 def smoothed(
-    picture: UInt8[np.ndarray, "rows columns 3"], known: Bool[np.ndarray, "rows columns"], sigma_px: float
-) -> Float32[np.ndarray, "rows columns 3"]:
+    picture: UInt8[np.ndarray, "rows columns bands"] | Float32[np.ndarray, "rows columns bands"],
+    known: Bool[np.ndarray, "rows columns"],
+    sigma_px: float,
+) -> Float32[np.ndarray, "rows columns bands"]:
     """Gaussian means of the known pixels of a picture."""
     values = np.where(known[..., None], picture, 0).astype(np.float32)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma_px)

@@ -105,12 +105,15 @@ class ErrorModel:
 
     def cell_sigma(self, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of a cell's whole error, for some rows."""
-        own = self.sigma[rows] if isinstance(self.sigma, np.ndarray) else np.float32(self.sigma)
-        return np.hypot(own, self.shared_sigma(rows)).astype(np.float32)
+        return self.cell_sigmas(rows)[0]
 
-    def shared_sigma(self, rows: slice) -> Float32[np.ndarray, "rows columns"]:
-        """One sigma of the systematic part of a cell's error, for some rows."""
-        return self._shared(self.registration.deviation(self.grid, rows), rows).astype(np.float32)
+    def cell_sigmas(
+        self, rows: slice
+    ) -> tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"]]:
+        """One sigma of a cell's whole error, and of its systematic part, for some rows."""
+        own = self.sigma[rows] if isinstance(self.sigma, np.ndarray) else np.float32(self.sigma)
+        shared = self._shared(self.registration.deviation(self.grid, rows), rows).astype(np.float32)
+        return np.hypot(own, shared).astype(np.float32), shared
 
     def near_sigma(self) -> Float32[np.ndarray, "rows columns"] | float:
         """One sigma of the error that a cell shares with all around it."""

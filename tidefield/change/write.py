@@ -112,8 +112,7 @@ def write_rasters(change: Change, folder: Path) -> None:
         for rows in change.grid.strips():
             dz = change.dz[rows]
             known = np.isfinite(dz)
-            sigma = np.where(known, change.errors.cell_sigma(rows), np.float32(np.nan))
-            shared = np.where(known, change.errors.shared_sigma(rows), np.float32(np.nan))
+            sigma, shared = (np.where(known, each, np.float32(np.nan)) for each in change.errors.cell_sigmas(rows))
             write(rows, np.stack([dz, sigma, p_values(dz / sigma), shared]))
             alone = np.where(np.abs(dz) > Z95 * sigma, np.sign(np.where(known, dz, 0)), 0).astype(np.int8)
             outlined = lookup[change.outlines.labels[rows]]
