@@ -221,24 +221,17 @@ def _require_its_options(options: Train, run: Run) -> None:
     """Raises: RunError when a run is to be continued with options that are not its own."""
     from tidefield.train.checkpoint import weights_sha256
 
-    network = options.method, options.preset, options.variant
-    same = network == ("tidefield", "swift", None) or _configuration(options) == run.config
-    given = {
-        "--width": (options.width, None, run.width),
-        "--seed": (options.seed, 0, run.seed),
-        **{
-            f"--{name}": (value, usual, value if same else usual)
-            for name, value, usual in zip(
-                ("method", "preset", "variant"), network, ("tidefield", "swift", None), strict=True
-            )
-        },
-        "--from-scratch": (options.from_scratch, False, run.weights is None),
-    }
-    others = [
-        name if value is True else f"{name} {value}"
-        for name, (value, usual, own) in given.items()
-        if value not in (usual, own)
-    ]
+    others = []
+    if options.width not in (None, run.width):
+        others.append(f"--width {options.width}")
+    if options.seed not in (0, run.seed):
+        others.append(f"--seed {options.seed}")
+    network = {"method": "tidefield", "preset": "swift", "variant": None}
+    named = {name: getattr(options, name) for name, usual in network.items() if getattr(options, name) != usual}
+    if named and _configuration(options) != run.config:
+        others += [f"--{name} {value}" for name, value in named.items()]
+    if options.from_scratch and run.weights is not None:
+        others.append("--from-scratch")
     if options.weights is not None and weights_sha256(options.weights) != run.weights:
         others.append(f"--weights {options.weights}")
     if others:
