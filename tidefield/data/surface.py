@@ -9,6 +9,8 @@ on flat ground at any tilt.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
@@ -75,9 +77,9 @@ def seen_count(camera: Cameras, depth: Float[Tensor, "H W"], cameras: Cameras, m
     """Count the `cameras` that have each pixel's surface point in front of them, inside their image, and not masked."""
     points_world = surface_points(camera, depth)
     count = torch.zeros(len(points_world), dtype=torch.long, device=depth.device)
-    for i in range(len(cameras)):
-        uv, z = cameras[i].project(points_world)
-        count += in_frame(cameras[i], uv, z, masks[i : i + 1])[0]
+    for some in _groups(len(cameras), len(points_world)):
+        part = cameras[some]
+        count += in_frame(part, *part.project(points_world), masks[some.start : some.stop]).sum(0)
     return count.reshape(depth.shape)
 
 
@@ -101,8 +103,14 @@ def in_frame(
 
 def which_see(cameras: Cameras, points_world: Float[Tensor, "P 3"]) -> Bool[Tensor, " V"]:
     """Decide which cameras have any of some points in their frames; memory does not grow with their number."""
-    parts = [cameras[some] for some in torch.arange(len(cameras)).split(max(1, PROJECTED_AT_ONCE // len(points_world)))]
+    parts = [cameras[some] for some in _groups(len(cameras), len(points_world))]
     return torch.cat([in_frame(part, *part.project(points_world)).any(1) for part in parts])
+
+
+def _groups(cameras: int, points: int) -> Iterator[slice]:
+    """Split cameras into groups that points are projected with at once."""
+    size = max(1, PROJECTED_AT_ONCE // points)
+    return (slice(start, start + size) for start in range(0, cameras, size))
 
 
 def _mean_depth(camera: Cameras) -> Float[Tensor, "H W"]:
