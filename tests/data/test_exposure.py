@@ -15,7 +15,8 @@ from tidefield.data import exposure
 from tidefield.data.exif import Exposures, read_exposures
 from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.images import Photographs
-from tidefield.data.scene import SparsePoints, every_eighth
+from tidefield.data.readers.posed import every_eighth
+from tidefield.data.scene import SparsePoints
 from tidefield.geometry.cameras import Cameras
 
 COUNT, WIDTH, HEIGHT, FOCAL, HEIGHT_M = 17, 96, 72, 80.0, 40.0

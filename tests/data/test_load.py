@@ -163,10 +163,12 @@ def test_the_layouts_own_split_is_kept(tmp_path: Path) -> None:
     assert len(scene.names) == 7
 
 
+@pytest.mark.parametrize("folder", ["", "card/images/"])
 def test_a_split_next_to_a_colmap_model_is_kept_where_it_lists_its_photographs(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    folder: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     truth = survey(PINHOLE)
+    truth = replace(truth, names=tuple(folder + name for name in truth.names))
     files = [f"images/{name}" for name in truth.names]
     write_transforms(tmp_path, truth, train_filenames=files[:6], val_filenames=["./" + file for file in files[6:]])
     write_colmap(tmp_path, truth)
@@ -176,7 +178,7 @@ def test_a_split_next_to_a_colmap_model_is_kept_where_it_lists_its_photographs(
     assert load_scene(tmp_path, hold_out=False).test == ()
     top = json.loads((tmp_path / "transforms.json").read_text())
     for place in ("images_2/", "/home/me/flats/images/"):
-        smaller = {key: [name.replace("images/", place) for name in top[key]] for key in top if "_filenames" in key}
+        smaller = {key: [name.replace("images/", place, 1) for name in top[key]] for key in top if "_filenames" in key}
         (tmp_path / "transforms.json").write_text(json.dumps(top | smaller))
         assert len(load_scene(tmp_path).train) == 6
     assert caplog.messages == []

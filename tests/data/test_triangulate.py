@@ -17,7 +17,7 @@ import tidefield as tf
 from tidefield.baselines.untrained import sparse_depth
 from tidefield.data import triangulate
 from tidefield.data.load import load_scene, read_posed
-from tidefield.data.scene import every_eighth
+from tidefield.data.readers.posed import every_eighth
 from tidefield.geometry.lenses import Lens
 
 DOWN = np.diag([1.0, -1.0, -1.0])

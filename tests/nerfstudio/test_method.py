@@ -13,7 +13,8 @@ from scenes_on_disk import FISHEYE, UTM, survey, write_colmap
 from tidefield.config import PRESETS
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.data.load import load_scene, read_posed
-from tidefield.data.scene import Scene, every_eighth
+from tidefield.data.readers.posed import every_eighth
+from tidefield.data.scene import Scene
 from tidefield.evaluation.evaluate import evaluate
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity

@@ -39,7 +39,6 @@ class Import:
 def import_project(options: Import, console: Console) -> None:
     """Run `tidefield import`."""
     from tidefield.data.load import read_posed
-    from tidefield.data.scene import every_eighth
     from tidefield.progress import ProgressBar
     from tidefield.survey import import_project as importing
     from tidefield.survey.sfm.features import set_up_pycolmap
@@ -58,8 +57,7 @@ def import_project(options: Import, console: Console) -> None:
     photographs, cameras, observations = model.num_images(), model.num_cameras(), model.compute_num_observations()
     observed = f", observed {observations:,} times" if observations else ""
     frame = located and located.frame
-    split = read_posed(options.scene, False).split
-    held_out = len(split[1] if split else every_eighth(photographs)[1])
+    held_out = len(read_posed(options.scene, False).train_and_test[1])
     where = f"; in metres about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f} ({frame.crs})" if frame else ""
     console.print(
         f"{options.scene}: {photographs} photographs, {held_out} of them held out; {cameras} "

@@ -28,7 +28,7 @@ from tidefield.data.readers.llff import SUFFIXES, read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
 from tidefield.data.readers.transforms import read_blender, read_split, read_transforms
-from tidefield.data.scene import Scene, SparsePoints, every_eighth
+from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
@@ -91,8 +91,8 @@ LAYOUTS = (
 )
 """In this order; the first one found is read. A new layout is a line here and its reader in data/readers/."""
 _FEWEST = 3
-_IMAGES = re.compile(r"^(.*/)?images(_\d+)?/")
-"""Folder of the photographs in a path, in their own size or a smaller one."""
+_IMAGES = re.compile(r"(?:^|(?<=/))images(?:_\d+)?/")
+"""Folder of the photographs in a path, in their own size or a smaller one; also one within it may be named so."""
 _SMALLEST_WIDTH = 16
 _WHITE = (1.0, 1.0, 1.0)
 DOUBLED_BYTES = 4e9
@@ -133,16 +133,10 @@ def load_scene(
     for path, lens, mask in zip(posed.paths, posed.lenses, masks, strict=True):
         own, has_alpha = own_lens(path, lens)
         files.append(PhotographFile(path, own, own.width, own.height, has_alpha, mask).at_width(width))
-    train, test = every_eighth(len(posed.names))
-    if posed.split is not None:
-        train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
-    if not hold_out:
-        train, test = tuple(range(len(posed.names))), ()
+    train, test = posed.train_and_test if hold_out else (tuple(range(len(posed.names))), ())
     if posed.points is None or not len(posed.points.uv_px):
         posed = replace(posed, points=find_points(posed, train, root, progress, cache) or posed.points)
-    origin = posed.T_world_camera[:, :, 3].mean(axis=0)
-    T_world_camera = posed.T_world_camera.copy()
-    T_world_camera[:, :, 3] -= origin
+    T_world_camera, origin = posed.centred
     pinholes = tuple(_pinhole(file) for file in files)
     background = posed.background_rgb or _WHITE
     photographs = open_photographs(files, background, progress, cache)
@@ -350,7 +344,13 @@ def _split_beside(root: Path, names: tuple[str, ...]) -> tuple[frozenset[str], f
     split = read_split(read_json(file), file)
     if split is None:
         return None
-    train, test = (frozenset(_IMAGES.sub("", name) for name in part) & {*names} for part in split)
+    there = frozenset(names)
+
+    def name_in(path: str) -> str | None:
+        rests = (path[found.end() :] for found in _IMAGES.finditer(path))
+        return next((name for name in (path, *rests) if name in there), None)
+
+    train, test = (there & {name_in(path) for path in part} for part in split)
     if train and test and len(train) + len(test) == len(names):
         return train, test
     _log.warning(f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out")

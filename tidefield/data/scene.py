@@ -125,10 +125,3 @@ def poses_key(names: Sequence[str], T_world_camera: Float[Tensor, "V 3 4"], held
     train, test = (tuple(i for i, name in enumerate(names) if (name in held_out) == out) for out in (False, True))
     poses = T_world_camera.double().cpu().round(decimals=5) + 0.0  # no -0.0
     return hashlib.sha256(json.dumps([names, train, test, poses.tolist()]).encode()).hexdigest()
-
-
-def every_eighth(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Split photographs as LLFF and NeRF do: 0, 8, 16, ... of the sorted names are held out. Returns train and test."""
-    test = tuple(range(0, count, 8))
-    train = tuple(i for i in range(count) if i % 8)
-    return train, test

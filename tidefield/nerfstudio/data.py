@@ -23,7 +23,6 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import own_lens, read_posed
-from tidefield.data.scene import every_eighth
 from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
@@ -70,13 +69,9 @@ class SceneParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> SceneOutputs:
         root = self.config.data
         posed = read_posed(root, allow_missing=False)
-        train, test = every_eighth(len(posed.names))
-        if posed.split is not None:
-            train, test = (tuple(i for i, name in enumerate(posed.names) if name in part) for part in posed.split)
+        train, test = posed.train_and_test
         chosen = train if split == "train" else test
-        origin = posed.T_world_camera[:, :, 3].mean(axis=0)
-        pose = posed.T_world_camera.copy()
-        pose[:, :, 3] -= origin
+        pose, origin = posed.centred
         radius = float(np.abs(pose[:, :, 3]).max())
         scale = 1 / radius if self.config.auto_scale_poses else 1.0
         pose[:, :, 3] *= scale

@@ -20,8 +20,8 @@ from PIL import ExifTags, Image
 from tidefield.data.exif import EXIF_DAMAGE, read_exif
 from tidefield.data.pictures import MODES, decode, write_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
+from tidefield.data.readers.posed import every_eighth
 from tidefield.data.readers.transforms import write_transforms_file
-from tidefield.data.scene import every_eighth
 from tidefield.errors import RunError
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap

@@ -18,7 +18,7 @@ from tidefield.data.georeference import Georeference, read_georeference
 from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.holdout import Holdout
 from tidefield.data.load import load_scene
-from tidefield.data.scene import every_eighth
+from tidefield.data.readers.posed import every_eighth
 from tidefield.errors import RunError, SurveyError
 from tidefield.files import is_empty, only_writer, writing_to
 from tidefield.progress import ProgressBar

@@ -87,6 +87,29 @@ class PosedPhotographs:
     reference: Reference | None = None
     masks: tuple[Path | None, ...] = ()
 
+    @property
+    def train_and_test(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Indices of the training and the held-out photographs: every eighth where the format has no split."""
+        if self.split is None:
+            return every_eighth(len(self.names))
+        train, test = (tuple(i for i, name in enumerate(self.names) if name in part) for part in self.split)
+        return train, test
+
+    @property
+    def centred(self) -> tuple[Float64[np.ndarray, "V 3 4"], Float64[np.ndarray, "3"]]:
+        """The poses around their mean position, and that position."""
+        origin = self.T_world_camera[:, :, 3].mean(axis=0)
+        T_world_camera = self.T_world_camera.copy()
+        T_world_camera[:, :, 3] -= origin
+        return T_world_camera, origin
+
+
+def every_eighth(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Split photographs as LLFF and NeRF do: 0, 8, 16, ... of the sorted names are held out. Returns train and test."""
+    test = tuple(range(0, count, 8))
+    train = tuple(i for i in range(count) if i % 8)
+    return train, test
+
 
 def proper_rotations(
     T_world_camera: Float[np.ndarray, "V 3 4"], names: Sequence[str], named_by: Path
