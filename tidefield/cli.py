@@ -6,8 +6,10 @@ Only what is needed to answer --help is imported here; torch and the rest are im
 from __future__ import annotations
 
 import difflib
+import errno
 import logging
 import os
+import re
 import shlex
 import signal
 import sys
@@ -66,6 +68,7 @@ COMMANDS: dict[str, tuple[Any, Any, str]] = {
 }
 """By name: module, options and function."""
 
+_NO_MEMORY = re.compile("out of memory|(can't|cannot) allocate memory|not enough memory", re.IGNORECASE)
 DESCRIPTION = """New views of tidal flats from drone photographs.
 
 The usual order of commands:
@@ -99,7 +102,8 @@ def main() -> None:
         sys.exit(141)
     except Exception as error:
         if _is_out_of_memory(error):
-            reason = str(error).split("\n")[0].split(". ")[0] or "the system gave no more"
+            sentences = re.split(r"\n|\. |: you tried", str(error))
+            reason = next(filter(_NO_MEMORY.search, sentences), sentences[0]) or "the system gave no more"
             todo = "choose a smaller --width or another --device, where the command has them, or end other programs"
             _end(2, f"not enough memory ({reason}): expected more; {todo}")
         if isinstance(error, OSError) and error.filename is not None and user_can_mend(error):
@@ -115,11 +119,12 @@ def main() -> None:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Whether an error is of Python's memory or of PyTorch's, whose text alone says so except on GPUs of NVIDIA."""
+    """Whether an error is of the system's memory, or of PyTorch's, whose text alone says so except on NVIDIA's GPUs."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
-    text = str(error).casefold()
-    return isinstance(error, RuntimeError) and ("can't allocate memory" in text or "out of memory" in text)
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    return isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
 
 
 def _end(status: int, message: str) -> NoReturn:

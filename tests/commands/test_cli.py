@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -361,16 +362,21 @@ def test_what_is_no_users_mistake_is_reported_as_a_defect(
     ("error", "reason"),
     [
         (MemoryError(), "the system gave no more"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "DefaultCPUAllocator: can't allocate memory"),
+        (None, "DefaultCPUAllocator: can't allocate memory"),  # as PyTorch has it on this system
+        (RuntimeError("DefaultCPUAllocator: not enough memory: you tried 8"), "DefaultCPUAllocator: not enough memory"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "[Errno 12] Cannot allocate memory"),
         (RuntimeError("MPS backend out of memory (allocated: 9 GB)"), "MPS backend out of memory (allocated: 9 GB)"),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB. GPU 0 has\nmore"), "CUDA out of memory"),
     ],
 )
 def test_too_little_memory_is_no_defect(
-    error: Exception, reason: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    error: Exception | None, reason: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stumble(words: list[str]) -> None:
-        raise error
+        if error is None:
+            torch.empty(10**15)
+        else:
+            raise error
 
     monkeypatch.setattr(cli, "_run", stumble)
     message = fails(capsys, "train", "a", "b")

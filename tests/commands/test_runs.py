@@ -26,7 +26,7 @@ from tidefield.commands.pretrain import PRETRAINING_FILE, Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
 from tidefield.commands.train import Train, _configuration, _require_its_options, train
 from tidefield.compare.run import read_evaluation
-from tidefield.config import PRESETS, Budget
+from tidefield.config import PRESETS, Budget, Config
 from tidefield.errors import RunError, SceneError
 from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import only_writer
@@ -298,8 +298,9 @@ def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
     names = survey(PINHOLE).names
     lists = {"train_filenames": names[2:], "test_filenames": names[:2]}
     (again / "transforms.json").write_text(json.dumps({k: [f"images/{n}" for n in v] for k, v in lists.items()}))
-    with pytest.raises(RunError, match="or holds out others"):
-        start(again, run, steps=4, resume=True)
+    for options in ({}, {"allow_missing": True}):
+        with pytest.raises(RunError, match="or holds out others"):
+            start(again, run, steps=4, resume=True, **options)
     evaluate(Evaluate(run, device="cpu"), QUIET)
     assert [text for text in caplog.messages if "or holds out others" in text]
 
@@ -310,11 +311,25 @@ def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
 )
 def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path, options: dict[str, Any]) -> None:
     started = Train(scene, tmp_path / "run", from_scratch=True, **options)
-    run = checkpoint.Run(scene, None, 0, _configuration(started))
+    run = checkpoint.Run(scene, None, 0, _configuration(started), variant=started.variant)
     _require_its_options(replace(started, resume=True), run)
     for other, named in (({"method": "nerf"}, "--method nerf"), ({"variant": "views-2"}, "--variant views-2")):
         with pytest.raises(RunError, match=f"was not started with .*{named}"):
-            _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=SMALL))
+            _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=SMALL, variant=None))
+
+
+def test_a_run_goes_on_with_some_of_its_options_though_its_preset_has_changed_since(
+    tmp_path: Path, scene: Path
+) -> None:
+    options = {"preset": "paper", "variant": "no-target-colour"}
+    config = _configuration(Train(scene, tmp_path / "run", **options))
+    assert isinstance(config, Config)
+    older = replace(config, train=replace(config.train, tiles=config.train.tiles + 1))
+    run = checkpoint.Run(scene, None, 0, older, variant="no-target-colour")
+    for name, value in options.items():
+        _require_its_options(Train(scene, tmp_path / "run", **{name: value}), run)
+    with pytest.raises(RunError, match="was not started with --method opensplat: expected"):
+        _require_its_options(Train(scene, tmp_path / "run", method="opensplat"), run)
 
 
 def test_a_pretraining_that_died_before_its_first_save_starts_again(
@@ -339,6 +354,8 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
     assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
     (tmp_path / "out" / PRETRAINING_FILE).unlink()  # as of an earlier version
+    with pytest.raises(RunError, match="does not fit"):
+        pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, variant="with-ray-transformer"), QUIET)
     pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
     with pytest.raises(SceneError, match="typo"):

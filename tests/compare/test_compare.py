@@ -127,6 +127,11 @@ def test_results_on_a_scene_that_was_made_anew_are_not_mixed_in(disk: Path, tmp_
     with pytest.raises(RunError, match="flats has results of nearest, on other poses or another split than the scene"):
         require_one_state({"flats": "third"}, methods[1:], out)
     write_json(out / "runs" / "flats" / "nerf" / "run.json", {"poses": "first"})  # trained, and not yet evaluated
+    (out / "runs" / "flats" / "nerf" / "evaluation.json").unlink()
+    process = (out / "runs" / "flats" / "nerf" / "process.json").read_text()
+    (out / "runs" / "flats" / "nerf" / "process.json").unlink()  # the training was interrupted, and is started again
+    require_one_state({"flats": "second"}, methods[1:], out)
+    (out / "runs" / "flats" / "nerf" / "process.json").write_text(process)
     with pytest.raises(RunError, match="flats has results of nearest, and nerf, on different poses or splits"):
         require_one_state({"flats": "second"}, methods[1:], out)
     write_json(out / "runs" / "flats" / "nerf" / "run.json", {"poses": None})

@@ -92,7 +92,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         delete_partials(*(folder / name for name in names))
         for scene in options.real:  # a name that is mistyped leaves the folder as it is
             read_posed(scene, allow_missing=False)
-        if not (folder / PRETRAINING_FILE).exists():
+        if not options.resume:
             write_json(folder / PRETRAINING_FILE, _record(options))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
@@ -100,6 +100,8 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:
             trainer.resume(folder)
+            if trainer.is_main_process:  # an older one may lack it
+                write_json(folder / PRETRAINING_FILE, _record(options))
         stopped = train(trainer, folder, budget, console, validation)
     if trainer.is_main_process:
         done = trainer.progress

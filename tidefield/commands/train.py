@@ -151,7 +151,7 @@ def _train(options: Train, console: Console, again: str) -> None:
                 progress = opensplat.train(program, scene, folder, budget, device, curve, show)
         stopped = None
     else:
-        if options.resume and not options.allow_missing and not is_of(run, scene):
+        if options.resume and not is_of(run, scene):
             raise RunError(
                 f"{options.scene} has other photographs or poses than when {folder} was started, or holds out others: "
                 "expected the same; train again, with --overwrite"
@@ -226,10 +226,15 @@ def _require_its_options(options: Train, run: Run) -> None:
         others.append(f"--width {options.width}")
     if options.seed not in (0, run.seed):
         others.append(f"--seed {options.seed}")
-    network = {"method": "tidefield", "preset": "swift", "variant": None}
-    named = {name: getattr(options, name) for name, usual in network.items() if getattr(options, name) != usual}
-    if named and _configuration(options) != run.config:
-        others += [f"--{name} {value}" for name, value in named.items()]
+    # By name: a preset may have other numbers than when the run was started.
+    preset = run.config.preset if isinstance(run.config, Config) else options.preset
+    for name, usual, own in (
+        ("method", "tidefield", run.config.method),
+        ("preset", "swift", preset),
+        ("variant", None, run.variant),
+    ):
+        if getattr(options, name) not in (usual, own):
+            others.append(f"--{name} {getattr(options, name)}")
     if options.from_scratch and run.weights is not None:
         others.append("--from-scratch")
     if options.weights is not None and weights_sha256(options.weights) != run.weights:
@@ -278,7 +283,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
     digest = None if weights is None else weights_sha256(weights)
     root = Path(os.path.realpath(options.scene))
     seed, budget = checked_seed(options.seed), options.budget.checked()
-    return Run(root, options.width, seed, config, digest, budget=budget), weights
+    return Run(root, options.width, seed, config, digest, options.variant, budget=budget), weights
 
 
 def _configuration(options: Train) -> AnyConfig:

@@ -186,17 +186,15 @@ def check_scene(scene: Path, width: int | None) -> str:
     import torch
 
     from tidefield.data.load import read_posed, require_width
-    from tidefield.data.scene import every_eighth, poses_key
+    from tidefield.data.scene import poses_key
 
     require_width(width)
     posed = read_posed(scene, allow_missing=False)
-    names = posed.names
-    held_out = {names[i] for i in every_eighth(len(names))[1]} if posed.split is None else posed.split[1]
+    held_out = {posed.names[i] for i in posed.train_and_test[1]}
     if not held_out:
         raise SceneError(f"{scene} holds no photograph out: expected at least one to compare with; add photographs")
-    poses = posed.T_world_camera.copy()
-    poses[:, :, 3] -= poses[:, :, 3].mean(axis=0)
-    return poses_key(names, torch.from_numpy(poses).float(), held_out)
+    T_world_camera, _ = posed.centred
+    return poses_key(posed.names, torch.from_numpy(T_world_camera).float(), held_out)
 
 
 def run_measured(command: Sequence[str], environment: Mapping[str, str], output: IO[bytes] | None = None) -> Usage:
@@ -339,7 +337,9 @@ def require_one_state(scenes: Mapping[str, str], methods: Sequence[str], out: Pa
         for method in methods:
             folder = out / RUNS / name / method
             # Not `read_run`: the memory of PyTorch would be charged to every process that this one starts.
-            run, evaluation = read_json(folder / RUN_FILE) or {}, read_evaluation(folder) or {}
+            # One that was interrupted is trained anew.
+            run = (read_json(folder / RUN_FILE) if "train" in read_process(folder) else None) or {}
+            evaluation = read_evaluation(folder) or {}
             for poses in {run.get("poses"), evaluation.get("poses")} - {None}:
                 measured.setdefault(poses, []).append(method)
         if len(measured) > 1:

@@ -42,6 +42,7 @@ _RUN = {
     "seed": Seed,
     "version": str,
     "weights": str | None,
+    "variant": str | None,
     "id": str | None,
     "budget": Budget | None,
     "poses": str | None,
@@ -65,6 +66,8 @@ class Run:
         width: of its photographs, pixels; None for their own.
         seed: of weights and batches.
         config: network and training.
+        variant: the part of its preset that was changed, by the name that was given; None for none, and in runs of
+            version 0.1.
         weights: SHA-256 of the trained weights it started from; None from scratch.
         version: of the program that started it.
         id: random; None in runs of version 0.1.
@@ -78,6 +81,7 @@ class Run:
     seed: int
     config: AnyConfig
     weights: str | None = None
+    variant: str | None = None
     version: str = __version__
     id: str | None = field(default_factory=lambda: secrets.token_hex(8))
     budget: Budget | None = None
@@ -114,7 +118,7 @@ def read_run(folder: Path) -> Run:
             f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
         )
     keys = {*_RUN, "config"}
-    if not isinstance(data, dict) or not keys - {"id", "budget", "poses", "held_out"} <= set(data) <= keys:
+    if not isinstance(data, dict) or not keys - {"variant", "id", "budget", "poses", "held_out"} <= set(data) <= keys:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
