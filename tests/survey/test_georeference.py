@@ -266,6 +266,23 @@ def test_a_few_differential_positions_on_one_line_do_not_push_out_the_others():
     assert given.names == tuple(map(name_of, range(0, 45, 5)))
 
 
+def test_differential_positions_along_a_single_line_go_before_many_others_along_it():
+    """Across the line, positions differ by their receivers' errors: less where these are differential."""
+    generator = np.random.default_rng(0)
+    survey = fly(lines=1, each=40).survey
+    plain = {
+        p.name: {"latitude_deg": p.position.latitude_deg + generator.normal(0, 1.5) / 111_000}
+        for p in survey.photographs
+        if p.position is not None
+    }
+    fixed = {"datum": "ellipsoid", "horizontal_m": 0.02, "vertical_m": 0.03}
+    along = {name_of(i): fixed for i in range(0, 40, 3)}
+    assert given_positions(moved(survey, plain | along).photographs).names == tuple(along)
+    hovering = {name_of(i): {**fixed, "longitude_deg": -2.75} for i in range(8)}
+    given = given_positions(moved(survey, plain | hovering).photographs)
+    assert given.names == tuple(map(name_of, range(8, 40))), "one place says nothing of scale and heading"
+
+
 def test_the_ellipsoid_is_one_zero_whoever_names_it():
     flight = fly()
     sources = ("EXIF, RTK fixed", "EXIF, RTK float", "XMP", "gps.csv")

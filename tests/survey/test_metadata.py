@@ -8,6 +8,7 @@ from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, su
 from PIL.ExifTags import GPS, Base
 
 from tidefield.data.exif import Exif
+from tidefield.survey.georeference.gps_alignment import given_positions
 from tidefield.survey.io.lens_prior import lens_prior
 from tidefield.survey.io.metadata import PhotographMetadata, read_xmp
 from tidefield.survey.io.photographs import read_survey
@@ -124,18 +125,33 @@ def test_a_position_that_was_corrected_in_exif_replaces_the_drones_own_in_xmp(tm
     assert math.isnan(read.vertical_m), "the accuracy is that of the drone's fix"
 
 
-@pytest.mark.parametrize(("far", "corrected"), [(1, False), (3, True)])
-def test_a_correction_of_a_good_share_of_the_positions_is_one_of_all(tmp_path, far, corrected):
+@pytest.mark.parametrize(("count", "far", "corrected"), [(12, 1, False), (12, 3, True), (20, 2, True)])
+def test_a_correction_of_a_good_share_of_the_positions_is_one_of_all(tmp_path, count, far, corrected):
     """PPK moves some positions little, which are as little the drone's own as the others."""
-    for k in range(12):
+    for k in range(count):
         up_m = 0.9 if k < far else 0.2
         packet = xmp({"AbsoluteAltitude": "+112.30", **HERE, **RTK_FLOAT})
         photograph(tmp_path / f"{k:02d}.jpg", table=exif(place=BRIGHTON, height_m=112.30 + up_m), packet=packet)
     positions = [p.position for p in read_survey(tmp_path).photographs]
     own = [p for p in positions if p is not None and p.datum == "ellipsoid"]
-    assert len(own) == (0 if corrected else 12 - far)
+    assert len(own) == (0 if corrected else count - far)
     heights = [p.height_m for p in positions if p is not None]
-    assert heights == pytest.approx([113.2] * far + ([112.5] if corrected else [112.3]) * (12 - far))
+    assert heights == pytest.approx([113.2] * far + ([112.5] if corrected else [112.3]) * (count - far))
+
+
+def test_a_flight_that_was_corrected_leaves_another_the_drones_own_positions(tmp_path):
+    for k in range(20):
+        height_m = 67.3 if k < 6 else 112.307  # EXIF repeats XMP to within rounding
+        packet = xmp({"AbsoluteAltitude": "+112.30", **HERE, **RTK_FLOAT})
+        photograph(tmp_path / f"{k:02d}.jpg", table=exif(place=BRIGHTON, height_m=height_m), packet=packet)
+    photographs = read_survey(tmp_path).photographs
+    positions = [p.position for p in photographs if p.position is not None]
+    assert [p.source for p in positions] == ["EXIF"] * 6 + ["EXIF, RTK float"] * 14
+    assert [p.datum for p in positions] == ["unknown"] * 6 + ["ellipsoid"] * 14
+    assert [p.vertical_m for p in positions[6:]] == [2.5] * 14
+    given = given_positions(photographs)
+    assert len(given.names) == 14
+    assert "6 of 20 positions are not used: their heights are over" in given.notes[0]
 
 
 @pytest.mark.parametrize(

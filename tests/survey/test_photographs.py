@@ -226,6 +226,58 @@ def test_photographs_in_the_folder_of_the_masks_are_none_of_them(tmp_path: Path)
     assert not any("belong to no photograph" in remark for remark in survey.remarks)
 
 
+@pytest.mark.parametrize(
+    ("folder", "masks"),
+    [("images", "{}"), ("{}/images", "."), ("images", "../here"), ("{}/link/images", "{}"), ("images", "link")],
+)
+def test_the_folder_of_the_masks_holds_photographs_by_whatever_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, masks: str
+):
+    here = tmp_path / "here"
+    survey_folder(here / "images")
+    mask(here / "DJI_0000.JPG.png")
+    (here / "link").symlink_to(here)
+    monkeypatch.chdir(here)
+    survey = read_survey(Path(folder.format(here)), masks=Path(masks.format(here)))
+    assert [p.mask is not None for p in survey.photographs] == [True, False, False, False]
+    assert len(survey.remarks) == 1
+    assert "1 of the photographs have masks" in survey.remarks[0]
+
+
+@pytest.mark.parametrize(("folder", "masks"), [(".", "{}/masks"), ("{}", "masks"), ("../here", "masks")])
+def test_masks_in_the_folder_of_the_photographs_are_none_by_whatever_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, masks: str
+):
+    here = survey_folder(tmp_path / "here")
+    for k in range(4):
+        mask(here / "masks" / f"DJI_{k:04d}.JPG.png")
+    mask(here / "masks" / "DJI_0009.JPG.png")
+    monkeypatch.chdir(here)
+    survey = read_survey(Path(folder.format(here)), masks=Path(masks.format(here)))
+    assert [p.mask is not None for p in survey.photographs] == [True] * 4
+    assert len(survey.remarks) == 1
+    assert "1 of the 5 pictures" in survey.remarks[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="there are no users")
+def test_a_folder_next_to_the_masks_that_may_not_be_read_is_no_error(tmp_path: Path):
+    survey_folder(tmp_path / "card")
+    mask(tmp_path / "disk" / "DJI_0000.JPG.png")
+    (tmp_path / "disk" / "lost+found").mkdir(mode=0)
+    user, parents = os.geteuid(), {p: p.stat().st_mode for p in tmp_path.parents if "pytest" in str(p)}
+    for path in (tmp_path, *parents) if user == 0 else ():
+        path.chmod(0o755)
+    read_survey(tmp_path / "card")  # which imports what only root may read
+    os.seteuid(user or 54321)  # root may read everything
+    try:
+        survey = read_survey(tmp_path / "card", masks=tmp_path / "disk")
+    finally:
+        os.seteuid(user)
+        for path, mode in parents.items():
+            path.chmod(mode)
+    assert sum(p.mask is not None for p in survey.photographs) == 1
+
+
 def test_grey_photographs_of_a_camera_in_a_folder_called_masks_are_photographs(tmp_path: Path):
     survey_folder(tmp_path, 3)
     for k in range(3):

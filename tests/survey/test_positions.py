@@ -135,6 +135,74 @@ def test_a_table_may_name_the_system_of_its_degrees(tmp_path, name, system):
     assert (position.latitude_deg, position.longitude_deg, position.height_m) == (54.5, -2.75, 344)
 
 
+@pytest.mark.parametrize("titles", ["name,lat,lon,alt", "name;lat;lon;alt", "name\tlat\tlon\talt"])
+@pytest.mark.parametrize(
+    ("system", "place", "datum"),
+    [
+        ("EPSG:4979", (54.5, -2.75), "ellipsoid"),
+        ("EPSG:4326+5773", (54.5, -2.75), "mean sea level"),
+        ("EPSG:4277", (54.500120761, -2.751418468), "unknown"),  # OSGB36, some 90 m off here
+    ],
+)
+def test_degrees_and_heights_of_a_table_are_those_of_its_system(tmp_path, titles, system, place, datum):
+    row = titles.replace("name", "DJI_0001.JPG").replace("lat", "54.5").replace("lon", "-2.75").replace("alt", "344")
+    found, _ = read_gps_file(written(tmp_path, f"{system}\n{titles}\n{row}\n"), NAMES)
+    position = found["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg) == pytest.approx(place, abs=1e-8)
+    assert (position.height_m, position.datum) == (344, datum)
+
+
+def test_unit_and_zero_of_heights_in_a_title_go_before_those_of_the_system(tmp_path):
+    for title, height_m, datum in (
+        ("alt", 1000 * 1200 / 3937, "mean sea level"),
+        ("alt [m]", 1000, "mean sea level"),
+        ("ellipsoidal height (ft)", 304.8, "ellipsoid"),
+    ):
+        text = f"EPSG:4326+6360\nname,lat,lon,{title}\nDJI_0001.JPG,54.5,-2.75,1000\n"
+        position = read_gps_file(written(tmp_path, text), NAMES)[0]["DJI_0001.JPG"].position
+        assert position.height_m == pytest.approx(height_m, rel=1e-9), title
+        assert position.datum == datum
+
+
+@pytest.mark.parametrize(
+    "titles",
+    [
+        "name\tlon\tlat\talt\tyaw\tpitch\troll\thacc\tvacc",
+        "image_name\tx\ty\tz\tyaw (degrees)\tpitch (degrees)\troll (degrees)\thorz accuracy (m)\tvert accuracy (m)",
+        "# name\tlon\tlat\talt\tyaw\tpitch\troll\thacc\tvacc",
+    ],
+)
+def test_titles_change_nothing_of_a_geo_txt_in_tabs(tmp_path, titles):
+    rows = "DJI_0001.JPG\t-2.75\t54.5\t344\t90\t5\t1\t0.02\t0.04\nDJI_0002.JPG\t-2.75\t54.5\t344\t0\t0\t0\t0.02\t0.04\n"
+    bare, _ = read_gps_file(written(tmp_path, f"EPSG:4979\n{rows}", "geo.txt"), NAMES)
+    titled, _ = read_gps_file(written(tmp_path, f"EPSG:4979\n{titles}\n{rows}", "geo.txt"), NAMES)
+    assert titled == bare
+    assert titled["DJI_0001.JPG"].gimbal_deg == (90, -85, 1)
+    assert titled["100MEDIA/DJI_0002.JPG"].gimbal_deg is None
+
+
+@pytest.mark.parametrize("system", ["", "EPSG:4326\n"])
+def test_angles_of_other_tables_are_not_read(tmp_path, system):
+    text = f"{system}name,lat,lon,alt,yaw,pitch,roll\nDJI_0001.JPG,54.5,-2.75,344,90,-90,\n"
+    found, _ = read_gps_file(written(tmp_path, text), NAMES)
+    assert found["DJI_0001.JPG"].gimbal_deg is None
+
+
+@pytest.mark.parametrize(
+    "rows", ["EPSG:4326\nDJI_0001.JPG -2.75 54.5\n", "name,lat,lon,alt\nDJI_0001.JPG,54.5,-2.75,\n"]
+)
+def test_a_line_may_be_there_twice(tmp_path, rows):
+    found, _ = read_gps_file(written(tmp_path, rows + rows.splitlines()[1], "geo.txt"), NAMES)
+    assert list(found) == ["DJI_0001.JPG"]
+
+
+@pytest.mark.parametrize("titles", ["name,x,y,z", "name,easting,northing,height"])
+def test_a_table_in_metres_is_to_be_separated_as_a_geo_txt_is(tmp_path, titles):
+    text = f"EPSG:32630\n{titles}\nDJI_0001.JPG,530000,5600000,40\n"
+    with pytest.raises(SurveyError, match=r"names none of the photographs: .*in rows separated by spaces or tabs"):
+        read_gps_file(written(tmp_path, text), NAMES)
+
+
 @pytest.mark.parametrize("name", ["geo.txt", "positions.csv"])
 @pytest.mark.parametrize("titles", ["#image\tx\ty\tz", "# image,lat,lon,z"])
 def test_titles_below_the_system_of_a_geo_txt_are_a_comment(tmp_path, name, titles):

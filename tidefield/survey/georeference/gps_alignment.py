@@ -22,9 +22,11 @@ DIFFERENTIAL_M = 0.3
 FEWEST_DIFFERENTIAL = 8
 """Positions of differential receivers that are enough to go by."""
 _LEAST_BREADTH = 0.25
-"""Differential positions are as broad as this share of all, or they are not enough."""
+"""Differential positions are as long and as broad as this share of all, or they are not enough."""
 _NOMINAL_M = 3.0
 """Standard deviation assumed for a receiver that states none: a good fix, so that only gross errors are rejected."""
+_NARROW_M = 3 * _NOMINAL_M
+"""Positions on one line may be as broad as this by their receivers' errors alone."""
 _LEAST_M = 0.01
 """Smallest standard deviation, which keeps the weights finite."""
 _MAX_TILT_RAD = math.radians(1.0)
@@ -123,28 +125,29 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
 def _of_one_zero(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[Photograph, Position]]:
     """Select positions whose heights have one zero: that of most, or of a differential receiver that saw the survey.
 
-    A few differential positions at one place or on one line say less of the model's tilt than many others.
+    A few differential positions at one place or on one line say less of the model's tilt than many others, unless these
+    are on one line, too.
     """
     by_zero = defaultdict(list)
     for pair in located:
         by_zero[_zero(pair[1])].append(pair)
-    least_m = _LEAST_BREADTH * _breadth_m([position for _, position in located])
+    across_m, along_m = _breadths_m([position for _, position in located])
+    least_m = _LEAST_BREADTH * np.array([across_m if across_m > _NARROW_M else 0.0, along_m])
 
     def worth(own: Sequence[tuple[Photograph, Position]]) -> tuple[bool, int]:
         accurate = [p for _, p in own if p.horizontal_m < DIFFERENTIAL_M and p.vertical_m < DIFFERENTIAL_M]
-        return len(accurate) >= FEWEST_DIFFERENTIAL and _breadth_m(accurate) >= least_m, len(own)
+        return len(accurate) >= FEWEST_DIFFERENTIAL and bool((_breadths_m(accurate) >= least_m).all()), len(own)
 
     return max(by_zero.values(), key=worth, default=[])
 
 
-def _breadth_m(positions: Sequence[Position]) -> float:
-    """Deviation of positions across the line that they lie along."""
+def _breadths_m(positions: Sequence[Position]) -> Float64[np.ndarray, " 2"]:
+    """Standard deviations of positions across the line that they lie along, and along it."""
     if len(positions) < 2:
-        return 0.0
+        return np.zeros(2)
     degrees = np.array([(p.longitude_deg, p.latitude_deg) for p in positions])
     degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180
-    variance = np.linalg.eigvalsh(np.cov((degrees * metres_per_degree(degrees[0, 1])).T))[0]
-    return math.sqrt(max(0.0, float(variance)))
+    return np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(np.cov((degrees * metres_per_degree(degrees[0, 1])).T))))
 
 
 def _zero(position: Position) -> str:

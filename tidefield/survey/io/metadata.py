@@ -18,8 +18,10 @@ from tidefield.survey.survey import Position, VerticalDatum
 _XMP_TAG = 700
 # https://www.easymanua.ls/dji/mavic-3m/manual?p=89: 0 no position, 16 single point, 32 to 49 float, 50 fixed.
 _RTK_SINGLE, _RTK_FLOAT, _RTK_FIXED = 16, 32, 50
-# What a drone writes into EXIF and into XMP agrees within rounding (1 cm in brighton_beach and turin_lot).
-_CORRECTED_M = 0.5
+CORRECTED_M = 0.5
+"""A position in EXIF that is farther from that in XMP was written after the flight, by PPK for example."""
+ROUNDING_M = 0.03
+"""What a drone writes into EXIF and into XMP differs by less: by 1 cm in brighton_beach and turin_lot."""
 _LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # the Dead Sea, and Mount Everest
 # Pix4D's namespace counts a camera's pitch from straight down, the others from the horizon (as opendm/photo.py of
 # OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its pitch alone.
@@ -90,17 +92,17 @@ class PhotographMetadata:
         return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
 
     @property
-    def is_corrected(self) -> bool:
-        """Whether EXIF's position was written after the flight, by PPK for example: it is far from the drone's own."""
+    def correction_m(self) -> float:
+        """How far EXIF's position is from the drone's own in XMP, in plan or in height; 0 where either is missing."""
         (latitude, longitude), own = self._degrees_of_exif, self._own_degrees
         if not math.isfinite(latitude + longitude):
-            return False
+            return 0.0
         east, north = metres_per_degree(latitude)
         turned = (longitude - own[1] + 180) % 360 - 180
-        own_m, height_m = self.xmp_number("AbsoluteAltitude"), _exif_height_m(self)
-        return math.hypot(north * (latitude - own[0]), east * turned) > _CORRECTED_M or (
-            abs(height_m - own_m) > _CORRECTED_M and _is_plausible(height_m, own_m)
-        )
+        plan_m = math.hypot(north * (latitude - own[0]), east * turned)
+        height_m, own_m = _exif_height_m(self), self.xmp_number("AbsoluteAltitude")
+        up_m = abs(height_m - own_m) if _is_plausible(height_m, own_m) else 0.0
+        return max(up_m, plan_m if math.isfinite(plan_m) else 0.0)
 
     @property
     def _degrees_of_exif(self) -> tuple[float, float]:
@@ -233,7 +235,7 @@ def _height_reference(metadata: PhotographMetadata) -> object:
 
 def _is_plausible(height_m: float, own_m: float) -> bool:
     """Whether a height of EXIF is one, and not the drone's own without its sign."""
-    return _LOWEST_M < height_m < _HIGHEST_M and (own_m >= 0 or abs(height_m + own_m) > _CORRECTED_M)
+    return _LOWEST_M < height_m < _HIGHEST_M and (own_m >= 0 or abs(height_m + own_m) > CORRECTED_M)
 
 
 def _height(metadata: PhotographMetadata, rtk: float, corrected: bool) -> tuple[float, VerticalDatum]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -28,7 +28,7 @@ from tidefield.survey.io.image_decoding import (
     upright_size,
 )
 from tidefield.survey.io.lens_prior import lens_prior
-from tidefield.survey.io.metadata import PhotographMetadata, read_metadata
+from tidefield.survey.io.metadata import CORRECTED_M, ROUNDING_M, PhotographMetadata, read_metadata
 from tidefield.survey.io.positions import locate_photographs
 from tidefield.survey.io.text_files import find_file, normalise_name
 from tidefield.survey.survey import Photograph, Survey
@@ -79,13 +79,9 @@ def read_survey(
         SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
             positions or the given ground control cannot be parsed.
     """
-    paths, about_files = _list_photographs(folder)
-    mask_of, remarks = _find_masks(folder, paths, masks)
+    listed, about_files = _list_photographs(folder)
+    paths, mask_of, remarks = _find_masks(folder, listed, masks)
     remarks += about_files
-    home = masks or folder / MASKS
-    if mask_of:  # they are no photographs
-        own, apart = set(mask_of.values()), not folder.is_relative_to(home)
-        paths = [path for path in paths if path not in own and not (apart and path.is_relative_to(home))]
     _refuse_collisions([path.relative_to(folder).as_posix() for path in paths])
     _refuse_unreadable([path for path in paths if path.suffix.casefold() in HEIFS])
     names = [_name(path.relative_to(folder)) for path in paths]
@@ -136,12 +132,16 @@ class _Read:
 def _with_positions(read: Sequence[_Read]) -> list[Photograph]:
     """The photographs with their positions.
 
-    A correction such as PPK writes all positions of a survey into EXIF, also where it moves them little: all are taken
-    from there if a good share of them is far from the drone's own.
+    A correction such as PPK writes all positions of a flight into EXIF, also where it moves them little: if a good
+    share of them is far from the drone's own, each that is not the drone's own is taken from there.
     """
-    corrected = sum(one.metadata.is_corrected for one in read)
-    every = corrected > _CORRECTED_SHARE * len(read)
-    return [replace(one.photograph, position=one.metadata.position(every or one.metadata.is_corrected)) for one in read]
+    moved_m = [one.metadata.correction_m for one in read]
+    far = sum(length_m > CORRECTED_M for length_m in moved_m)
+    least_m = ROUNDING_M if far >= _CORRECTED_SHARE * len(read) else CORRECTED_M
+    return [
+        replace(one.photograph, position=one.metadata.position(length_m > least_m))
+        for one, length_m in zip(read, moved_m, strict=True)
+    ]
 
 
 def control_remark(error: SurveyError) -> str:
@@ -171,7 +171,7 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
         if not folder.is_dir():
             found = "a file" if folder.exists() else "nothing"
             raise SurveyError(f"{folder} is {found}: expected a folder of photographs; give one")
-        paths = sorted(_walk(folder))
+        paths = sorted(_walk(folder, _raise))
     except OSError as error:
         raise SurveyError(
             f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one"
@@ -212,22 +212,27 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
     raise SurveyError(f"{folder} has {found}: expected JPEG, PNG or TIFF files; give their folder, or convert them")
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    """All files in a folder and its sub-folders, and the sub-folders that are links, which are not followed."""
+def _raise(error: OSError) -> None:
+    raise error
 
-    def refuse(error: OSError) -> None:
-        raise error
 
-    for parent, folders, files in os.walk(folder, onerror=refuse):
+def _walk(folder: Path, on_error: Callable[[OSError], None] | None = None) -> Iterator[Path]:
+    """All files in a folder and its sub-folders, and the sub-folders that are links, which are not followed.
+
+    Args:
+        on_error: is called where a folder cannot be read; None skips it.
+    """
+    for parent, folders, files in os.walk(folder, onerror=on_error):
         folders[:] = [
             name
             for name in folders
             if not name.casefold().startswith(_FOREIGN_FOLDERS)
-            and not any(Path(parent, name, part).exists() for part in _SCENE_PARTS)
+            # Unlike Path.exists, this raises no error where a folder may not be entered.
+            and not any(os.path.exists(os.path.join(parent, name, part)) for part in _SCENE_PARTS)
         ]
         yield from (Path(parent, name) for name in files if not name.startswith("."))
         # Linked masks are found by their names.
-        links = (Path(parent, name) for name in folders if Path(parent, name).is_symlink())
+        links = (Path(parent, name) for name in folders if os.path.islink(os.path.join(parent, name)))
         yield from (path for path in links if path != folder / MASKS)
 
 
@@ -257,47 +262,59 @@ def _name(path: Path) -> str:
     return (path.with_suffix(".jpg") if path.suffix.casefold() in HEIFS else path).as_posix()
 
 
-def _find_masks(folder: Path, photographs: Sequence[Path], masks: Path | None) -> tuple[dict[Path, Path], list[str]]:
+def _find_masks(
+    folder: Path, listed: Sequence[Path], masks: Path | None
+) -> tuple[Sequence[Path], dict[Path, Path], list[str]]:
     """Find the masks of photographs, and say what is to be said of them.
+
+    Returns:
+        Those of the listed files that are photographs, the masks by photograph, and remarks.
 
     Raises:
         SurveyError: there is no mask where they were asked for, or none of those that there are has the name of a
             photograph.
     """
     home = masks or folder / MASKS
-    names = mask_names(path.relative_to(folder) for path in photographs)
-    candidates = {path: [home / name for name in names[path.relative_to(folder)]] for path in photographs}
+    names = mask_names(path.relative_to(folder) for path in listed)
+    candidates = {path: [home / name for name in names[path.relative_to(folder)]] for path in listed}
     masked = {path: next(filter(Path.is_file, own), None) for path, own in candidates.items()}
     found = {path: mask for path, mask in masked.items() if mask is not None}
-    taken = set(found.values())
-    count = len([path for path in photographs if path not in taken])
+    # One of the two folders may hold the other, by whatever path each is given.
+    root, masks_root = folder.resolve(), home.resolve()
+    places = {path: root / path.relative_to(folder) for path in listed}
+    taken = {masks_root / mask.relative_to(home) for mask in found.values()}
     # Where the masks' folder holds that of the photographs, they are none of its masks.
-    others = {*photographs} - taken if folder.is_relative_to(home) else set()
-    there = sorted(_walk(home)) if home.is_dir() else []
+    apart = not root.is_relative_to(masks_root)
+    photographs = [
+        path
+        for path, place in places.items()
+        if place not in taken and not (apart and place.is_relative_to(masks_root))
+    ]
+    others = {places[path] for path in photographs}
+    there = sorted(_walk(masks_root)) if home.is_dir() else []
     pictures = [path for path in there if path.suffix.casefold() in _PHOTOGRAPHS and path not in others]
-    strange = [] if home == folder else [path for path in pictures if path not in taken]
+    strange = [] if masks_root == root else [path for path in pictures if path not in taken]
+    named = list_names([path.relative_to(masks_root).as_posix() for path in strange])
     if not found and (masks or 2 * sum(map(_is_mask, strange)) > len(strange)):
-        inside = {*strange}
-        outside = [path for path in photographs if path not in inside] or photographs
-        example = candidates[outside[0]][0].relative_to(home).as_posix()
-        listed = f" (found: {list_names([path.relative_to(home).as_posix() for path in strange])})" if strange else ""
+        example = candidates[(photographs or listed)[0]][0].relative_to(home).as_posix()
+        instead = f" (found: {named})" if strange else ""
         todo = "give the folder of the masks, or leave --masks out" if masks else "rename them, or move the folder away"
         raise SurveyError(
-            f"{home} has no mask of any photograph in {folder}{listed}: expected a PNG called like its photograph, "
+            f"{home} has no mask of any photograph in {folder}{instead}: expected a PNG called like its photograph, "
             f"such as {example}, that is black where the photograph is not to be used; {todo}"
         )
     if not found:
-        return found, []
+        return listed, found, []
     remarks = [f"{home} has masks of {len(found)} photographs: what is black there is not used."]
     if masks:
         some = f"{len(found)} of the photographs have masks in {masks}, the others are used whole."
-        remarks = [some] if len(found) < count else []
+        remarks = [some] if len(found) < len(photographs) else []
     if strange:
         remarks.append(
             f"{len(strange)} of the {len(pictures)} pictures in {home} belong to no photograph and are not used "
-            f"({list_names([path.relative_to(home).as_posix() for path in strange])}): rename them, or move them away."
+            f"({named}): rename them, or move them away."
         )
-    return found, remarks
+    return photographs, found, remarks
 
 
 def _is_mask(path: Path) -> bool:

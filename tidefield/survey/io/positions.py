@@ -9,10 +9,11 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import (
@@ -46,10 +47,20 @@ _COLUMNS = {
     "latitude": ("latitude", "lat", "y", "gpslatitude", "latitudedeg"),
     "longitude": ("longitude", "lon", "lng", "long", "x", "gpslongitude", "longitudedeg"),
     "height": ("height", "altitude", "alt", "elevation", "ele", "z", "h", "gpsheight", "gpsaltitude", "gpsalt"),
-    "horizontal": ("accuracyhorizontal", "horizontalaccuracy", "hacc", "accuracyxy", "xyaccuracy", "sigmaxy", "stdxy"),
-    "vertical": ("accuracyvertical", "verticalaccuracy", "vacc", "accuracyz", "zaccuracy", "sigmaz", "stdz"),
+    "horizontal": (
+        *("accuracyhorizontal", "horizontalaccuracy", "horzaccuracy", "hacc"),
+        *("accuracyxy", "xyaccuracy", "sigmaxy", "stdxy"),
+    ),
+    "vertical": (
+        *("accuracyvertical", "verticalaccuracy", "vertaccuracy", "vacc"),
+        *("accuracyz", "zaccuracy", "sigmaz", "stdz"),
+    ),
+    "yaw": ("yaw",),
+    "pitch": ("pitch",),
+    "roll": ("roll",),
 }
 _LENGTHS = ("height", "horizontal", "vertical")
+_ANGLES = ("yaw", "pitch", "roll")
 _ZEROS: dict[str, VerticalDatum] = {
     **dict.fromkeys(("ellipsoid", "ellipsoidal", "ellips", "ell", "hae"), "ellipsoid"),
     **dict.fromkeys(("sea", "msl", "amsl", "orthometric", "navd", "egm"), "mean sea level"),
@@ -62,8 +73,7 @@ _OF_DEGREES = ("deg", "degree", "degrees", "decimal", "dd")
 _OF_LENGTHS = (*_ZEROS, *_UNITS_M, "us", "survey", "wgs", "above", "over", "mean", "level")
 _BESIDE = {
     "name": ("name",),
-    "latitude": _OF_DEGREES,
-    "longitude": _OF_DEGREES,
+    **dict.fromkeys(("latitude", "longitude", *_ANGLES), _OF_DEGREES),
     **dict.fromkeys(_LENGTHS, _OF_LENGTHS),
 }
 _MAX_TITLE = 100  # longer is no title; a search for units in megabytes of brackets would take hours
@@ -72,14 +82,18 @@ _EXPECTED_TABLE = (
     "expected a header such as image_name,lat,lon,gps_height and one line per photograph, in degrees (WGS 84) and "
     "metres, separated by commas, semicolons or tabs"
 )
-# geo.txt after the name: x y [z [yaw pitch roll [horizontal accuracy, vertical accuracy]]]
-# (https://github.com/OpenDroneMap/docs/blob/publish/source/geo.rst)
-_GEO_ANGLES, _GEO_ACCURACIES = 3, 6
+# geo.txt after the name, of which two numbers must be there
+# (https://github.com/OpenDroneMap/docs/blob/publish/source/geo.rst).
+_GEO = ("longitude", "latitude", "height", *_ANGLES, "horizontal", "vertical")
 # A position this far from the median of the others is wrong: no single flight is so long.
 _FAR_M = 10_000.0
 _FAR_TIMES_MEDIAN = 20.0
 # A larger share of distant photographs is a second site, not an error of the receiver.
 _MAX_OUTLIERS = 0.1
+
+
+_Row: TypeAlias = tuple[str, str, list[float]]
+"""A photograph, the place in the file for messages, and the numbers of `_GEO`, NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +180,12 @@ def read_gps_file(path: Path, names: PhotographNames) -> tuple[dict[str, GpsReco
     if header is None and not is_geo and path.suffix.casefold() == ".csv":
         start = next((line.strip() for line in lines if line.strip()), "nothing")
         raise SurveyError(f"{path} begins with {start[:80]!r}: {_EXPECTED_TABLE}; write one")
-    found, remarks = _read_geo(path, names) if header is None else _read_table(path, lines, header, names)
+    found, remarks = _read_geo(path, names) if header is None else _read_table(path, lines, header, names, system)
     if not found:
+        rows = ", in rows separated by spaces or tabs" if header is None else ""
         raise SurveyError(
-            f"{path} names none of the photographs: expected their file names, with or without suffix; correct them, "
-            "or remove the file"
+            f"{path} names none of the photographs: expected their file names, with or without suffix{rows}; correct "
+            "them, or remove the file"
         )
     return found, remarks
 
@@ -206,13 +221,17 @@ def _unit_m(title: str) -> float:
 
 
 def _read_table(
-    path: Path, lines: Sequence[str], header: int, names: PhotographNames
+    path: Path, lines: Sequence[str], header: int, names: PhotographNames, system: CRS | None
 ) -> tuple[dict[str, GpsRecord], list[str]]:
     columns, separator = _columns(lines[header])
+    if system is None or separator != "\t":  # then it is no geo.txt, and its pitch may count from the horizon
+        columns = {key: column for key, column in columns.items() if key not in _ANGLES}
+    system = system or parse_crs(WGS84)
     titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
     above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
-    zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), "unknown"]
-    found: dict[str, GpsRecord] = {}
+    zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), _datum(system)]
+    height_unit_m = 1.0 if {*above} & {*_UNITS_M} else metres_per_height(system)
+    read: list[_Row] = []
     rows: list[list[str]] = []
     for number, row in _rows(path, lines, header, separator):
         if not any(cell.strip() for cell in row) or row[0].startswith("#"):
@@ -239,9 +258,10 @@ def _read_table(
             raise SurveyError(
                 f"{where} gives {degrees}: {_EXPECTED_TABLE}; metres belong under the EPSG code of a geo.txt"
             )
-        height, across, up = (numbers.get(key, math.nan) for key in ("height", "horizontal", "vertical"))
-        position = Position(*degrees, height, *_positive(across, up), zeros[0], path.name)
-        _add(found, name, GpsRecord(position), where)
+        values = [numbers.get(key, math.nan) for key in _GEO]
+        values[2] *= height_unit_m
+        read.append((name, where, values))
+    found = _records(path, read, system, zeros[0])
     unread = {*range(len(titles))} - {index for index, _ in columns.values()}
     numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
     if "height" in columns or not numeric:
@@ -276,41 +296,47 @@ def _rows(path: Path, lines: Sequence[str], header: int, separator: str) -> Iter
 
 def _read_geo(path: Path, names: PhotographNames) -> tuple[dict[str, GpsRecord], list[str]]:
     crs, lines = read_list(path)
-    read: list[tuple[str, str, list[float]]] = []
+    system = parse_crs(crs)
+    read: list[_Row] = []
     for where, line in lines:
         name, rest = names.split(line)
         if name is None:
             continue
-        values = leading_numbers(rest[: _GEO_ACCURACIES + 2])
+        values = leading_numbers(rest[: len(_GEO)])
         if len(values) < 2 or not all(map(math.isfinite, values[:2])):
             raise SurveyError(f"{where} is {line[:80]!r}: expected image_name x y [z]; correct it")
+        values += [math.nan] * (len(_GEO) - len(values))
+        values[2] *= metres_per_height(system)
         read.append((name, where, values))
-    if not read:
-        return {}, []
-    system = parse_crs(crs)
-    to_degrees = Transformer.from_crs(horizontal(system), WGS84, always_xy=True)
-    degrees = np.column_stack(to_degrees.transform(*np.array([values[:2] for _, _, values in read]).T))
-    datum = "mean sea level" if system.is_compound else "ellipsoid" if len(system.axis_info) == 3 else "unknown"
-    found: dict[str, GpsRecord] = {}
-    for (name, where, values), (longitude, latitude) in zip(read, degrees.tolist(), strict=True):
-        if not math.isfinite(latitude):
-            raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {crs!r}; correct either")
-        height = values[2] * metres_per_height(system) if len(values) > 2 else math.nan
-        gimbal = None
-        if len(values) >= _GEO_ACCURACIES and any(values[_GEO_ANGLES:_GEO_ACCURACIES]):
-            yaw, pitch, roll = values[_GEO_ANGLES:_GEO_ACCURACIES]
-            gimbal = yaw, pitch - 90.0, roll  # ODM counts the pitch from straight down
-        accuracies = values[_GEO_ACCURACIES:] if len(values) == _GEO_ACCURACIES + 2 else [math.nan, math.nan]
-        position = Position(latitude, longitude, height, *_positive(*accuracies), datum, path.name)
-        _add(found, name, GpsRecord(position, gimbal), where)
+    found = _records(path, read, system, _datum(system))
     has_heights = any(math.isfinite(record.position.height_m) for record in found.values())
     return found, unit_remarks(path, system) if has_heights else []
 
 
-def _add(found: dict[str, GpsRecord], name: str, record: GpsRecord, where: str) -> None:
-    if name in found and found[name] != record:
-        raise SurveyError(f"{where} gives {name} a second position: expected one line per photograph; remove one")
-    found[name] = record
+def _datum(system: CRS) -> VerticalDatum:
+    return "mean sea level" if system.is_compound else "ellipsoid" if len(system.axis_info) == 3 else "unknown"
+
+
+def _records(path: Path, read: Sequence[_Row], system: CRS, datum: VerticalDatum) -> dict[str, GpsRecord]:
+    """Records by name of the photograph, of rows in a system, with heights in metres."""
+    if not read:
+        return {}
+    to_degrees = Transformer.from_crs(horizontal(system), WGS84, always_xy=True)
+    degrees = np.column_stack(to_degrees.transform(*np.array([values[:2] for _, _, values in read]).T))
+    given: dict[str, list[float]] = {}
+    found: dict[str, GpsRecord] = {}
+    for (name, where, values), (longitude, latitude) in zip(read, degrees.tolist(), strict=True):
+        if not math.isfinite(latitude):
+            raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {system.srs!r}; correct either")
+        if not np.array_equal(given.setdefault(name, values), values, equal_nan=True):
+            raise SurveyError(f"{where} gives {name} a second position: expected one line per photograph; remove one")
+        height, yaw, pitch, roll, across, up = values[2:]
+        # ODM counts the pitch from straight down; three zeros stand for angles that are not available.
+        is_turned = math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll))
+        gimbal = (yaw, pitch - 90.0, roll) if is_turned else None
+        position = Position(latitude, longitude, height, *_positive(across, up), datum, path.name)
+        found[name] = GpsRecord(position, gimbal)
+    return found
 
 
 def _positive(horizontal_m: float, vertical_m: float) -> tuple[float, float]:
