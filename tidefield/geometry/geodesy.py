@@ -153,11 +153,11 @@ class LocalFrame:
 
     @cached_property
     def _projection(self) -> Transformer:
-        return Transformer.from_crs(self._base, self._datum, always_xy=True)
+        return _transformer(self._base, self._datum)
 
     @cached_property
     def _wgs84(self) -> Transformer:
-        return Transformer.from_crs(horizontal(self._crs), WGS84, always_xy=True)
+        return _transformer(horizontal(self._crs), parse_crs(WGS84))
 
     @cached_property
     def _degrees(self) -> Float64[np.ndarray, " 3"]:
@@ -184,11 +184,11 @@ class LocalFrame:
         points = coordinates * np.array([1.0, 1.0, metres_per_height(system)])
         if datum is not None and datum.to_2d() == self._datum:
             if base.is_projected:
-                points = self._transform(Transformer.from_crs(base, self._datum, always_xy=True), points)
+                points = self._transform(_transformer(base, self._datum), points)
         else:
             # By way of the projected system as given, because its definition may hold its own shift to WGS 84.
             height_m = points[:, 2].copy()
-            shift = Transformer.from_crs(horizontal(system), horizontal(self._crs), always_xy=True)
+            shift = _transformer(horizontal(system), horizontal(self._crs))
             points = self._transform(self._projection, self._transform(shift, points))
             points[:, 2] = height_m
         return points * self._degrees
@@ -203,6 +203,12 @@ class LocalFrame:
         if not np.isfinite(result).all():
             raise ValueError("the coordinates lie outside what the system can hold")
         return result
+
+
+@lru_cache
+def _transformer(source: CRS, target: CRS) -> Transformer:
+    """The transformation of coordinates, longitude or easting first; PROJ takes milliseconds to find one."""
+    return Transformer.from_crs(source, target, always_xy=True)
 
 
 @lru_cache
