@@ -11,10 +11,10 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 
 def template_environment(*packages: str) -> Environment:
-    """Templates of packages, the first that has one of a name before the others; names of photographs are escaped, and
-    what a template names must be there."""
+    """Templates of packages, the first that has one of a name before the others, and the style that reports share;
+    names of photographs are escaped, and what a template names must be there."""
     return Environment(
-        loader=ChoiceLoader([PackageLoader(package, "templates") for package in packages]),
+        loader=ChoiceLoader([PackageLoader(package, "templates") for package in (*packages, "tidefield")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -11,7 +11,7 @@ from pyproj import CRS, Transformer
 from tidefield.change.clouds import Cloud, compare_clouds, in_system, read_cloud, write_distances, write_surface
 from tidefield.change.inputs import open_pair
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, open_surface
+from tidefield.change.surfaces import ChangeError, open_surface, other_zeros
 
 US_FOOT = 1200 / 3937
 EAST, NORTH = 1_830_000.0, 646_000.0
@@ -109,9 +109,18 @@ def test_a_projection_of_its_own_is_not_taken_for_degrees(tmp_path: Path):
     assert cloud.crs is None
     assert np.abs(cloud.xyz - US_FOOT * xyz).max() < 0.001
     assert "projected system of its own" in cloud.remarks[0]
-    assert "multiplied by 0.304801 to be metres" in cloud.remarks[0]
+    assert "multiplied by 0.304801 to be metres" in cloud.remarks[1]
     with pytest.raises(ChangeError, match="degrees"):
         read_cloud(write_old_cloud(tmp_path / "b.las", xyz * [1e-4, 1e-4, 1], {1024: 2, 2048: 4269}))
+
+
+@pytest.mark.parametrize("keys", [{3076: 9003}, {1024: 1, 3076: 9003}])
+def test_a_plan_in_feet_without_a_system_is_remarked(tmp_path: Path, keys: dict[int, int]):
+    xyz = square(np.random.default_rng(0), 100.0) + np.array([980_000.0, 200_000.0, 10.0])
+    cloud = read_cloud(write_old_cloud(tmp_path / "a.las", xyz, keys))
+    assert np.abs(cloud.xyz - [US_FOOT, US_FOOT, 1] * xyz).max() < 0.001
+    assert len(cloud.remarks) == 1
+    assert "a.las are multiplied by 0.304801 to be metres; heights without a unit are taken as" in cloud.remarks[0]
 
 
 def test_a_geocentric_cloud_is_refused(tmp_path: Path):
@@ -183,6 +192,18 @@ def test_clouds_over_different_zeros_are_refused(tmp_path: Path):
     other = write_cloud(tmp_path / "b.laz", "EPSG:25832+5783", xyz)
     with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
         open_pair(one, other, tmp_path)
+
+
+def test_clouds_over_two_ellipsoids_are_remarked_and_refused_without_registration(tmp_path: Path):
+    xyz = square(np.random.default_rng(0), 20.0) + np.array([450_000.0, 5_930_000.0, 2.0])
+    one, other = (
+        write_cloud(tmp_path / f"{name}.laz", CRS(system).to_3d().to_wkt(), xyz)
+        for name, system in (("a", "EPSG:32632"), ("b", "EPSG:25832"))
+    )
+    found = open_pair(one, other, tmp_path)
+    assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in other_zeros(found.earlier, found.later)[0]
+    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
+        open_pair(one, other, tmp_path, registered=False)
 
 
 def test_one_cloud_without_a_system_is_refused():

@@ -1,14 +1,21 @@
 """Plants gained and lost, on pictures and on a built-in flat whose plants are known."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import shapely
+from pyproj import CRS
+from surveys_of_two_dates import NORTH, WEST, write_surface
 
-from tidefield.change.cover import compare_cover
+from tidefield.change.cover import compare_cover, measure_cover
 from tidefield.change.light import light_gains, with_light
+from tidefield.change.measure import measure
+from tidefield.change.page import write_page
 from tidefield.change.regions import Region
-from tidefield.change.surfaces import Grid
+from tidefield.change.surfaces import Grid, open_surface
+from tidefield.change.write import summary
 
 MUD, PLANTS = np.array([125, 112, 92]), np.array([95, 110, 60])
 GRID = Grid(None, 0.0, 30.0, 0.1, 400, 300)
@@ -95,6 +102,73 @@ def test_a_green_film_is_no_plant_and_grass_beside_gravel_is_one():
         classes = compare_cover(shown, shown, np.ones((300, 400), bool), GRID).classes
         assert (classes[disc(10, 15, 4)] == 0).all()
         assert (classes[disc(30, 15, 4)] == 2).all()
+
+
+def test_the_range_has_plants_that_touch_a_larger_film():
+    rng = np.random.default_rng(5)
+    every = np.ones((300, 400), bool)
+    film, plants = disc(12, 15, 8), disc(22, 15, 3)
+    shown = picture(rng, film | plants, rough=plants & ~film)
+    area = compare_cover(shown, shown, every, GRID).areas["all"]["earlier"]
+    assert area.value_m2 == area.low_m2 == 0
+    assert (plants & ~film).sum() * 0.01 < area.high_m2 < (plants | film).sum() * 0.01
+    # The plants stay while a film grows up to them.
+    film, plants = disc(12, 15, 9.5), disc(24, 15, 3)
+    one, two = picture(rng, plants, rough=plants), picture(rng, plants | film, rough=plants)
+    areas = compare_cover(one, two, every, GRID).areas["all"]
+    assert areas["lost"].low_m2 == 0
+    assert areas["later"].low_m2 < np.pi * 9 < areas["later"].high_m2
+
+
+def test_the_range_leaves_out_what_is_smooth_in_a_patch_of_plants():
+    rng = np.random.default_rng(5)
+    film, plants = disc(30, 15, 7), disc(15, 15, 10)
+    shown = picture(rng, film | plants, rough=plants)
+    area = compare_cover(shown, shown, np.ones((300, 400), bool), GRID).areas["all"]["earlier"]
+    assert area.value_m2 > (film | plants).sum() * 0.01
+    assert area.low_m2 < area.value_m2 - 0.5 * (film & ~plants).sum() * 0.01
+
+
+def strip(rng: np.random.Generator, length_m: float, pixel_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A picture 20 m high of mud, 14 m wide films and plants in turns, and where these are."""
+    east, north = (pixel_m * (np.arange(round(length / pixel_m)) + 0.5) for length in (length_m, 20.0))
+    near = np.hypot((east % 40 - 20)[None], north[:, None] - 10) < 7
+    film, plants = near & (east % 80 < 40), near & (east % 80 > 40)
+    leaves = cv2.resize(rng.normal(0, 0.3, (100, round(length_m / 0.2))).astype(np.float32), near.shape[::-1])
+    colour = np.where(near[..., None], PLANTS, MUD) * (1 + np.where(plants, leaves, 0))[..., None]
+    shown = (colour + rng.normal(0, 3, (*near.shape, 3))).clip(0, 255).astype(np.uint8)
+    return shown.transpose(2, 0, 1), film, plants
+
+
+@pytest.mark.parametrize(("length_m", "pixel_m", "finds"), [(1040, 0.1, True), (80, 0.2002, True), (80, 0.4, False)])
+def test_films_are_left_out_where_pixels_show_leaves_however_long_the_survey(
+    tmp_path: Path, length_m: float, pixel_m: float, finds: bool
+):
+    rng = np.random.default_rng(0)
+    shown, film, plants = strip(rng, length_m, pixel_m)
+    path = write_surface(tmp_path / "a.tif", shown, pixel_m)
+    grid = Grid(CRS("EPSG:32630").to_wkt(), WEST, NORTH, 1.0, int(length_m) - 1, 19)
+    found = measure_cover(path, path, grid)
+    assert found.leaves_out_films == found.to_json()["green_films_left_out"] == finds
+    true = (plants.sum() + (0 if finds else film.sum())) * pixel_m**2
+    assert found.areas["all"]["earlier"].value_m2 == pytest.approx(true, rel=0.2)
+
+
+def test_the_page_states_whether_films_and_shallow_water_count(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    paths = [write_surface(tmp_path / f"{k}.tif", rng.normal(0, 0.02, (60, 80)).astype(np.float32)) for k in (0, 1)]
+    change = measure(open_surface(paths[0]), open_surface(paths[1]))
+    shown = picture(rng, disc(30, 15, 5))
+    for cell, finds in ((0.1, True), (0.4, False)):
+        grid = Grid(change.grid.crs, WEST, NORTH, cell, 400, 300)
+        cover = compare_cover(shown, shown, np.ones((300, 400), bool), grid)
+        assert cover.leaves_out_films == finds
+        write_page(change, summary(change, "tidefield change"), tmp_path / "change.html", cover)
+        page = (tmp_path / "change.html").read_text()
+        assert ("such as a film of algae or shallow water, is none of plants" in page) == finds
+        assert ("Green water with waves counts as plants" in page) == finds
+        assert ("Green films count as plants" in page) == (not finds)
+        assert ("Shallow water, which is green, counts as plants" in page) == (not finds)
 
 
 def test_ground_that_only_one_picture_shows_is_unknown():

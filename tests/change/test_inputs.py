@@ -157,6 +157,21 @@ def test_clouds_without_the_system_of_their_surfaces_are_refused_before_anything
         open_pair(one, two, tmp_path, with_clouds=True)
 
 
+def test_surfaces_over_two_ellipsoids_are_refused_without_registration(tmp_path: Path):
+    from surveys_of_two_dates import write_surface
+
+    heights = np.zeros((20, 20), np.float32)
+    one, other = (
+        write_surface(tmp_path / f"{name}.tif", heights, 1e-5, -75.0, 40.0, system)
+        for name, system in (("a", "EPSG:4979"), ("b", "EPSG:6319"))
+    )
+    assert open_pair(one, other, tmp_path).clouds is None
+    with pytest.raises(ChangeError, match=r"WGS 84.*NAD83\(2011\).*one zero"):
+        open_pair(one, other, tmp_path, registered=False)
+    with pytest.raises(ChangeError, match="one zero"):
+        cli._run(["change", str(one), str(other), str(tmp_path / "out"), "--register", "none"])
+
+
 def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
     from tidefield.change.measure import measure
 

@@ -74,3 +74,25 @@ def test_whole_numbers_are_names_as_they_are_written(tmp_path: Path):
     path = tmp_path / "a.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "crs": system, "features": features}))
     assert names(path) == ["7", "2"]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.array([7, np.nan], np.float32), ["7", "2"]),
+        (np.array([7.5, 9]), ["7.5", "9"]),
+        (np.array(["2020-01-01", "NaT"], "datetime64[D]"), ["2020-01-01", "2"]),
+    ],
+)
+def test_numbers_and_dates_of_whatever_type_are_names(tmp_path: Path, values: np.ndarray, expected: list[str]):
+    raw.write(
+        tmp_path / "a.gpkg",
+        geometry=shapely.to_wkb(np.array([CREEK, ROAD], object)),
+        field_data=[values],
+        fields=["id"],
+        geometry_type="Polygon",
+        crs="EPSG:32630",
+        driver="GPKG",
+        layer="ground",
+    )
+    assert names(tmp_path / "a.gpkg") == expected

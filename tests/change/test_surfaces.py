@@ -8,7 +8,7 @@ import pytest
 from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
-from tidefield.change.surfaces import ChangeError, common_grid, open_surface
+from tidefield.change.surfaces import ChangeError, common_grid, open_surface, other_zeros, require_one_zero
 
 
 def plane(rows: int, columns: int, cell: float, west: float = WEST, north: float = NORTH) -> np.ndarray:
@@ -119,6 +119,66 @@ def test_a_sea_that_is_levelled_to_zero_has_heights(tmp_path: Path, nodata: floa
     frame = np.where(shore == 0, shore, shore + 0.5)  # its heights end
     path = write_surface(tmp_path / "b.tif", frame, nodata=nodata)
     assert open_surface(path).unknown == ((0.0,) if nodata is None else ())
+
+
+def shore(shape: tuple[int, int], cell: float, slope: float) -> np.ndarray:
+    """A sea that is levelled to zero, and ground that rises from it to the east."""
+    east = cell * (np.arange(shape[1]) - 0.4 * shape[1])
+    return np.broadcast_to(np.maximum(0, slope * east), shape).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("shape", "cell", "slope"),
+    [((100, 100), 1.0, 0.1), ((100, 100), 5.0, 0.05), ((100, 200), 1.0, 0.25), ((50, 8000), 0.25, 0.1)],
+)
+def test_a_levelled_sea_has_heights_however_steep_its_shore_and_large_its_raster(
+    tmp_path: Path, shape: tuple[int, int], cell: float, slope: float
+):
+    heights = shore(shape, cell, slope)
+    assert open_surface(write_surface(tmp_path / "a.tif", heights, cell)).unknown == ()
+    frame = np.where(heights == 0, heights, heights + np.float32(2 * cell))  # its heights end
+    assert open_surface(write_surface(tmp_path / "b.tif", frame, cell)).unknown == (0.0,)
+
+
+def test_a_levelled_sea_has_heights_where_nodata_that_is_not_declared_borders_it(tmp_path: Path):
+    heights = shore((200, 200), 1.0, 0.02)
+    heights[:80] = heights[120:] = -9999
+    assert open_surface(write_surface(tmp_path / "a.tif", heights, 1.0)).unknown == (-9999.0,)
+    # Zeros in the corners of a raster that was turned, around nodata that is not declared.
+    heights[80:120] += 3
+    heights[:20] = 0
+    assert open_surface(write_surface(tmp_path / "b.tif", heights, 1.0)).unknown == (-9999.0, 0.0)
+
+
+@pytest.mark.parametrize("nodata", [None, -9999.0])
+def test_levelled_water_in_front_of_a_quay_has_heights_where_nodata_is_declared(tmp_path: Path, nodata: float | None):
+    harbour = np.random.default_rng(0).normal(3, 0.2, (100, 100)).astype(np.float32)
+    harbour[:, :40] = 0
+    surface = open_surface(write_surface(tmp_path / "a.tif", harbour, 1.0, nodata=nodata))
+    assert surface.unknown == ((0.0,) if nodata is None else ())
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("mm", 0.001), ("cm", 0.01)])
+def test_a_levelled_sea_has_heights_in_small_units(tmp_path: Path, unit: str, metre: float):
+    import rasterio
+
+    path = write_surface(tmp_path / "a.tif", shore((100, 100), 1.0, 0.02) / np.float32(metre), 1.0)
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    assert open_surface(path).unknown == ()
+
+
+@pytest.mark.parametrize("nodata", [None, -1.0])
+def test_a_height_is_one_though_programs_write_it_for_nodata(tmp_path: Path, nodata: float | None):
+    import rasterio
+
+    heights = np.round(np.random.default_rng(0).normal(10_000, 40, (100, 100))).astype(np.float32)
+    heights[:10] = -9999
+    path = write_surface(tmp_path / "a.tif", heights, 1.0, nodata=nodata)
+    with rasterio.open(path, "r+") as file:
+        file.units = ("mm",)
+    assert (heights == 9999).any()
+    assert open_surface(path).unknown == (-9999.0,)
 
 
 @pytest.mark.parametrize(("unit", "metre"), [("mm", 0.001), ("cm", 0.01)])
@@ -258,6 +318,11 @@ def test_ellipsoidal_heights_are_not_compared_with_those_over_a_geoid(tmp_path: 
     assert common_grid([open_surface(one), open_surface(one)]).rows > 1
     third = write_surface(tmp_path / "c.tif", plane(20, 20, 1e-5, -4.4, 51.4), 1e-5, -4.4, 51.4, "EPSG:4937")  # ETRS89
     assert common_grid([open_surface(one), open_surface(third)]).rows > 1
+    surfaces = [open_surface(path) for path in (one, third)]
+    assert "up to two metres apart: the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in other_zeros(*surfaces)[0]
+    assert other_zeros(surfaces[0], surfaces[0]) == []
+    with pytest.raises(ChangeError, match=r"WGS 84.*ETRS89.*leave --register none out"):
+        require_one_zero([(surface.path, surface.zero) for surface in surfaces], registered=False)
 
 
 def test_a_vertical_system_without_a_name_is_compared_with_any(tmp_path: Path):

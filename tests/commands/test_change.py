@@ -223,12 +223,12 @@ def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     made = make_pair("ground_textures", 9, Difference(0.4, tide_m=0.0, sun_turn_deg=0.0), views=9, width=128)
-    extent = Extent.around([-25.0, -20.0], [25.0, 20.0], 0.25)
+    extent = Extent.around([-25.0, -20.0], [25.0, 20.0], 0.5)
     for name, survey in (("early", made.earlier), ("late", made.later)):
         write_survey(survey, tmp_path / name)
         heights = surveyed(survey.flat.bed, extent, np.random.default_rng(0), SurveyErrors(datum_m=0.0))
-        west, north = extent.west_m - 0.125, extent.north_m + 0.125
-        write_surface(tmp_path / f"{name}.tif", heights, 0.25, west, north, crs=None)
+        west, north = extent.west_m - 0.25, extent.north_m + 0.25
+        write_surface(tmp_path / f"{name}.tif", heights, 0.5, west, north, crs=None)
     scenes = ("--scenes", tmp_path / "early", tmp_path / "late", "--view-width", 96, "--device", "cpu")
     surfaces = (tmp_path / "early.tif", tmp_path / "late.tif")
     call("change", *surfaces, tmp_path / "out", "-q", *scenes, "--cameras", "ground_textures_0004")
@@ -298,21 +298,22 @@ def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_fir
 ):
     from surveys_of_two_dates import NORTH, WEST, noise, write_surface
 
-    rng, shape = np.random.default_rng(3), (120, 140)
+    rng, shape = np.random.default_rng(3), (80, 100)
     rows, columns = np.indices(shape)
-    pit = np.hypot(rows - 40, columns - 40) < 20
+    pit = np.hypot(rows - 30, columns - 30) < 14
     names = []
     for year, depth in ((2021, 0.0), (2022, 0.2), (2023, 0.5)):
         heights = 0.002 * columns - depth * pit + noise(rng, shape, 0.012, 0.008, 4)
         names.append(write_surface(tmp_path / f"dsm_{year}-05-01.tif", heights.astype(np.float32)))
-    square = [[WEST + x, NORTH - y] for x, y in ((5, 5), (35, 5), (35, 35), (5, 35), (5, 5))]
+    square = [[WEST + x, NORTH - y] for x, y in ((3, 3), (27, 3), (27, 27), (3, 27), (3, 3))]
     polygons = {"type": "FeatureCollection", "features": []}
     polygons["crs"] = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32630"}}
     geometry = {"type": "Polygon", "coordinates": [square]}
     polygons["features"] = [{"type": "Feature", "properties": {"name": "pit"}, "geometry": geometry}]
     (tmp_path / "pit.geojson").write_text(json.dumps(polygons))
     out = tmp_path / "out"
-    call("change", *names[:2], out, "--series", names[2], "-q", "--polygons", tmp_path / "pit.geojson")
+    words = ("--series", names[2], "-q", "--polygons", tmp_path / "pit.geojson", "--windows", 5, 11)
+    call("change", *names[:2], out, *words)
     with (out / "series.csv").open() as file:
         table = list(csv.DictReader(file))
     volume = pit.sum() * 0.25

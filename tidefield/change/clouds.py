@@ -127,12 +127,16 @@ def read_cloud(path: Path) -> Cloud:
     if crs is None or is_local(crs):
         unit_m = _UNITS_M.get(keys.get(_PLAN_UNIT, 0), 1.0)
         xyz[:, :2] *= unit_m
-        converted = "" if unit_m == 1 else f", its eastings and northings are multiplied by {unit_m:.6g} to be metres"
         own_system = (
             f"{path.name} has a projected system of its own, which is not read: that both surveys have the same one is "
-            f"taken for granted, and that heights without a unit are metres{converted}; assign a known one ({_ASSIGN})"
+            f"taken for granted; assign one with an EPSG code ({_ASSIGN})"
         )
-        remarks = (own_system,) if crs is None and keys.get(_PROJECTED) == _USER_DEFINED else ()
+        converted = (
+            f"eastings and northings of {path.name} are multiplied by {unit_m:.6g} to be metres; heights without a "
+            "unit are taken as metres"
+        )
+        own = crs is None and keys.get(_PROJECTED) == _USER_DEFINED
+        remarks = (*((own_system,) if own else ()), *((converted,) if unit_m != 1 else ()))
         return Cloud(path, None, xyz, sigma, remarks=remarks)
     try:
         metric = metric_system(crs, *xyz[:, :2].mean(axis=0).tolist())

@@ -3,8 +3,9 @@
 A place is covered where its mean colour is greener than bare ground's by a margin, unless it lies in a patch that is as
 smooth as bare ground: green films and shallow water have no leaves that shade each other. Bare ground is the lowest of
 the common values of greenness, unless that is a plant's, as in a meadow. Areas come with the range that they have when
-the margin is moved by what greenness scatters from date to date over ground that is bare at both; what changed by less
-than that did not change.
+the margin is moved by what greenness scatters from date to date over ground that is bare at both, and when patches,
+which are plants or none as a whole, are divided into rough and smooth ground; what changed by less than that scatter
+did not change.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8
-from scipy.ndimage import label, median
+from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
+from scipy.ndimage import label
 
 from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, smoothed, with_light
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.shift import picture_grid, read_picture
-from tidefield.change.surfaces import Grid
+from tidefield.change.surfaces import STRIP_CELLS, Grid
 
 MARGIN = 0.035
 """Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""
@@ -43,12 +44,14 @@ _GREENEST = 0.05
 """Greenness that bare ground has at most: grey has -0.13, and 0.06 in a picture with 20% more green."""
 _LEAST_BARE = 0.01
 """With a smaller share of the ground bare at both dates, light and scatter are those of all ground."""
+_FINE_M = 1.01 * WINDOW_M / 2
+"""Larger pixels do not show leaves; those of 20 cm do, which a conversion may make a little larger."""
 _UNKNOWN = np.int8(-128)
 
 
 @dataclass(frozen=True)
 class Area:
-    """An area in square metres, and the range it has when the margin is moved."""
+    """An area in square metres, and the range it has when the margin is moved and patches are divided."""
 
     value_m2: float
     low_m2: float
@@ -64,6 +67,8 @@ class Cover:
         gains: what the later picture's red, green and blue were multiplied by.
         bare: greenness of bare ground.
         scatter: one sigma of greenness between the dates over bare ground.
+        leaves_out_films: whether smooth green patches are none of plants; they are where no ground is bare to compare
+            with, and where pixels are too large to show leaves.
         areas: earlier, later, gained and lost, in all and in each of the user's polygons.
     """
 
@@ -72,6 +77,7 @@ class Cover:
     gains: tuple[float, float, float]
     bare: float
     scatter: float
+    leaves_out_films: bool
     known_m2: float
     areas: dict[str, dict[str, Area]]
 
@@ -81,6 +87,7 @@ class Cover:
             "bare_greenness": self.bare,
             "margin": MARGIN,
             "scatter": self.scatter,
+            "green_films_left_out": self.leaves_out_films,
             "area_m2": self.known_m2,
             "regions": {
                 region: {
@@ -111,12 +118,38 @@ def measure_cover(
         ChangeError: one of the files is no orthophoto.
     """
     small = picture_grid((earlier, later), grid)
+    times, lights = math.ceil(small.cell_m / _FINE_M), None
+    if times > 1 and picture_grid((earlier, later), grid, math.inf).cell_m <= _FINE_M:
+        lights = [_finer_light(earlier, small, times), _finer_light(later, small, times, shift_m)]
     one, inside = read_picture(earlier, small)
     other, also = read_picture(later, small, shift_m)
     inside &= also
     if known is not None:
         inside &= _resampled(known, grid, small)
-    return compare_cover(one, other, inside, small, regions)
+    return compare_cover(one, other, inside, small, regions, lights)
+
+
+def _finer_light(
+    path: Path, grid: Grid, times: int, shift_m: tuple[float, float] = (0.0, 0.0)
+) -> Float32[np.ndarray, "rows columns 2"]:
+    """Means of an orthophoto's light and of its square over the cells of a grid, from pixels this many times finer."""
+    out = np.empty((*grid.shape, 2), np.float32)
+    step = max(1, STRIP_CELLS // (grid.columns * times**2))
+    for first in range(0, grid.rows, step):
+        rows = min(step, grid.rows - first)
+        north, cell = grid.north_m - first * grid.cell_m, grid.cell_m / times
+        fine = Grid(grid.crs, grid.west_m, north, cell, grid.columns * times, rows * times)
+        picture, known = read_picture(path, fine, shift_m)
+        values = np.concatenate([_light(picture), known[..., None]], axis=-1)
+        means = values.reshape(rows, times, grid.columns, times, 3).mean(axis=(1, 3))
+        out[first : first + rows] = means[..., :2] / np.maximum(means[..., 2:], np.float32(1e-3))
+    return out
+
+
+def _light(picture: UInt8[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 2"]:
+    """Light and its square."""
+    light = picture.mean(axis=-1, dtype=np.float32)
+    return np.stack([light, light**2], axis=-1)
 
 
 def compare_cover(
@@ -125,8 +158,13 @@ def compare_cover(
     known: Bool[np.ndarray, "rows columns"],
     grid: Grid,
     regions: list[Region] | None = None,
+    lights: Sequence[Float32[np.ndarray, "rows columns 2"]] | None = None,
 ) -> Cover:
-    """Compare the plant cover of two pictures (8-bit RGB) on one grid."""
+    """Compare the plant cover of two pictures (8-bit RGB) on one grid.
+
+    Args:
+        lights: means of each picture's light and of its square, where finer pixels show leaves that the grid's do not.
+    """
     sigma = max(0.8, WINDOW_M / grid.cell_m)
     first = greenness(smoothed(earlier, known, sigma))
     second = greenness(smoothed(later, known, sigma))
@@ -137,73 +175,86 @@ def compare_cover(
     bare = _bare(np.concatenate([first[known], second[known]]))
     bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
     difference = (second - first)[_enough(bare_ground, known)]
-    rough = [_roughness(picture, known, sigma, bare_ground) for picture in (earlier, later)]
+    can_tell = _is_enough(bare_ground, known) and (lights is not None or grid.cell_m <= _FINE_M)
+    rough = [np.ones_like(known)] * 2
+    if can_tell:
+        rough = [
+            _rough(_light(picture) if lights is None else lights[k], known, sigma, bare_ground)
+            for k, picture in enumerate((earlier, later))
+        ]
     scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
     inside = {"all": known} | {region.name: rasterised([region], grid) & known for region in regions or []}
-    classes = {k: _classes(first, second, known, bare + MARGIN + k * scatter, least, grid, rough) for k in (-1, 0, 1)}
+    clearly, classes = np.abs(second - first) > least, {}
+    for k in (-1, 0, 1):
+        threshold = bare + MARGIN + k * scatter
+        before, after = (_plants(green > threshold, own, k) for green, own in zip((first, second), rough, strict=True))
+        classes[k] = _classes(before, np.where(clearly, after, before), known, grid)
     for name, where in inside.items():
         areas[name] = {}
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
             sizes = [float(np.isin(classes[k][where], codes).sum()) * cell for k in (0, -1, 1)]
             areas[name][what] = Area(sizes[0], min(sizes), max(sizes))
     red, green, blue = (float(gain) for gain in gains)
-    return Cover(grid, classes[0], (red, green, blue), bare, float(scatter), float(known.sum()) * cell, areas)
+    return Cover(grid, classes[0], (red, green, blue), bare, float(scatter), can_tell, float(known.sum()) * cell, areas)
 
 
 def _classes(
-    first: Float32[np.ndarray, "rows columns"],
-    second: Float32[np.ndarray, "rows columns"],
+    before: Bool[np.ndarray, "rows columns"],
+    after: Bool[np.ndarray, "rows columns"],
     known: Bool[np.ndarray, "rows columns"],
-    threshold: float,
-    least: float,
     grid: Grid,
-    rough: Sequence[Float32[np.ndarray, "rows columns"]],
 ) -> Int8[np.ndarray, "rows columns"]:
-    """Classes as `Cover` has them; what changed too little, and patches that are too small, keep what they were."""
-    before, after = (_rough_patches(green > threshold, own) for green, own in zip((first, second), rough, strict=True))
-    after = np.where(np.abs(second - first) > least, after, before)
+    """Classes as `Cover` has them; patches that are too small keep what they were."""
     for moved in (after & ~before, before & ~after):
         after = np.where(small_patches(moved, grid, LEAST_M2), before, after)
     classes = np.where(after, np.where(before, 2, 1), np.where(before, -1, 0)).astype(np.int8)
     return np.where(known, classes, _UNKNOWN)
 
 
-def _roughness(
-    picture: np.ndarray,
+def _rough(
+    light: Float32[np.ndarray, "rows columns 2"],
     known: Bool[np.ndarray, "rows columns"],
     sigma: float,
     bare_ground: Bool[np.ndarray, "rows columns"],
-) -> Float32[np.ndarray, "rows columns"]:
-    """Variation of a picture's light in a Gaussian window, over that from which a patch is one of plants."""
-    light = picture.mean(axis=-1, dtype=np.float32)
-    mean, square = np.moveaxis(smoothed(np.stack([light, light**2], axis=-1), known, sigma), -1, 0)
-    variation = np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, 1)
-    # Every patch counts without bare ground to compare with, and where pixels are too coarse to show leaves.
-    can_tell = _is_enough(bare_ground, known) and sigma >= 2
-    usual = float(np.quantile(variation[bare_ground], 0.25)) if can_tell else 0.0
-    return variation / np.float32(max(min(ROUGHER * usual, ROUGH), 1e-6))
-
-
-def _rough_patches(
-    green: Bool[np.ndarray, "rows columns"], roughness: Float32[np.ndarray, "rows columns"]
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Those connected parts of a region whose median roughness, which edges do not count for, is more than 1."""
-    numbers = np.empty(green.shape, np.int32)
-    label(green, output=numbers)
-    rough = np.zeros(numbers.max() + 1, bool)
-    rough[1:] = median(roughness, numbers, np.arange(1, len(rough))) > 1
-    return rough[numbers]
+    """Where light, given with its square, varies in a Gaussian window as it does in a patch of plants."""
+    mean, square = np.moveaxis(smoothed(light, known, sigma), -1, 0)
+    variation = np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, 1)
+    return variation > max(min(ROUGHER * float(np.quantile(variation[bare_ground], 0.25)), ROUGH), 1e-6)
+
+
+def _plants(
+    green: Bool[np.ndarray, "rows columns"], rough: Bool[np.ndarray, "rows columns"], k: int
+) -> Bool[np.ndarray, "rows columns"]:
+    """The patches of a green region that are rough in more than half of their area.
+
+    Args:
+        k: 1 counts of these what is rough alone; -1 counts them whole, and what is rough of the others.
+    """
+    numbers, sizes = _numbered(green)
+    mostly = 2 * np.bincount(numbers[rough], minlength=len(sizes)) > sizes
+    mostly[0] = False
+    whole = mostly[numbers]
+    return whole if k == 0 else whole & rough if k > 0 else whole | (green & rough)
+
+
+def _numbered(
+    region: Bool[np.ndarray, "rows columns"],
+) -> tuple[Int32[np.ndarray, "rows columns"], Int64[np.ndarray, " parts"]]:
+    """Numbers of the connected parts of a region, 0 outside of it, and their sizes in pixels."""
+    numbers = np.empty(region.shape, np.int32)
+    label(region, output=numbers)
+    return numbers, np.bincount(numbers.ravel())
 
 
 def small_patches(
     region: Bool[np.ndarray, "rows columns"], grid: Grid, least_m2: float
 ) -> Bool[np.ndarray, "rows columns"]:
     """The connected parts of a region that are smaller than an area."""
-    numbers = np.empty(region.shape, np.int32)
-    label(region, output=numbers)
-    small = np.bincount(numbers.ravel()) * grid.cell_area_m2 < least_m2
+    numbers, sizes = _numbered(region)
+    small = sizes * grid.cell_area_m2 < least_m2
     small[0] = False
     return small[numbers]
 

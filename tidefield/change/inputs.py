@@ -87,6 +87,7 @@ def open_pair(
     dates: tuple[str | None, str | None] = (None, None),
     cell_m: float | None = None,
     with_clouds: bool = False,
+    registered: bool = True,
 ) -> Pair:
     """Open two surveys; of point clouds surfaces are made, the mean height of the points in each cell.
 
@@ -94,33 +95,35 @@ def open_pair(
         work: folder for the surfaces of clouds.
         cell_m: of these; ten points to a cell if None.
         with_clouds: read the clouds of folders, too.
+        registered: whether stable ground takes out what their ellipsoids differ by.
 
     Raises:
-        ChangeError: one has no surface, only one is a cloud, or folders have no clouds.
+        ChangeError: one has no surface, only one is a cloud, folders have no clouds, or zeros of heights differ.
     """
     if is_cloud(earlier) != is_cloud(later):
         cloud = earlier if is_cloud(earlier) else later
         raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
     if not is_cloud(earlier):
         surveys = [open_survey(path, date) for path, date in zip((earlier, later), dates, strict=True)]
+        require_one_zero([(survey.path, survey.zero) for survey in surveys], registered)
         clouds = None
         if with_clouds:
             paths = [survey.cloud for survey in surveys]
             if paths[0] is None or paths[1] is None:
                 raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
-            clouds = _both(paths[0], paths[1])
+            clouds = _both(paths[0], paths[1], registered)
             for k, cloud in enumerate(clouds):
                 require_system(cloud, surveys[0].crs)
                 surveys[k] = replace(surveys[k], remarks=[*surveys[k].remarks, *cloud.remarks])
         return Pair(*_distinguished(surveys[0], surveys[1], earlier, later), clouds)
-    clouds = _both(earlier, later)
+    clouds = _both(earlier, later, registered)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
     surfaces = []
     for name, cloud, date in zip(("earlier", "later"), clouds, dates, strict=True):
         path = work / f"{name}.tif"
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
-        surfaces.append(replace(opened, source=cloud.path.name, remarks=list(cloud.remarks)))
+        surfaces.append(replace(opened, source=cloud.path.name, datum=cloud.zero, remarks=list(cloud.remarks)))
     return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
 
 
@@ -136,9 +139,9 @@ def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tu
     )
 
 
-def _both(earlier: Path, later: Path) -> tuple[Cloud, Cloud]:
+def _both(earlier: Path, later: Path, registered: bool) -> tuple[Cloud, Cloud]:
     first, second = read_cloud(earlier), read_cloud(later)
-    require_one_zero([(cloud.path, cloud.zero) for cloud in (first, second)])
+    require_one_zero([(cloud.path, cloud.zero) for cloud in (first, second)], registered)
     return first, in_system(second, first.crs)
 
 

@@ -44,7 +44,7 @@ def write_page(
     views: Sequence[View] = (),
 ) -> None:
     """Write the page, which needs no other file."""
-    environment = template_environment("tidefield.change", "tidefield.survey.report")
+    environment = template_environment("tidefield.change")
     environment.filters |= {
         "metres": lambda value, digits=3: number(value, digits),
         "signed": lambda value, digits=3: signed(value, digits),
@@ -74,7 +74,7 @@ def write_page(
         more=len(rows) - _SHOWN_OUTLINES,
         colours={"lower": LOWER, "higher": HIGHER},
         regions=change.per_region,
-        limits=limits(change, cover is not None and (water is None or water.waterline is None)),
+        limits=limits(change, cover if water is None or water.waterline is None else None),
         cover=cover,
         views=[
             (view.name, jpeg(side_by_side(view, (earlier, later))), jpeg(difference(view)))
@@ -171,14 +171,15 @@ def _from_north(change: Change, row: int) -> str:
     return f"{(row + 0.5) * change.grid.cell_m:.0f} m south of the northern edge"
 
 
-def limits(change: Change, sea_may_be_green: bool = False) -> list[str]:
-    """What the page does not tell."""
+def limits(change: Change, cover: Cover | None = None) -> list[str]:
+    """What the page does not tell; cover is that of a survey in which water was not left out."""
     found = [
         "Cut and fill are of the outlines. Narrow changes near the level of detection are in the net volume only.",
         "Plants and water are part of the surfaces: where they changed, the change is not of the ground.",
     ]
-    if sea_may_be_green:
-        found.append("Shallow water is green: it counts as plants, unless the water's heights are given (--water).")
+    if cover is not None:
+        green = "Green water with waves" if cover.leaves_out_films else "Shallow water, which is green,"
+        found.append(f"{green} counts as plants, unless the water's heights are given (--water).")
     if change.errors.registration.shift_error_m == 0:
         found.append("The surveys were compared where they lie: no horizontal shift was estimated.")
     if change.errors.registration.model == "none":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,9 +54,9 @@ def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
 
 def _name(value: Any) -> str:
     """A name in a column; empty where there is none. Whole numbers beside missing ones are read as floats."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
+    if value is None or value != value:  # NaN and NaT differ from themselves
         return ""
-    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+    return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)
 
 
 def _layer(path: Path, layers: list[str], asked: str | None) -> str:

@@ -99,7 +99,7 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
         "closure": {region: closure(entries, region) for region in regions},
     }
     write_json(folder / "series.json", numbers)
-    environment = template_environment("tidefield.change", "tidefield.survey.report")
+    environment = template_environment("tidefield.change")
     environment.filters["cubic"] = cubic
     shown = regions[:_MOST_PLOTS]
     html = environment.get_template("series.html").render(

@@ -79,8 +79,11 @@ def is_picture(dataset: Any) -> bool:
     return dataset.count >= 3 and dataset.dtypes[0] in ("uint8", "uint16")
 
 
-def picture_grid(paths: tuple[Path, Path], grid: Grid) -> Grid:
+def picture_grid(paths: tuple[Path, Path], grid: Grid, side: float = _SIDE) -> Grid:
     """The grid that two orthophotos are compared on: their coarser pixels, on the ground of another grid.
+
+    Args:
+        side: most rows and columns; where there are more, cells are larger.
 
     Raises:
         ChangeError: one of them is no picture.
@@ -95,7 +98,7 @@ def picture_grid(paths: tuple[Path, Path], grid: Grid) -> Grid:
                 own *= 111_320.0
             pixel = max(pixel, own)
     west, south, east, north = grid.bounds
-    pixel = max(pixel, (east - west) / _SIDE, (north - south) / _SIDE)
+    pixel = max(pixel, (east - west) / side, (north - south) / side)
     columns, rows = max(2, math.floor((east - west) / pixel)), max(2, math.floor((north - south) / pixel))
     return Grid(grid.crs, west, north, pixel, columns, rows)
 

@@ -50,8 +50,12 @@ _UNLIKELY_M = 3_000.0
 """No flat is further from zero; 9999 feet are."""
 _ZERO_SHARE = 0.01
 """Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
+_FAR_M = 1.0
+"""What is further from zero is far."""
+_ELLIPSOID = "the ellipsoid"
+"""How the zeros of ellipsoidal heights are named."""
 _STEP_M = 0.1
-"""The ground beside levelled water is not as high above it."""
+"""Where a survey ends, most of its heights are further from zero than this."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -141,7 +145,7 @@ class Surface:
         orthophoto, cloud: of the same survey, if there are any.
         source: name of the cloud that the surface was made of, or of the folder.
         date: YYYY-MM-DD of the photographs, if the file or its name tells.
-        datum: zero of the heights in words, where the file tells it (`tidefield map`).
+        datum: zero of the heights in words, where the file (of `tidefield map`) or the cloud states it.
         remarks: what a user should know of how it was read.
     """
 
@@ -168,6 +172,11 @@ class Surface:
     def name(self) -> str:
         """Date, or the file's name."""
         return self.date or self.source or self.path.stem
+
+    @property
+    def zero(self) -> str | None:
+        """Zero of the heights by the coordinate system; None where that defines none."""
+        return None if self.crs is None else zero_of_heights(self.crs)
 
     @contextmanager
     def on_grid(self, grid: Grid, shift_m: tuple[float, float] = (0.0, 0.0)) -> Iterator[Read]:
@@ -413,33 +422,50 @@ def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float]:
         known &= ~np.isclose(values, dataset.nodata)  # the lowest float is often declared with fewer digits
     scale, offset = dataset.scales[0], dataset.offsets[0]
     floats, found = np.issubdtype(raw.dtype, np.floating), []
-    for value in (*_SENTINELS, float(np.finfo(np.float32).min)):
+    sentinels = (*_SENTINELS, float(np.finfo(np.float32).min))
+    others = values[known & ~np.isin(values, sentinels)]
+    # Where many heights are lower and many higher, as 9.999 m in millimetres may be, it is one of them.
+    low, high = np.quantile(others, (0.001, 0.999)) if len(others) else (math.inf, -math.inf)
+    for value in sentinels:
         # Whole numbers with a scale reach some of these values; where others are declared they may be heights.
         unlikely = floats or abs(value * scale + offset) * metres > _UNLIKELY_M
-        if (unlikely or dataset.nodata is None) and (known & (values == value)).any():
+        among = low <= value <= high
+        if (unlikely or dataset.nodata is None) and not among and (known & (values == value)).any():
             found.append(value)
-    zero, rest = known & (values == 0), values[known & (values != 0) & ~np.isin(values, found)]
-    if offset == 0 and len(rest):
-        far = np.quantile(np.abs(rest), 0.01) * abs(scale) > 1.0
-        framed = floats and dataset.nodata is None and _is_frame(zero, known, values * abs(scale) * metres)
-        if framed or (far and zero.mean() > _ZERO_SHARE):
+    zero, heights = known & (values == 0), known & (values != 0) & ~np.isin(values, found)
+    if offset == 0 and dataset.nodata is None and heights.any():
+        sizes_m = np.abs(values) * abs(scale) * metres
+        far = np.quantile(sizes_m[heights], 0.01) > _FAR_M
+        if (far and _is_outside(zero, heights, sizes_m)) or (floats and _is_outside(_at_edges(zero), heights, sizes_m)):
             found.append(0.0)
     return found, float((known & np.isin(values, found)).mean())
 
 
-def _is_frame(
-    zero: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"], heights_m: np.ndarray
-) -> bool:
-    """Whether zeros along the edge of a raster lie around a survey: its heights end there, those of a shore run out.
+def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The connected parts of a region that reach the edge of a raster."""
+    numbers = np.zeros(region.shape, np.int32)
+    label(region, output=numbers)
+    edges = np.concatenate([numbers[0], numbers[-1], numbers[:, 0], numbers[:, -1]])
+    return np.isin(numbers, edges[edges > 0])
 
-    A sea that was levelled is zero in large areas, too.
+
+def _is_outside(
+    zero: Bool[np.ndarray, "rows columns"], heights: Bool[np.ndarray, "rows columns"], sizes_m: np.ndarray
+) -> bool:
+    """Whether zeros lie where a survey has no heights: its heights end there, those of a shore run out.
+
+    A sea that was levelled is zero in large areas, too. Its shore rises no further to the first cell than from that to
+    the second, however steep it is and however large its cells are. Zeros that touch no height are outside.
     """
-    numbered = np.zeros(zero.shape, np.int32)
-    label(zero, output=numbered)
-    edges = np.concatenate([numbered[0], numbered[-1], numbered[:, 0], numbered[:, -1]])
-    frame = np.isin(numbered, edges[edges > 0])
-    beside = binary_dilation(frame) & known & ~zero
-    return bool(frame.mean() > _ZERO_SHARE and beside.any() and np.median(np.abs(heights_m[beside])) > _STEP_M)
+    if zero.mean() <= _ZERO_SHARE:
+        return False
+    near = np.asarray(binary_dilation(zero), bool)
+    first, second = near & heights, binary_dilation(near) & heights & ~near
+    if not first.any():
+        return True
+    here = float(np.median(sizes_m[first]))
+    further = float(np.median(sizes_m[second])) if second.any() else here
+    return here > max(_STEP_M, 2 * abs(further - here))
 
 
 def date_in(text: str) -> str | None:
@@ -459,11 +485,11 @@ def same_system(one: CRS, other: CRS) -> bool:
 
 
 def other_zeros(earlier: Surface, later: Surface) -> list[str]:
-    """A remark where surfaces state zeros of their heights in words, and not the same or an unknown one."""
-    if earlier.datum is None or later.datum is None:
-        return []
-    if earlier.datum != later.datum:
-        return [f"heights are over other zeros: {earlier.datum} and {later.datum}; stable ground takes the difference"]
+    """A remark where surfaces state other zeros of their heights, by their systems or in words."""
+    for one, other in ((earlier.zero, later.zero), (earlier.datum, later.datum)):
+        if one is not None and other is not None and one != other:
+            apart = ", up to two metres apart" if one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID) else ""
+            return [f"heights are over other zeros{apart}: {one} and {other}; only stable ground takes the difference"]
     return []
 
 
@@ -574,18 +600,26 @@ def _require_same_heights(surfaces: list[Surface]) -> None:
             f"{named[0].path.name} has a coordinate system, {bare.path.name} has none: expected it in all files or in "
             "none; assign it with gdal_edit.py -a_srs"
         )
-    require_one_zero([(surface.path, zero_of_heights(surface.crs)) for surface in named if surface.crs is not None])
+    require_one_zero([(surface.path, surface.zero) for surface in named])
 
 
-def require_one_zero(zeros: Sequence[tuple[Path, str | None]]) -> None:
-    """Raises: ChangeError when files state heights over different zeros; None states none."""
-    # Those of modern datums are within two metres of each other, which stable ground takes out.
-    ellipsoid = "the ellipsoid"
-    of = {ellipsoid if zero.startswith(ellipsoid) else zero: (zero, path) for path, zero in zeros if zero is not None}
-    heights = dict(of.values())
+def require_one_zero(zeros: Sequence[tuple[Path, str | None]], registered: bool = True) -> None:
+    """Check that files state heights over one zero; None states none.
+
+    Args:
+        registered: whether stable ground takes out what ellipsoids of modern datums differ by, up to two metres.
+
+    Raises:
+        ChangeError: they do not.
+    """
+    stated = [(zero, path) for path, zero in zeros if zero is not None]
+    alike = {_ELLIPSOID if registered and zero.startswith(_ELLIPSOID) else zero: (zero, path) for zero, path in stated}
+    heights = dict(alike.values())
     if len(heights) > 1:
         (one, first), (other, second), *_ = heights.items()
+        both = one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID)
         raise ChangeError(
             f"heights of {first.name} are over {one}, those of {second.name} over {other}: expected one zero "
-            "for both; convert one of them first (gdalwarp -t_srs with a compound system)"
+            f"for both; convert one of them first (gdalwarp -t_srs with a {'3D' if both else 'compound'} system)"
+            f"{', or leave --register none out' if both else ''}"
         )

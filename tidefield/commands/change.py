@@ -33,11 +33,12 @@ log = logging.getLogger(__name__)
 class Change:
     """Measure what changed between two surveys: what was eroded, what grew, and how sure that is.
 
-    OUT is a new folder: change.html (the report), change.tif (difference, its standard error and p-value),
-    significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and change.json. All volumes have
-    95% intervals from the random, the spatially correlated and the systematic part of the error, which are measured
-    over stable ground. Where both surveys have orthophotos, plants gained and lost are reported, too (cover.tif,
-    cover.csv); with --scenes the same places then and now are in views, as pictures, a page that swipes and a video.
+    OUT is a new folder: change.html (the report), change.tif (difference, its standard error, p-value and
+    systematic error), significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and
+    change.json. All volumes have 95% intervals from the random, the spatially correlated and the systematic part of the
+    error, which are measured over stable ground. Where both surveys have orthophotos, plants gained and lost are
+    reported, too (cover.tif, cover.csv); with --scenes the same places then and now are in views, as pictures, a page
+    that swipes and a video.
     """
 
     earlier: Annotated[Positional[Path], arg(metavar="EARLIER")]
@@ -190,7 +191,8 @@ def _measured(
     from tidefield.change.water import measure_water
     from tidefield.progress import ProgressBar
 
-    pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2)
+    registered = options.register != "none"
+    pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2, registered)
     earlier, later = pair.earlier, pair.later
     if options.orthophotos is not None:
         earlier, later = (
