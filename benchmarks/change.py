@@ -435,12 +435,18 @@ def write_page(runs: Path, out: Path) -> None:
     """Write the page from what is stored.
 
     Raises:
-        ChangeError: nothing is.
+        ChangeError: nothing is, or only as earlier versions stored it.
     """
     record = read_json(runs / CHANGE_FILE)
     if record is None:
         raise ChangeError(
             f"{runs / CHANGE_FILE} is not there: expected figures; run `python -m benchmarks change` first"
+        )
+    former = [part for part in PARTS if part in record and "found" not in record[part]]
+    if former:
+        raise ChangeError(
+            f"{runs / CHANGE_FILE} has {', '.join(former)} as earlier versions stored it: expected each part with its "
+            "own date; measure again what is named, or take it out of the file"
         )
     parts = [INTRODUCTION]
     for part, tables in PARTS.items():

@@ -18,7 +18,10 @@ DATA = SHARED / "change"
 def figures():
     if not (DATA / "st_leonards").is_dir():
         pytest.skip(f"needs st_leonards and bmx in {DATA}")
-    return published(DATA)
+    with pytest.MonkeyPatch.context() as patch:
+        # What the choice of outlines adds to cut and fill takes most of the time, and is asked for nowhere here.
+        patch.setattr("tidefield.change.measure.repeat_choice", lambda *_: None)
+        return published(DATA)
 
 
 def test_published_deviations_are_reproduced_with_their_pixel_rule(figures):
@@ -49,6 +52,15 @@ def test_missing_data_are_told_of(tmp_path):
         measure_change(tmp_path, tmp_path, 0, print)
     with pytest.raises(ChangeError, match="benchmarks change"):
         write_page(tmp_path, tmp_path / "page.md")
+
+
+def test_figures_that_an_earlier_version_stored_are_refused(tmp_path):
+    """It kept one date for all parts, which were lists or had their figures at once."""
+    former = {"date": "2026-11-01", "pairs": [], "size": {"million_cells": 100.0}}
+    (tmp_path / "change.json").write_text(json.dumps(former))
+    with pytest.raises(ChangeError, match=r"pairs, size as earlier versions stored it: .* measure again"):
+        write_page(tmp_path, tmp_path / "page.md")
+    assert not (tmp_path / "page.md").exists()
 
 
 def test_the_command_is_measured_on_a_small_pair(tmp_path):

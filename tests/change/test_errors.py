@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from tidefield.change.choice import simulate_noise
+from tidefield.change.choice import _root_power, simulate_noise
 from tidefield.change.errors import (
     UNCORRELATED,
     Variogram,
+    _joined,
     anderson_terms,
     deviation95,
     fit_variogram,
@@ -121,6 +122,12 @@ def test_intervals_are_wider_where_the_errors_were_measured_on_few_pieces_of_gro
     assert replace(volume, correlated_m3=0.0).factor == pytest.approx(1.959963984540054)
 
 
+def test_what_the_user_stated_of_the_errors_is_not_widened_for_little_stable_ground():
+    volume = Volume(10.0, 0.0, 3.0, 4.0, 1.0, degrees_of_freedom=1.0, datum_m3=4.0)
+    assert volume.factor == pytest.approx(stdtrit((25 / 9) ** 2, 0.975))
+    assert replace(volume, correlated_m3=0.0).factor == pytest.approx(1.959963984540054)
+
+
 def test_the_choice_of_outlines_adds_what_the_cells_own_errors_do_not_explain():
     volume = Volume(10.0, 3.0, 4.0, 0.0, 1.0)
     larger, smaller = volume.chosen(2.0, 13.0), volume.chosen(-2.0, 1.0)
@@ -135,18 +142,64 @@ def test_scattered_stable_ground_does_not_make_neighbours_independent():
     scattered = fit_variogram(residuals, 1.0)
     assert scattered.nugget == pytest.approx(0, abs=1e-9)
     assert scattered.ranges_m[0] == pytest.approx(20, rel=0.1)
+    assert scattered.assumed_m == pytest.approx(20, rel=0.1)
     region = np.ones((60, 60), bool)
     whole = np.random.default_rng(1).normal(0, 0.1, (200, 200)).astype(np.float32)
     error = region_error(0.1, region, scattered, 1.0).total
     assert error > 5 * region_error(0.1, region, fit_variogram(whole, 1.0), 1.0).total
+    freedom = scattered.degrees_of_freedom(np.isfinite(residuals), 1.0)
+    assert freedom == pytest.approx(399, rel=0.1), "points 20 m apart are independent of each other"
+    assert Volume(0.0, 0.0, 1.0, 0.0, 1.0, degrees_of_freedom=freedom).factor == pytest.approx(1.966, abs=0.002)
 
 
-def test_degrees_of_freedom_are_the_independent_pieces_of_an_area_less_one():
+def test_a_row_of_stable_cells_shows_what_neighbours_share():
+    """150 cells have 149 pairs of neighbours, fewer than a bin needs on more ground."""
+    rng = np.random.default_rng(0)
+    residuals = np.full((150, 60), np.nan, np.float32)
+    residuals[:, 30] = rng.normal(0, 0.1, 150)
+    road = fit_variogram(residuals, 1.0)
+    assert (road.nugget > 0.8, road.assumed_m) == (True, 0.0)
+    smooth = np.convolve(rng.normal(size=169), np.ones(20), "valid") / math.sqrt(20)
+    residuals[:, 30] = 0.1 * smooth
+    road = fit_variogram(residuals, 1.0)
+    assert (road.nugget < 0.1, road.assumed_m) == (True, 0.0)
+
+
+def test_nothing_is_assumed_of_neighbours_where_scattered_ground_shows_no_nugget():
+    field = correlated_field(np.random.default_rng(2), (400, 400), 15).astype(np.float32)
+    residuals = np.full((400, 400), np.nan, np.float32)
+    residuals[2::5, 2::5] = field[2::5, 2::5]
+    found = fit_variogram(residuals, 1.0)
+    assert (len(found.sills), found.assumed_m) == (1, 0.0)
+    assert found.range_m == pytest.approx(30, rel=0.2)
+
+
+def test_structures_of_one_range_are_one():
+    assert _joined((0.2, 0.3, 0.1), (30.0, 5.0, 5.01)) == (pytest.approx((0.4, 0.2)), (5.0, 30.0))
+
+
+def test_degrees_of_freedom_are_the_independent_samples_among_stable_cells_less_one():
+    """N^2 over the sum of all pairs' correlation; of two ranges, Satterthwaite's sum of sill r^2."""
+    stable = np.random.default_rng(3).random((30, 40)) < 0.3
+    at = np.argwhere(stable) * 0.5
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    short, long = (len(at) ** 2 / Variogram((1.0,), (reach,)).correlation(distance).sum() - 1 for reach in (4.0, 10.0))
+    assert Variogram((0.5,), (10.0,)).degrees_of_freedom(stable, 0.5) == pytest.approx(long, rel=0.01)
+    both = Variogram((0.6, 0.2), (4.0, 10.0)).degrees_of_freedom(stable, 0.5)
+    assert both == pytest.approx((9.6 + 20) ** 2 / (9.6**2 / short + 20**2 / long), rel=0.01)
+    assert Variogram((0.5,), (1000.0,)).degrees_of_freedom(stable, 0.5) == 1
+    lone = np.zeros((1100, 1100), bool)
+    lone[::100, ::100] = True
+    assert Variogram((0.5,), (4.0,)).degrees_of_freedom(lone, 1.0) == 120
+
+
+def test_degrees_of_freedom_of_an_area_are_the_independent_pieces_of_it_less_one():
     """Of a range r, a piece has the area pi r^2 / 5; of two ranges, Satterthwaite's sum of sill r^2."""
-    area = 200 * math.pi
-    assert Variogram((0.5,), (10.0,)).degrees_of_freedom(area) == pytest.approx(9)
-    both = Variogram((0.6, 0.2), (2.0, 10.0)).degrees_of_freedom(area)
-    assert both == pytest.approx((2.4 + 20) ** 2 / (2.4**2 / 249 + 20**2 / 9))
+    stable = np.ones((1100, 900), bool)
+    long, short = (5 * 990_000 / (math.pi * reach**2) - 1 for reach in (20.0, 4.0))
+    assert Variogram((0.5,), (20.0,)).degrees_of_freedom(stable, 1.0) == pytest.approx(long, rel=0.05)
+    both = Variogram((0.6, 0.2), (4.0, 20.0)).degrees_of_freedom(stable, 1.0)
+    assert both == pytest.approx((9.6 + 80) ** 2 / (9.6**2 / short + 80**2 / long), rel=0.05)
 
 
 def test_the_covariance_of_a_registration_is_the_sum_over_all_pairs_of_stable_cells():
@@ -193,6 +246,14 @@ def test_simulated_noise_has_its_variogram():
     spherical = 1 - 1.5 * (2 / 5) + 0.5 * (2 / 5) ** 3
     assert (field[:, 2:] * field[:, :-2]).mean() == pytest.approx(0.6 * spherical, rel=0.15)
     assert (field[2:] * field[:-2]).mean() == pytest.approx(0.6 * spherical, rel=0.15)
+
+
+def test_the_spectrum_of_simulated_noise_is_computed_once():
+    _root_power.cache_clear()
+    random = np.random.default_rng(0)
+    first, second = (simulate_noise((40, 30), Variogram((0.6,), (5.0,)), 1.0, random) for _ in range(2))
+    assert (first != second).all()
+    assert _root_power.cache_info()[:2] == (1, 1)
 
 
 def test_a_window_averages_the_cells_own_errors_and_not_the_systematic_one():

@@ -64,6 +64,17 @@ def test_a_known_datum_error_enters_every_volume(tmp_path: Path):
     found = measured(earlier, later, options=Options(register="none", datum_error_m=0.05))
     assert found.errors.registration.vertical_m == 0
     assert found.net.systematic_m3 == pytest.approx(0.05 * found.net.area_m2, rel=1e-6)
+    assert found.net.datum_m3 == pytest.approx(found.net.systematic_m3)
+
+
+def test_what_scattered_stable_ground_cannot_show_is_taken_for_granted_in_a_remark(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 2, 0.0)
+    corners = [(WEST + 5.0 * k, NORTH - 5.0 * j - 0.5) for k in range(24) for j in range(20)]
+    cells = Region("cells", shapely.MultiPolygon([shapely.box(x, y, x + 0.5, y + 0.5) for x, y in corners]))
+    found = measured(earlier, later, stable=lambda grid: [cells])
+    assert found.errors.registration.stable_cells == len(corners)
+    assert any("shared within 5.0 m is taken for granted" in remark for remark in found.remarks)
+    assert not any("taken for granted" in remark for remark in measured(earlier, later, stable=east).remarks)
 
 
 def test_heights_that_share_control_and_disagree_have_the_disagreement_as_error(tmp_path: Path):
@@ -173,12 +184,13 @@ def test_a_tilt_is_found(tmp_path: Path):
 
 def test_an_outline_has_the_systematic_error_of_its_own_cells(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 9, 0.3)
-    found = measured(earlier, later, options=Options(register="tilt"))
+    found = measured(earlier, later, options=Options(register="tilt", datum_error_m=0.02))
     assert len(found.each) >= 2
     for number, volume, _ in found.each:
         inside = found.outlines.labels == number
         expected = found.errors.registration.deviation_of_sum(found.grid, inside) * AREA
         assert volume.systematic_m3 == pytest.approx(expected)
+        assert volume.datum_m3 == pytest.approx(0.02 * volume.area_m2)
 
 
 def test_an_error_of_the_shift_adds_up_over_a_slope_and_cancels_out_over_a_hill():

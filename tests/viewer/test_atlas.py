@@ -12,8 +12,11 @@ from PIL import Image
 pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
 
 from map_folders import CELL, SHAPE, corner, write_change, write_map
-from surveys_of_two_dates import write_surface
+from surveys_of_two_dates import noise, write_surface
 
+from tidefield.change.measure import measure
+from tidefield.change.surfaces import open_surface
+from tidefield.change.write import write_all
 from tidefield.errors import RunError
 from tidefield.maps.grid import LOCAL_WKT
 from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
@@ -92,6 +95,24 @@ def test_a_change_of_surfaces_without_a_system_is_shown_in_metres(tmp_path: Path
     assert volumes["net"]["value_m3"] == pytest.approx(40 * CELL**2, rel=1e-4)
     beside = Atlas([change, write_map(tmp_path / "map", (1, 2, 3))])
     assert beside.crs.to_epsg() == 32630
+    assert beside.metre == 1
+    write_surface(tmp_path / "feet" / "dsm.tif", np.ones(SHAPE, np.float32), CELL, crs="EPSG:2263")
+    with pytest.raises(RunError, match=r"taken as metres, and the maps .* US survey foot: expected one unit"):
+        Atlas([change, tmp_path / "feet"])
+
+
+def test_a_change_between_maps_in_a_local_frame_is_in_units_of_the_scene(tmp_path: Path):
+    surfaces = [
+        write_surface(tmp_path / name / "dsm.tif", noise(np.random.default_rng(k), SHAPE, 0.02, 0, 1), CELL, crs=system)
+        for k, (name, system) in enumerate((("a", LOCAL_WKT), ("b", LOCAL_WKT), ("c", None), ("d", None)))
+    ]
+    for one, two, unit in ((*surfaces[:2], "units"), (*surfaces[2:], "m")):
+        folder = tmp_path / unit
+        folder.mkdir()
+        write_all(measure(open_surface(one), open_surface(two)), folder, "tidefield change")
+        assert Atlas([folder]).unit == unit
+    assert Atlas([tmp_path / "units"]).describe()["volume"] == "cubic units"
+    assert Atlas([tmp_path / "units", tmp_path / "a"]).unit == "units"
 
 
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
@@ -148,6 +169,19 @@ def test_what_is_systematic_on_a_slope_adds_up_in_its_volume(tmp_path: Path):
     net = atlas.area(box(10, 10, 40, 20))["sheets"][0]["net"]
     half = 1.96 * CELL**2 * math.hypot(0.03 * math.sqrt(300), float(shared[10:20, 10:40].sum()))
     assert net["high_m3"] - net["value_m3"] == pytest.approx(half, rel=1e-3)
+
+
+def test_a_datum_error_that_was_stated_is_not_widened_for_little_stable_ground(tmp_path: Path):
+    folder = write_change(tmp_path / "change", np.full(SHAPE, 0.4, np.float32), sigma=0.03, systematic_m=0.01)
+    numbers = json.loads((folder / "change.json").read_text())
+    numbers["volumes"] = {"net": {"degrees_of_freedom": 1.0}}
+    for stated, factor in ((0.0, 5.0), (0.01, 1.96)):
+        numbers["registration"]["datum_error_m"] = stated
+        (folder / "change.json").write_text(json.dumps(numbers))
+        net = Atlas([folder]).area(box(10, 10, 40, 20))["sheets"][0]["net"]
+        half = CELL**2 * math.hypot(0.03 * math.sqrt(300), 0.01 * 300)
+        found = (net["high_m3"] - net["value_m3"]) / half
+        assert found > factor if stated == 0 else found == pytest.approx(factor, rel=1e-3)
 
 
 def test_a_heap_on_sloping_ground_has_its_volume_above_the_polygons_rim(tmp_path: Path):

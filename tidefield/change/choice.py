@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from scipy.fft import next_fast_len
 from scipy.ndimage import uniform_filter
 
@@ -46,14 +47,20 @@ def simulate_noise(
     """Normal noise of unit variance with the correlation of a variogram, by circulant embedding (Dietrich 1997)."""
     pad = math.ceil(variogram.range_m / cell_m)
     rows, columns = (next_fast_len(n + min(n, pad)) or n + pad for n in shape)
+    white = np.fft.rfft2(random.standard_normal((rows, columns)))
+    smooth = np.fft.irfft2(white * _root_power(rows, columns, variogram, cell_m), (rows, columns))
+    own = math.sqrt(variogram.nugget) * random.standard_normal(shape)
+    return (smooth[: shape[0], : shape[1]] + own).astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _root_power(rows: int, columns: int, variogram: Variogram, cell_m: float) -> Float64[np.ndarray, "rows half"]:
+    """Root of the spectrum of a variogram's correlation over a raster whose ends meet."""
     r = np.minimum(np.arange(rows), rows - np.arange(rows))[:, None] * cell_m
     c = np.minimum(np.arange(columns), columns - np.arange(columns))[None] * cell_m
     correlation = variogram.correlation(np.hypot(r, c))
     # Where the range is longer than the embedding, a few eigenvalues are below zero.
-    power = np.maximum(np.fft.rfft2(correlation).real, 0)
-    white = np.fft.rfft2(random.standard_normal((rows, columns)))
-    smooth = np.fft.irfft2(white * np.sqrt(power), (rows, columns))[: shape[0], : shape[1]]
-    return (smooth + math.sqrt(variogram.nugget) * random.standard_normal(shape)).astype(np.float32)
+    return np.sqrt(np.maximum(np.fft.rfft2(correlation).real, 0))
 
 
 def repeat_choice(

@@ -13,7 +13,7 @@ quantifying geomorphic change, doi 10.1002/esp.4551), which `anderson_terms` has
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -36,11 +36,16 @@ _BLOCKS = 512
 """Rows and columns to which a region is reduced before its covariances are summed."""
 _BINS_PER_OCTAVE = 4
 _LEAST_PAIRS = 200
+"""In a bin of distances; on little ground half as many as it has cells."""
 _LEAST_SHARE = 0.1
 """Of the pairs at a shorter distance in the same piece."""
 _LEAST_PATCHES = 12
 _RESOLVED_CELLS = 2.0
-"""Stable ground whose nearest pairs are further apart does not show what neighbours share."""
+"""Stable ground whose nearest bin is further away does not show what neighbours share."""
+_LEAST_SILL = 1e-3
+"""Structures and nuggets of smaller shares are none."""
+_SAME_RANGE = 1.01
+"""Ranges whose ratio is smaller are one."""
 _WORTH = 6.0
 """A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
 _CLIP = 4.0
@@ -60,6 +65,8 @@ class Variogram:
         ranges_m: of the structures.
         lags_m, semivariances, pairs: what was measured, over the variance.
         reached: whether the semivariance levels off within the distances that were measured.
+        assumed_m: distance within which errors are taken to be shared, because stable ground has too few neighbouring
+            cells to show it; 0 where it has enough.
     """
 
     sills: tuple[float, ...]
@@ -68,6 +75,7 @@ class Variogram:
     semivariances: tuple[float, ...] = ()
     pairs: tuple[float, ...] = ()
     reached: bool = True
+    assumed_m: float = 0.0
 
     @property
     def nugget(self) -> float:
@@ -78,15 +86,23 @@ class Variogram:
         """The longest range; 0 without correlation."""
         return max(self.ranges_m, default=0.0)
 
-    def degrees_of_freedom(self, area_m2: float) -> float:
-        """Of the variance of a large region's sum, if sills and ranges were measured on ground of this area.
+    def degrees_of_freedom(self, stable: Bool[np.ndarray, "rows columns"], cell_m: float) -> float:
+        """Of the variance of a large region's sum, if sills and ranges were measured on these cells.
 
-        A structure of range a has as many independent samples there as patches of pi a^2 / 5 fit in, less one for the
-        mean; structures are weighted by what they add to the variance of a sum (Satterthwaite 1946).
+        N cells have N^2 / sum rho independent samples of a structure, summed over all their pairs, less one for the
+        mean; on ground much larger than its range a these are one for each pi a^2 / 5. Structures are weighted by what
+        they add to the variance of a sum (Satterthwaite 1946).
         """
         if not self.sills:
             return math.inf
-        parts = [(s * a**2, max(1.0, 5 * area_m2 / (math.pi * a**2) - 1)) for s, a in self._structures()]
+        stable = stable[_extent(stable)]
+        cells, step = int(stable.sum()), -(-max(stable.shape) // _BLOCKS)
+        blocks = _block_sums(stable, step)
+        parts = []
+        for sill, reach in self._structures():
+            samples = cells**2 / _pair_sum(blocks, Variogram((1.0,), (reach,)), step * cell_m)
+            # A lone cell in a coarse block passes for several.
+            parts.append((sill * reach**2, max(1.0, min(samples, cells) - 1)))
         return sum(c for c, _ in parts) ** 2 / sum(c**2 / n for c, n in parts)
 
     def _structures(self) -> list[tuple[float, float]]:
@@ -160,8 +176,7 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     finite = np.isfinite(residuals)
     if finite.sum() < 100:
         return UNMEASURED
-    rows, columns = (np.flatnonzero(finite.any(axis)) for axis in (1, 0))
-    known_part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    known_part = _extent(finite)
     residuals, finite = residuals[known_part], finite[known_part]
     # What one number is taken from needs no more than a million cells.
     some = residuals[finite][:: 1 + int(finite.sum()) // 1_000_000]
@@ -195,7 +210,8 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
         if max(thin.shape) <= _WINDOW:
             break
         step *= 2
-    table = np.array([sums[key] for key in sorted(sums) if sums[key][0] >= _LEAST_PAIRS])
+    least = min(_LEAST_PAIRS, int(finite.sum()) / 2)
+    table = np.array([sums[key] for key in sorted(sums) if sums[key][0] >= least])
     # Pairs further apart than half of the longest distance are few and all of the same places.
     table = table[table[:, 2] / table[:, 0] <= longest / 2] if len(table) else table
     if len(table) < 4:
@@ -204,15 +220,23 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     every = 1 + math.isqrt(residuals.size // 1_000_000)
     thinned = residuals[::every, ::every] / np.float32(some.std())
     fitted = _fitted(lags, gammas, pairs)
-    if lags[0] > _RESOLVED_CELLS * cell_m:
-        fitted = _without_nugget(fitted, float(lags[0]))
+    if lags[0] > _RESOLVED_CELLS * cell_m and fitted.nugget > _LEAST_SILL:
+        # What seems random may be shared by all that is nearer than what was measured.
+        reach = float(lags[0])
+        sills, ranges = _joined((*fitted.sills, fitted.nugget), (*fitted.ranges_m, reach))
+        fitted = replace(fitted, sills=sills, ranges_m=ranges, assumed_m=reach)
     return _with_patches(fitted, thinned, every * cell_m)
 
 
-def _without_nugget(fitted: Variogram, reach_m: float) -> Variogram:
-    """A variogram that was measured from a distance on: what seems random may be shared by all that is nearer."""
-    ordered = sorted(zip((*fitted.ranges_m, reach_m), (*fitted.sills, fitted.nugget), strict=True))
-    return replace(fitted, sills=tuple(s for _, s in ordered), ranges_m=tuple(a for a, _ in ordered))
+def _joined(sills: Iterable[float], ranges_m: Iterable[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Sills and ranges of structures in the order of their ranges, those of one range as one."""
+    structures: list[list[float]] = []
+    for reach, sill in sorted(zip(ranges_m, sills, strict=True)):
+        if structures and reach < _SAME_RANGE * structures[-1][0]:
+            structures[-1][1] += sill
+        else:
+            structures.append([reach, sill])
+    return tuple(sill for _, sill in structures), tuple(reach for reach, _ in structures)
 
 
 def _padded(rows: int, columns: int) -> tuple[int, int]:
@@ -247,8 +271,8 @@ def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Va
     if sill <= 0:
         return fitted
     whole = 1 + sill
-    ordered = sorted(zip((*fitted.ranges_m, reach), (*fitted.sills, sill), strict=True))
-    return replace(fitted, sills=tuple(s / whole for _, s in ordered), ranges_m=tuple(a for a, _ in ordered))
+    sills, ranges = _joined((*fitted.sills, sill), (*fitted.ranges_m, reach))
+    return replace(fitted, sills=tuple(s / whole for s in sills), ranges_m=ranges)
 
 
 def _pieces(values: np.ndarray) -> list[np.ndarray]:
@@ -299,17 +323,17 @@ def _fitted(lags: np.ndarray, gammas: np.ndarray, pairs: np.ndarray) -> Variogra
         if best is None or criterion < best[0] + _WORTH:
             best = criterion, found
     assert best is not None
-    nugget, *rest = best[1]
-    sills, ranges = np.array(rest[::2]), np.array(rest[1::2])
-    total = float(nugget + sills.sum())
-    order = [k for k in np.argsort(ranges) if sills[k] > 1e-3 * total]
+    nugget, *rest = best[1].tolist()
+    sills, ranges = _joined(rest[::2], rest[1::2])
+    total = nugget + sum(sills)
+    kept = [k for k in range(len(sills)) if sills[k] > _LEAST_SILL * total]
     return Variogram(
-        tuple(float(sills[k] / total) for k in order),
-        tuple(float(ranges[k]) for k in order),
+        tuple(sills[k] / total for k in kept),
+        tuple(ranges[k] for k in kept),
         tuple(lags.tolist()),
         tuple((gammas / total).tolist()),
         tuple(pairs.tolist()),
-        reached=bool(not order or ranges[order[-1]] < 0.9 * lags[-1]),
+        reached=bool(not kept or ranges[kept[-1]] < 0.9 * lags[-1]),
     )
 
 
@@ -347,6 +371,7 @@ def _least_squares(
     return best.x
 
 
+@lru_cache(maxsize=64)
 def mean_correlation(variogram: Variogram, side_m: float) -> float:
     """Mean correlation of all pairs of points in a square, without the nugget."""
     return float(_block_correlation(variogram, side_m, np.zeros(1), np.zeros(1))[0])
@@ -393,11 +418,9 @@ def region_error(
         sigma: deviation of each cell, or of all.
         region: the cells that are summed.
     """
-    rows = np.flatnonzero(region.any(axis=1))
-    if len(rows) == 0:
+    if not region.any():
         return RegionError(0.0, 0.0)
-    columns = np.flatnonzero(region.any(axis=0))
-    box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    box = _extent(region)
     region = region[box]
     step = -(-max(region.shape) // _BLOCKS)
     if not isinstance(sigma, np.ndarray):
@@ -412,6 +435,12 @@ def region_error(
             squares += float(np.square(part, dtype=np.float64).sum())
     random = math.sqrt(variogram.nugget * squares)
     return RegionError(random, math.sqrt(max(0.0, _pair_sum(blocks, variogram, step * cell_m))))
+
+
+def _extent(region: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
+    """The rows and columns that a region covers."""
+    rows, columns = (np.flatnonzero(region.any(axis)) for axis in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def pair_covariance(

@@ -199,14 +199,19 @@ def measure(
             slopes -= np.stack([_sampled(part, ground).mean() for part in slopes])[:, None, None]
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
-    degrees = variogram.degrees_of_freedom(float(ground.sum()) * grid.cell_area_m2)
-    errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes)
+    degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
+    errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
     alarms = _false_alarms(dz, errors, ground)
     if area is not None:
         dz[~area] = np.nan
     if not variogram.reached:
         remarks.append(
             "errors are correlated over longer distances than stable ground can show: intervals may be too narrow"
+        )
+    if variogram.assumed_m > 0:
+        remarks.append(
+            "stable ground has too few neighbouring cells to show what these share: that errors are shared within "
+            f"{variogram.assumed_m:.1f} m is taken for granted"
         )
     if given is None:
         remarks.append(
@@ -448,6 +453,7 @@ def _in_box(
             errors.systematic_of_sum(inside, box) * area,
             len(values) * area,
             degrees_of_freedom=errors.degrees_of_freedom,
+            datum_m3=errors.datum_error_m * len(values) * area,
         ),
         float(np.abs(values).max()),
     )

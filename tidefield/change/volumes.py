@@ -29,6 +29,7 @@ class Volume:
         bias_m3: of the choice of the outlines, which was subtracted.
         degrees_of_freedom: of the errors but the random one: how many independent pieces of stable ground they were
             measured on.
+        datum_m3: of the systematic part, what the user stated, which was measured nowhere.
     """
 
     value_m3: float
@@ -39,6 +40,7 @@ class Volume:
     choice_m3: float = 0.0
     bias_m3: float = 0.0
     degrees_of_freedom: float = math.inf
+    datum_m3: float = 0.0
 
     @property
     def sigma_m3(self) -> float:
@@ -53,7 +55,7 @@ class Volume:
     @property
     def factor(self) -> float:
         """Half of the interval over one sigma: 1.96 where errors are well known, more where stable ground is small."""
-        measured = self.sigma_m3**2 - self.random_m3**2
+        measured = self.sigma_m3**2 - self.random_m3**2 - self.datum_m3**2
         if measured <= 0 or math.isinf(self.degrees_of_freedom):
             return Z95
         # Satterthwaite: only a part of the variance is uncertain.
@@ -91,9 +93,10 @@ class ErrorModel:
         sigma: one sigma of each cell's own error (random and correlated), metres.
         variogram: how that is correlated.
         registration: the systematic error.
-        degrees_of_freedom: of the correlated and the systematic part.
+        degrees_of_freedom: of the correlated and the systematic part, without the datum's.
         slopes: of the ground to the east and north, beyond what the vertical registration takes out of an error of the
             horizontal shift; None where nothing was shifted.
+        datum_error_m: one sigma of what the user stated of the systematic error, metres.
     """
 
     sigma: Float32[np.ndarray, "rows columns"] | float
@@ -102,6 +105,7 @@ class ErrorModel:
     grid: Grid
     degrees_of_freedom: float = math.inf
     slopes: Float32[np.ndarray, "2 rows columns"] | None = None
+    datum_error_m: float = 0.0
 
     def cell_sigma(self, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of a cell's whole error, for some rows."""
@@ -170,4 +174,5 @@ class ErrorModel:
             self.systematic_of_sum(region) * area,
             cells * area,
             degrees_of_freedom=self.degrees_of_freedom,
+            datum_m3=self.datum_error_m * cells * area,
         )

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Bool
+from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 
 from tidefield import SOFTWARE, __version__
 from tidefield.change.cover import LEAST_M2, Cover
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import PLAIN, ChangeError, Grid, require_rasterio
+from tidefield.change.surfaces import PLAIN, ChangeError, Grid, Surface, opened, require_rasterio
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water, Waterline
 from tidefield.files import plain_cell, write_json, write_text
@@ -319,6 +320,7 @@ def summary(change: Change, command: str) -> dict[str, Any]:
             "shift_m": list(registration.shift_m),
             "shift_error_m": registration.shift_error_m,
             "systematic_m": registration.systematic_m,
+            "datum_error_m": change.errors.datum_error_m,
             "stable_ground": "given" if change.stable_given else "found",
             "stable_cells": registration.stable_cells,
             "before": dict(zip(("median_m", "nmad_m", "deviation95_m"), registration.before, strict=True)),
@@ -330,6 +332,7 @@ def summary(change: Change, command: str) -> dict[str, Any]:
             "sill_shares": list(variogram.sills),
             "ranges_m": list(variogram.ranges_m),
             "reached": variogram.reached,
+            "assumed_m": variogram.assumed_m,
             "lags_m": list(variogram.lags_m),
             "semivariance_shares": list(variogram.semivariances),
             "pairs": list(variogram.pairs),
@@ -357,16 +360,24 @@ def summary(change: Change, command: str) -> dict[str, Any]:
     }
 
 
-def _survey(surface: Any) -> dict[str, Any]:
+def _survey(surface: Surface) -> dict[str, Any]:
     return {
         "file": surface.source or surface.path.name,
         "date": surface.date,
-        "crs": surface.crs.name if surface.crs is not None else None,
+        "crs": _system_name(surface),
         "pixel": [abs(surface.transform.a), abs(surface.transform.e)],
         "nodata": surface.nodata if surface.nodata is None or math.isfinite(surface.nodata) else str(surface.nodata),
         "unknown": list(surface.unknown),
         "sigma": surface.sigma.name if surface.sigma is not None else None,
     }
+
+
+def _system_name(surface: Surface) -> str | None:
+    """Name of a surface's coordinate system, or of the local frame that it lies in; None where it states none."""
+    if surface.crs is not None:
+        return surface.crs.name
+    with opened(surface.path) as file:
+        return None if file.crs is None else CRS.from_wkt(file.crs.to_wkt()).name
 
 
 def write_all(

@@ -355,7 +355,11 @@ class Atlas:
         """Metres in a unit of the plan and of heights, both units, and the system's name."""
         from pyproj import CRS
 
-        if self.crs is None:  # changes between surfaces without one, whose lengths `tidefield change` took as metres
+        bare = [sheet for sheet in self.sheets if sheet.kind == "change" and _system(sheet) is None]
+        if self.crs is None:
+            if any(sheet.numbers["later"].get("crs") == LOCAL_NAME for sheet in bare):
+                return 1.0, 1.0, "units", "units", LOCAL_NAME
+            # `tidefield change` took lengths of surfaces without a system as metres.
             return 1.0, 1.0, "m", "m", "no coordinate system"
         crs = CRS.from_wkt(self.crs.to_wkt())
         if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
@@ -363,6 +367,12 @@ class Atlas:
         plan = crs.axis_info[0]
         if "degree" in plan.unit_name:
             raise RunError(f"the maps are in degrees ({crs.name}): expected a projected system; make them in one")
+        if bare and plan.unit_conversion_factor != 1:
+            raise RunError(
+                f"{bare[0].folder} is between surfaces without a coordinate system, whose lengths were taken as "
+                f"metres, and the maps ({crs.name}) count in {plan.unit_name}: expected one unit; show it alone, or "
+                "assign the surfaces their system (gdal_edit.py -a_srs) and measure it again"
+            )
         up = next((axis for axis in crs.axis_info if axis.direction == "up"), None)
         unit, unit_up = (
             "m" if name in ("metre", "meter") else name for name in (plan.unit_name, up.unit_name if up else "metre")
@@ -546,6 +556,7 @@ def _change_volumes(
         shared = np.full_like(sigma, numbers.get("registration", {}).get("systematic_m", 0.0))
     measured = numbers.get("variogram", {})
     variogram = Variogram(tuple(measured.get("sill_shares", ())), tuple(measured.get("ranges_m", ())))
+    datum = float(numbers.get("registration", {}).get("datum_error_m", 0.0))
     freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
     result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
     chosen = {"net": inside, "cut": inside & (dz < -detection_m), "fill": inside & (dz > detection_m)}
@@ -560,6 +571,7 @@ def _change_volumes(
             float(shared[region].sum()) * cell_area,
             area,
             degrees_of_freedom=freedom,
+            datum_m3=datum * area,
         )
         low, high = volume.interval_m3
         result[name] = {"value_m3": volume.value_m3, "low_m3": low, "high_m3": high}
