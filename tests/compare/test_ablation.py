@@ -148,6 +148,12 @@ def test_the_table_has_steps_and_speeds_relative_to_the_whole_networks():
     assert table.rows[1][-2:] == ["1.50", "4.00"]
 
 
+def test_seeds_of_one_scene_show_the_noise_of_all(flats: Scene):
+    own = {"tidefield": 30.0, "tidefield-seed-1": 30.2}
+    (table,) = ablation_tables(results(flats, {"flats": own, "creek": {"tidefield": 25.0, "views-2": 25.3}}))
+    assert table.rows[1][3] == "+0.30 ± 0.20, noise"
+
+
 def test_without_other_seeds_small_differences_are_noise(flats: Scene):
     own = {"tidefield": 30.0, "views-2": 30.04, "degree-0": 30.06}
     (table,) = ablation_tables(results(flats, {"flats": own}))
@@ -180,7 +186,7 @@ def test_the_summary_names_what_has_no_effect_on_any_scene(flats: Scene):
             "views-8": 29.0,
             "tidefield-seed-1": 30.2,
         },
-        "creek": {"tidefield": 25.0, "views-2": 25.01, "degree-0": 25.04, "field": 25.2, "views-8": 25.3},
+        "creek": {"tidefield": 25.0, "views-2": 25.01, "degree-0": 25.04, "field": 25.2, "views-8": 25.9},
     }
     lines = summarise(results(flats, psnr))
     assert [line.rpartition(": ")[2] for line in lines] == ["views-2.", "field.", "degree-0."]

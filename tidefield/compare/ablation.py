@@ -32,8 +32,8 @@ class Difference:
 
     Attributes:
         mean: of all seeds.
-        error: its standard error, from how far results of one variant with several seeds are apart; None where each
-            has one seed.
+        error: its standard error, from how far results of one variant with several seeds are apart, on all scenes
+            together; None where each has one seed.
     """
 
     mean: float
@@ -71,7 +71,7 @@ def summarise(results: Results) -> list[str]:
     runs = _by_variant(results)
     groups: dict[str, list[str]] = {}
     for name in _names(runs):
-        differences = (_difference(of, name) for of in runs.values())
+        differences = (_difference(of, name, _spread(runs)) for of in runs.values())
         found = {one.effect for one in differences if one is not None}
         beyond = found - {WITHIN}
         if found and len(beyond) < 2:
@@ -122,25 +122,28 @@ def _base(name: str) -> str:
     return name.rpartition("+")[0] or WHOLE
 
 
-def _difference(runs: _Runs, name: str) -> Difference | None:
+def _difference(runs: _Runs, name: str, spread: float | None) -> Difference | None:
     """PSNR against what it is a variant of; None where either was not measured, and for the whole network."""
     if name == WHOLE:
         return None
     own, other = (_values(runs, each) for each in (name, _base(name)))
     if not own or not other:
         return None
-    spread = _spread(runs)
     error = None if spread is None else spread * math.sqrt(1 / len(own) + 1 / len(other))
     return Difference(fmean(own) - fmean(other), error)
 
 
-def _spread(runs: _Runs) -> float | None:
-    """Standard deviation of results of one variant with different seeds, over all variants."""
+def _spread(runs: Mapping[str, _Runs]) -> float | None:
+    """Standard deviation of results of one variant on one scene with different seeds, over all of them.
+
+    Seeds are few: those of one scene would show its own noise less well than those of all scenes show the usual one.
+    """
     squares, freedom = 0.0, 0
-    for name in runs:
-        values = _values(runs, name)
-        squares += sum((value - fmean(values)) ** 2 for value in values)
-        freedom += max(0, len(values) - 1)
+    for of in runs.values():
+        for name in of:
+            values = _values(of, name)
+            squares += sum((value - fmean(values)) ** 2 for value in values)
+            freedom += max(0, len(values) - 1)
     return math.sqrt(squares / freedom) if freedom else None
 
 
@@ -152,11 +155,12 @@ def _values(runs: _Runs, name: str) -> list[float]:
 def _table(runs: Mapping[str, _Runs], base: str, names: Sequence[str]) -> Table:
     """What variants change: PSNR on each scene, and means over the scenes of a variant of what else is measured, speeds
     relative to those of the network that it is a variant of."""
+    spread = _spread(runs)
 
     def row(name: str) -> list[str]:
         cells = [name, str(max(len(of.get(name, ())) for of in runs.values()))]
         for of in runs.values():
-            found = _difference(of, name) if name != base else None
+            found = _difference(of, name, spread) if name != base else None
             value = _mean(_values(of, name))
             effect = NOTHING if found is None else f"{found}{', noise' if found.effect == WITHIN else ''}"
             cells.append(shown(value, "{:.2f}") if name == base else effect)
