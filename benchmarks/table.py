@@ -468,9 +468,9 @@ def circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]
     for name, record in records:
         machine = record["machine"]
         text = (
-            f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
-            f"{machine['system']}, Python {machine['python']}, torch {machine['torch']}"
-            + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
+            f"{machine['processor']}, {machine['cores']} core{'s' * (machine['cores'] > 1)}, "
+            f"{machine['memory_bytes'] / 2**30:.0f} GiB; {machine['system']}, Python {machine['python']}, "
+            f"torch {machine['torch']}" + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
         )
         machines.setdefault(text, {})[name] = None
     versions = sorted({record["version"] for _, record in records})
