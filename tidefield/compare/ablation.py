@@ -69,9 +69,9 @@ def ablation_tables(results: Results) -> list[Table]:
 def summarise(results: Results) -> list[str]:
     """What the tables show together, as sentences: which parts matter, and which bring nothing."""
     runs = _by_variant(results)
-    groups: dict[str, list[str]] = {}
+    spread, groups = _spread(runs), dict[str, list[str]]()
     for name in _names(runs):
-        differences = (_difference(of, name, _spread(runs)) for of in runs.values())
+        differences = (_difference(of, name, spread) for of in runs.values())
         found = {one.effect for one in differences if one is not None}
         beyond = found - {WITHIN}
         if found and len(beyond) < 2:
