@@ -93,7 +93,21 @@ def test_the_error_of_a_region_is_the_sum_over_all_pairs_of_its_cells(varying: b
     brute = math.sqrt((s[:, None] * s[None] * variogram.correlation(distance)).sum())
     found = region_error(sigma if varying else 1.0, region, variogram, 0.5)
     assert found.random == pytest.approx(math.sqrt(0.3 * (s**2).sum()), rel=1e-6)
-    assert found.correlated == pytest.approx(brute, rel=0.01)
+    assert found.correlated == pytest.approx(brute, rel=1e-6)
+
+
+def test_the_error_of_a_long_shore_is_as_large_for_each_cell_as_that_of_a_short_one():
+    """Blocks of 59 rows: neither what few rows share nor that the shore is narrower than a block is lost."""
+    variogram = Variogram((0.6, 0.2), (1.5, 20.0))
+    short, long = (
+        region_error(0.1, np.ones((n, 20), bool), variogram, 1.0).total / math.sqrt(n) for n in (2000, 30000)
+    )
+    assert long == pytest.approx(short, rel=0.01)
+    lone = np.zeros((30_000, 600), bool)
+    lone[::1000, ::300] = True
+    assert region_error(0.1, lone, variogram, 1.0).correlated == pytest.approx(
+        0.1 * math.sqrt(0.8 * lone.sum()), rel=0.01
+    )
 
 
 def test_the_error_of_a_region_that_is_reduced_to_blocks_is_andersons():
@@ -191,6 +205,8 @@ def test_degrees_of_freedom_are_the_independent_samples_among_stable_cells_less_
     lone = np.zeros((1100, 1100), bool)
     lone[::100, ::100] = True
     assert Variogram((0.5,), (4.0,)).degrees_of_freedom(lone, 1.0) == 120
+    shore = np.ones((36_000, 50), bool)
+    assert Variogram((0.5,), (1.0,)).degrees_of_freedom(shore, 1.0) == pytest.approx(shore.sum() - 1)
 
 
 def test_degrees_of_freedom_of_an_area_are_the_independent_pieces_of_it_less_one():

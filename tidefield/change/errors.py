@@ -51,9 +51,9 @@ _WORTH = 6.0
 _CLIP = 4.0
 """Residuals are limited to this many deviations before they are squared: moved objects are no part of the noise."""
 _NEAR = 4
-"""Blocks closer than this have their correlation integrated."""
-_QUADRATURE = 48
-"""Steps along each side of the integral of rho over a pair of blocks."""
+"""Blocks closer than so many of their longer sides have their correlation summed over pairs of cells."""
+_DISTANCES = 128
+"""Distances along each side at which correlation is taken for a pair of near blocks; all there are, if fewer."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +96,13 @@ class Variogram:
         if not self.sills:
             return math.inf
         stable = stable[_extent(stable)]
-        cells, step = int(stable.sum()), -(-max(stable.shape) // _BLOCKS)
-        blocks = _block_sums(stable, step)
+        cells, size = int(stable.sum()), _block_size(stable.shape)
+        blocks = _block_sums(stable, size)
         parts = []
         for sill, reach in self._structures():
-            samples = cells**2 / _pair_sum(blocks, Variogram((1.0,), (reach,)), step * cell_m)
-            # A lone cell in a coarse block passes for several.
-            parts.append((sill * reach**2, max(1.0, min(samples, cells) - 1)))
+            # Scattered cells in a coarse block pass for spread ones; each is correlated with itself at least.
+            pairs = max(cells, _pair_sum(blocks, Variogram((1.0,), (reach,)), size, cell_m))
+            parts.append((sill * reach**2, max(1.0, cells**2 / pairs - 1)))
         return sum(c for c, _ in parts) ** 2 / sum(c**2 / n for c, n in parts)
 
     def _structures(self) -> list[tuple[float, float]]:
@@ -264,9 +264,9 @@ def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Va
     else:
         return fitted
     means = sums[full] / counts[full]
-    predicted = fitted.nugget / float(counts[full].mean()) + mean_correlation(fitted, side * cell_m)
+    predicted = fitted.nugget / float(counts[full].mean()) + mean_correlation(fitted, side, cell_m)
     reach = 2 * side * cell_m
-    share = mean_correlation(Variogram((1.0,), (reach,)), side * cell_m)
+    share = mean_correlation(Variogram((1.0,), (reach,)), side, cell_m)
     sill = (float(np.mean(means**2)) - predicted) / share
     if sill <= 0:
         return fitted
@@ -371,22 +371,45 @@ def _least_squares(
     return best.x
 
 
+def mean_correlation(variogram: Variogram, cells: int, cell_m: float) -> float:
+    """Mean correlation of all pairs of cells in a square of cells x cells, without the nugget."""
+    return float(_near_correlation(variogram, (cells, cells), cell_m, (1, 1))[0, 0])
+
+
 @lru_cache(maxsize=64)
-def mean_correlation(variogram: Variogram, side_m: float) -> float:
-    """Mean correlation of all pairs of points in a square, without the nugget."""
-    return float(_block_correlation(variogram, side_m, np.zeros(1), np.zeros(1))[0])
+def _near_correlation(
+    variogram: Variogram, size: tuple[int, int], cell_m: float, count: tuple[int, int]
+) -> Float64[np.ndarray, "rows columns"]:
+    """Mean correlation of the pairs of cells of two blocks, by their offset in blocks along rows and columns.
 
-
-def _block_correlation(variogram: Variogram, side_m: float, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Mean correlation between the points of two squares, whose centres are dx and dy apart."""
-    # The difference of two uniform positions has a triangular density.
-    u = (np.arange(2 * _QUADRATURE) + 0.5) / _QUADRATURE - 1
-    tent = (1 - np.abs(u)) / _QUADRATURE
-    total = np.zeros(np.shape(dx))
-    for uy, wy in zip(u, tent, strict=True):
-        far = np.hypot(dx[..., None] + side_m * u, dy[..., None] + side_m * uy)
-        total += wy * (variogram.correlation(far) @ tent)
+    Args:
+        size: rows and columns of cells in a block.
+        count: of the offsets.
+    """
+    total = np.zeros(count)
+    for sill, reach in zip(variogram.sills, variogram.ranges_m, strict=True):
+        structure = Variogram((sill,), (reach,))
+        down, across = ([_distances(k, n, reach / cell_m) for k in range(m)] for n, m in zip(size, count, strict=True))
+        for i, (rows, of_rows) in enumerate(down):
+            for j, (columns, of_columns) in enumerate(across):
+                far = cell_m * np.hypot(rows[:, None], columns[None])
+                total[i, j] += of_rows @ structure.correlation(far) @ of_columns
     return total
+
+
+def _distances(offset: int, size: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distances along one side between the cells of two blocks, in cells, and the share of the pairs that have them.
+
+    Args:
+        offset: of one block from the other, in blocks.
+        size: of a block, in cells.
+        reach: cells beyond which distances are left out.
+    """
+    low, high = max((offset - 1) * size + 1, -math.floor(reach)), min((offset + 1) * size - 1, math.floor(reach))
+    count = max(0, min(high - low + 1, _DISTANCES))
+    width = (high - low + 1) / max(count, 1)
+    at = low - 0.5 + width * (np.arange(count) + 0.5)
+    return at, width * (size - np.abs(at - offset * size)) / size**2
 
 
 @dataclass(frozen=True)
@@ -422,19 +445,20 @@ def region_error(
         return RegionError(0.0, 0.0)
     box = _extent(region)
     region = region[box]
-    step = -(-max(region.shape) // _BLOCKS)
+    size = _block_size(region.shape)
     if not isinstance(sigma, np.ndarray):
-        blocks = _block_sums(region, step) * sigma
+        blocks = _block_sums(region, size) * sigma
         squares = float(region.sum()) * sigma**2
     else:
-        inside = sigma[box]
-        blocks, squares = np.zeros((-(-region.shape[0] // step), -(-region.shape[1] // step))), 0.0
+        inside, (down, across) = sigma[box], size
+        blocks, squares = np.zeros((-(-region.shape[0] // down), -(-region.shape[1] // across))), 0.0
         for k in range(blocks.shape[0]):
-            part = np.where(region[k * step : (k + 1) * step], inside[k * step : (k + 1) * step], np.float32(0))
-            blocks[k] = _block_sums(part, step)[0]
+            part = np.where(region[k * down : (k + 1) * down], inside[k * down : (k + 1) * down], np.float32(0))
+            blocks[k] = _block_sums(part, size)[0]
             squares += float(np.square(part, dtype=np.float64).sum())
-    random = math.sqrt(variogram.nugget * squares)
-    return RegionError(random, math.sqrt(max(0.0, _pair_sum(blocks, variogram, step * cell_m))))
+    # Scattered cells in a coarse block pass for spread ones; each is correlated with itself at least.
+    correlated = max(sum(variogram.sills) * squares, _pair_sum(blocks, variogram, size, cell_m))
+    return RegionError(math.sqrt(variogram.nugget * squares), math.sqrt(correlated))
 
 
 def _extent(region: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
@@ -457,60 +481,63 @@ def pair_covariance(
     Args:
         terms: of each column of X, its factor of the rows and of the columns of the raster.
     """
-    step = -(-max(region.shape) // _BLOCKS)
-    starts = np.arange(0, region.shape[0], step)
+    down, across = size = _block_size(region.shape)
+    starts = np.arange(0, region.shape[0], down)
     squares = np.zeros((len(terms), len(terms)))
     normal = np.zeros_like(squares)
-    wide = -(-region.shape[1] // step)
+    wide = -(-region.shape[1] // across)
     blocks = np.zeros((len(terms), len(starts), wide))
     for k, first in enumerate(starts):
-        rows = slice(first, first + step)
+        rows = slice(first, first + down)
         inside = region[rows]
         if not inside.any():
             continue
         s = sigma[rows] if isinstance(sigma, np.ndarray) else sigma
-        columns = [down[rows, None] * across[None] * inside for down, across in terms]
+        columns = [of_rows[rows, None] * of_columns[None] * inside for of_rows, of_columns in terms]
         scaled = [np.where(inside, column * s, 0) for column in columns]
         for i, column in enumerate(columns):
-            blocks[i, k] = _block_sums(scaled[i], step)[0]
+            blocks[i, k] = _block_sums(scaled[i], size)[0]
             for j, other in enumerate(columns):
                 normal[i, j] += float((column * other).sum())
                 squares[i, j] += float((scaled[i] * scaled[j]).sum())
     middle = variogram.nugget * squares
     for i in range(len(terms)):
         for j in range(len(terms)):
-            middle[i, j] += _pair_sum(blocks[i], variogram, step * cell_m, blocks[j])
+            middle[i, j] += _pair_sum(blocks[i], variogram, size, cell_m, blocks[j])
     return normal, middle
 
 
-def _block_sums(values: np.ndarray, step: int) -> Float64[np.ndarray, "rows columns"]:
-    """Sums over blocks of step x step cells."""
-    if step == 1:
+def _block_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of the blocks that a raster is reduced to."""
+    rows, columns = shape
+    return -(-rows // _BLOCKS), -(-columns // _BLOCKS)
+
+
+def _block_sums(values: np.ndarray, size: tuple[int, int]) -> Float64[np.ndarray, "rows columns"]:
+    """Sums over blocks."""
+    if size == (1, 1):
         return values.astype(np.float64)
-    down = np.add.reduceat(values, np.arange(0, values.shape[0], step), axis=0, dtype=np.float64)
-    return np.add.reduceat(down, np.arange(0, values.shape[1], step), axis=1)
+    rows, columns = (np.arange(0, length, step) for length, step in zip(values.shape, size, strict=True))
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0, dtype=np.float64), columns, axis=1)
 
 
-def _pair_sum(blocks: np.ndarray, variogram: Variogram, side_m: float, others: np.ndarray | None = None) -> float:
+def _pair_sum(
+    blocks: np.ndarray,
+    variogram: Variogram,
+    size: tuple[int, int],
+    cell_m: float,
+    others: np.ndarray | None = None,
+) -> float:
     """Sum over all pairs of a block and one of the others, of their product times their mean correlation."""
     if not variogram.sills:
         return 0.0
-    rows, columns = blocks.shape
-    size = _padded(rows, columns)
-    spectrum = rfft2(blocks, size)
-    products = irfft2(np.conj(spectrum) * (spectrum if others is None else rfft2(others, size)), size)
-    r = np.abs(np.fft.fftfreq(size[0], 1 / size[0]))[:, None] * side_m
-    c = np.abs(np.fft.fftfreq(size[1], 1 / size[1]))[None] * side_m
-    correlation = variogram.correlation(np.hypot(r, c))
-    near = _near_correlation(variogram, side_m)
-    for i in range(min(_NEAR, rows)):
-        for j in range(min(_NEAR, columns)):
-            correlation[[i, i, -i, -i], [j, -j, j, -j]] = near[i, j]
+    padded = _padded(*blocks.shape)
+    spectrum = rfft2(blocks, padded)
+    products = irfft2(np.conj(spectrum) * (spectrum if others is None else rfft2(others, padded)), padded)
+    r, c = (np.abs(np.fft.fftfreq(n, 1 / n)) * step * cell_m for n, step in zip(padded, size, strict=True))
+    correlation = variogram.correlation(np.hypot(r[:, None], c[None]))
+    near = tuple(min(n, -(-_NEAR * max(size) // step)) for n, step in zip(blocks.shape, size, strict=True))
+    by_offset = _near_correlation(variogram, size, cell_m, near)
+    rows, columns = (np.arange(1 - n, n) for n in near)
+    correlation[np.ix_(rows, columns)] = by_offset[np.ix_(np.abs(rows), np.abs(columns))]
     return float((products * correlation).sum())
-
-
-@lru_cache(maxsize=64)
-def _near_correlation(variogram: Variogram, side_m: float) -> np.ndarray:
-    """Mean correlation between near blocks, in which it bends, by their offset in rows and columns."""
-    rows, columns = np.indices((_NEAR, _NEAR))
-    return _block_correlation(variogram, side_m, columns * side_m, rows * side_m)

@@ -170,7 +170,7 @@ def window_z(
 ) -> Float32[np.ndarray, "rows columns"]:
     """Mean of dz in a window around each cell over its deviation; NaN where the cell itself is unknown."""
     z = np.empty(dz.shape, np.float32)
-    correlated = mean_correlation(variogram, window * cell_m)
+    correlated = mean_correlation(variogram, window, cell_m)
     half = window // 2
     for first in range(0, dz.shape[0], _STRIP):
         last = min(first + _STRIP, dz.shape[0])
