@@ -3,6 +3,7 @@
 import math
 import time
 
+import numpy as np
 import pytest
 from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, survey_folder, xmp
 from PIL.ExifTags import GPS, Base
@@ -152,6 +153,35 @@ def test_a_flight_that_was_corrected_leaves_another_the_drones_own_positions(tmp
     given = given_positions(photographs)
     assert len(given.names) == 14
     assert "6 of 20 positions are not used: their heights are over" in given.notes[0]
+
+
+def at(second: int) -> dict[int, object]:
+    """The tag of a time."""
+    return {Base.DateTimeOriginal: time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime(1_700_000_000 + second))}
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_flight_of_which_a_part_was_corrected_far_is_corrected_as_a_whole(tmp_path, timed):
+    """PPK repairs where RTK was lost, moves fixes by a centimetre, and leaves some of them as they are."""
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        up_m = 0.9 if k < 6 else rng.normal(0, 0.02) if k < 27 else 0.0
+        table = exif(at(k) if timed else {}, place=BRIGHTON, height_m=112.3 + up_m)
+        packet = xmp({"AbsoluteAltitude": "+112.300", **HERE, **RTK_FLOAT})
+        photograph(tmp_path / f"{k:02d}.jpg", table=table, packet=packet)
+    given = given_positions(read_survey(tmp_path).photographs)
+    assert (len(given.names), given.notes) == (30, ())
+
+
+def test_flights_between_pauses_are_judged_each(tmp_path):
+    """Of the last flight a tenth was moved far, of all photographs a fortieth; the others repeat XMP."""
+    for k in range(40):
+        up_m = 0.004 if k < 20 else 0.0 if k < 30 else 0.9 if k == 30 else 0.1
+        table = exif(at(k + (200 if k >= 20 else 0) + (200 if k >= 30 else 0)), place=BRIGHTON, height_m=112.3 + up_m)
+        packet = xmp({"AbsoluteAltitude": "+112.300", **HERE, **RTK_FLOAT})
+        photograph(tmp_path / f"{k:02d}.jpg", table=table, packet=packet)
+    sources = [p.position.source for p in read_survey(tmp_path).photographs if p.position is not None]
+    assert sources == ["EXIF, RTK float"] * 30 + ["EXIF"] * 10
 
 
 @pytest.mark.parametrize(

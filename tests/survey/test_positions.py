@@ -152,6 +152,21 @@ def test_degrees_and_heights_of_a_table_are_those_of_its_system(tmp_path, titles
     assert (position.height_m, position.datum) == (344, datum)
 
 
+@pytest.mark.parametrize("title", ["Survey", "Lisbon", "Tokyo", "2024"])
+def test_a_title_above_a_table_is_no_system_though_proj_knows_one(tmp_path, title):
+    text = f"{title}\nname,lat,lon,alt\nDJI_0001.JPG,54.5,-2.75,344\n"
+    found, remarks = read_gps_file(written(tmp_path, text), NAMES)
+    position = found["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg, remarks) == (54.5, -2.75, [])
+
+
+def test_a_system_above_a_table_is_named(tmp_path):
+    text = "OSGB36\nname,lat,lon,alt\nDJI_0001.JPG,54.5,-2.75,344\n"
+    assert read_gps_file(written(tmp_path, text), NAMES)[1] == [
+        "gps.csv: positions are in OSGB36, as its first line has it."
+    ]
+
+
 def test_unit_and_zero_of_heights_in_a_title_go_before_those_of_the_system(tmp_path):
     for title, height_m, datum in (
         ("alt", 1000 * 1200 / 3937, "mean sea level"),

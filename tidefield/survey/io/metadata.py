@@ -20,7 +20,7 @@ _XMP_TAG = 700
 _RTK_SINGLE, _RTK_FLOAT, _RTK_FIXED = 16, 32, 50
 CORRECTED_M = 0.5
 """A position in EXIF that is farther from that in XMP was written after the flight, by PPK for example."""
-ROUNDING_M = 0.03
+ROUNDING_M = 0.015
 """What a drone writes into EXIF and into XMP differs by less: by 1 cm in brighton_beach and turin_lot."""
 _LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # the Dead Sea, and Mount Everest
 # Pix4D's namespace counts a camera's pitch from straight down, the others from the horizon (as opendm/photo.py of

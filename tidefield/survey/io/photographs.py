@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections import defaultdict
@@ -11,6 +12,8 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int64
 from PIL import ExifTags
 
 from tidefield.data.pictures import check_mask
@@ -49,7 +52,11 @@ _OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp", ".gif")
 # Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
 _FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
 _CORRECTED_SHARE = 0.1
-"""Of a survey's photographs."""
+"""Of a flight's photographs: where so many are far from the drone's own positions, it was corrected."""
+_REPEATED_SHARE = 0.9
+"""Of a flight's photographs: where EXIF repeats the drone's own positions in so many, it was not corrected."""
+_PAUSE_S = 120.0
+"""Photographs further apart in time are of two flights."""
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
 
 
@@ -132,16 +139,38 @@ class _Read:
 def _with_positions(read: Sequence[_Read]) -> list[Photograph]:
     """The photographs with their positions.
 
-    A correction such as PPK writes all positions of a flight into EXIF, also where it moves them little: if a good
-    share of them is far from the drone's own, each that is not the drone's own is taken from there.
+    A correction such as PPK writes all positions of a flight into EXIF, also where it moves them little. Where a flight
+    was corrected, the others of the survey are taken to be, too, unless EXIF repeats what the drone wrote into XMP.
     """
-    moved_m = [one.metadata.correction_m for one in read]
-    far = sum(length_m > CORRECTED_M for length_m in moved_m)
-    least_m = ROUNDING_M if far >= _CORRECTED_SHARE * len(read) else CORRECTED_M
+    flights = _flights([one.photograph for one in read])
+    moved_m = np.array([one.metadata.correction_m for one in read])
+    far = moved_m > CORRECTED_M
+    groups = [np.arange(len(read)), *flights]
+    any_corrected = any(far[group].mean() >= _CORRECTED_SHARE for group in groups if len(group) >= FEWEST)
+    corrected = far.copy()
+    for flight in flights if any_corrected else ():
+        # Without times, photographs of a corrected flight and of another may be one group.
+        timed = all(math.isfinite(read[k].photograph.time_s) for k in flight)
+        near = flight if timed else flight[~far[flight]]
+        if len(near) == 0 or (moved_m[near] <= ROUNDING_M).mean() < _REPEATED_SHARE:
+            corrected[flight] = True
     return [
-        replace(one.photograph, position=one.metadata.position(length_m > least_m))
-        for one, length_m in zip(read, moved_m, strict=True)
+        replace(one.photograph, position=one.metadata.position(bool(of_exif)))
+        for one, of_exif in zip(read, corrected, strict=True)
     ]
+
+
+def _flights(photographs: Sequence[Photograph]) -> list[Int64[np.ndarray, " K"]]:
+    """The indices of the photographs of each camera and folder that have no long pause between them."""
+    by_camera = defaultdict(list)
+    for k, photograph in enumerate(photographs):
+        by_camera[photograph.camera, photograph.serial, photograph.name.rpartition("/")[0]].append(k)
+    flights = []
+    for own in by_camera.values():
+        times_s = np.array([photographs[k].time_s for k in own])
+        order = np.argsort(times_s)  # those without a time are last
+        flights += np.split(np.array(own)[order], np.flatnonzero(np.diff(times_s[order]) > _PAUSE_S) + 1)
+    return flights
 
 
 def control_remark(error: SurveyError) -> str:

@@ -31,6 +31,7 @@ from tidefield.survey.io.text_files import (
     find_file,
     first_system,
     leading_numbers,
+    names_a_system,
     read_lines,
     read_list,
     unit_remarks,
@@ -173,6 +174,8 @@ def read_gps_file(path: Path, names: PhotographNames) -> tuple[dict[str, GpsReco
     system = first_system(lines)
     titles = (row for row, line in enumerate(lines) if all(name in _columns(line)[0] for name in _REQUIRED))
     header = next(titles, None)
+    if system is not None and header is not None and not lines[header].startswith("#") and not names_a_system(lines):
+        system = None
     # Titles in a geo.txt are a comment. A table may name the system of its degrees above them.
     if system is not None and header is not None and (system.is_projected or lines[header].startswith("#")):
         header = None
@@ -226,7 +229,10 @@ def _read_table(
     columns, separator = _columns(lines[header])
     if system is None or separator != "\t":  # then it is no geo.txt, and its pitch may count from the horizon
         columns = {key: column for key, column in columns.items() if key not in _ANGLES}
-    system = system or parse_crs(WGS84)
+    usual = parse_crs(WGS84)
+    other = system is not None and not system.equals(usual, ignore_axis_order=True)
+    system = system or usual
+    remarks = [f"{path.name}: positions are in {system.name}, as its first line has it."] if other else []
     titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
     above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
     zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), _datum(system)]
@@ -265,10 +271,11 @@ def _read_table(
     unread = {*range(len(titles))} - {index for index, _ in columns.values()}
     numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
     if "height" in columns or not numeric:
-        return found, []
+        return found, remarks
     return found, [
+        *remarks,
         f"{path.name} has no column of heights that is understood; its columns {list_names(numeric)} are not read. If "
-        'one of them is the height, call it "height (m)".'
+        'one of them is the height, call it "height (m)".',
     ]
 
 

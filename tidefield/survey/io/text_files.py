@@ -19,6 +19,8 @@ _MAX_WORDS = 64
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
 _UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
 
+_CODE = re.compile(r"\+|\w+[:[]")
+
 
 class PhotographNames:
     """Index of the photographs of a survey by full or shortened name.
@@ -137,6 +139,19 @@ def first_system(lines: Sequence[str]) -> CRS | None:
         return parse_crs(_header(lines)[1])
     except ValueError:
         return None
+
+
+def names_a_system(lines: Sequence[str]) -> bool:
+    """Whether the first line that is no comment names its coordinate reference system as no title would.
+
+    That is by a code, a proj4 string, WKT, or a name with a number, such as "ETRS89". PROJ takes "Tokyo", "Survey" and
+    "2024" for systems, too.
+    """
+    header = _header(lines)[0].strip()
+    if _CODE.match(header) or _UTM.fullmatch(header):
+        return True
+    name, own = (re.sub(r"[\s/_-]", "", text).casefold() for text in (header, parse_crs(header).name))
+    return name == own and re.search(r"\d", name) is not None
 
 
 def unit_remarks(path: Path, system: CRS) -> list[str]:
