@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+from scipy.special import stdtrit
+
 from tidefield.compare.results import Result, Results
 from tidefield.compare.run import WHOLE, Settings, of_seed, variant_and_seed
 from tidefield.compare.tables import NOTHING, Table, shown, write_figures, write_tables
@@ -19,8 +21,8 @@ from tidefield.config import PRESETS, variants_of
 
 LEAST_DB = 0.05
 """A smaller difference counts as noise, even if seeds happen to agree better."""
-ERRORS = 2.0
-"""Standard errors beyond which a difference is none of the seeds."""
+CONFIDENCE = 0.95
+"""That a larger difference is none of the seeds."""
 WITHIN = "within the noise"
 PSNR = "psnr_seen_cc"
 _METRICS = ((PSNR, "PSNR, dB", ".2f"), ("ssim_seen_cc", "SSIM", ".4f"), ("flip_seen_cc", "FLIP", ".4f"))
@@ -34,15 +36,18 @@ class Difference:
         mean: of all seeds.
         error: its standard error, from how far results of one variant with several seeds are apart, on all scenes
             together; None where each has one seed.
+        freedom: degrees of freedom of that error.
     """
 
     mean: float
     error: float | None
+    freedom: int
 
     @property
     def effect(self) -> str:
         """Better, worse or within the noise."""
-        if abs(self.mean) <= max(LEAST_DB, ERRORS * (self.error or 0.0)):
+        noise = 0.0 if self.error is None else self.error * float(stdtrit(self.freedom, 0.5 + CONFIDENCE / 2))
+        if abs(self.mean) <= max(LEAST_DB, noise):
             return WITHIN
         return "better" if self.mean > 0 else "worse"
 
@@ -69,9 +74,9 @@ def ablation_tables(results: Results) -> list[Table]:
 def summarise(results: Results) -> list[str]:
     """What the tables show together, as sentences: which parts matter, and which bring nothing."""
     runs = _by_variant(results)
-    spread, groups = _spread(runs), dict[str, list[str]]()
+    noise, groups = _noise(runs), dict[str, list[str]]()
     for name in _names(runs):
-        differences = (_difference(of, name, spread) for of in runs.values())
+        differences = (_difference(of, name, noise) for of in runs.values())
         found = {one.effect for one in differences if one is not None}
         beyond = found - {WITHIN}
         if found and len(beyond) < 2:
@@ -79,9 +84,16 @@ def summarise(results: Results) -> list[str]:
     sentences = {
         "worse": "Worse, and nowhere better",
         "better": "Better, and nowhere worse",
-        WITHIN: f"Within {ERRORS:g} standard errors, or {LEAST_DB:g} dB, on all scenes, so that no effect was measured",
+        WITHIN: f"Within {LEAST_DB:g} dB or the noise ({CONFIDENCE:.0%}) on all scenes, so that no effect was measured",
     }
-    return [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
+    found = [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
+    if noise is None:
+        return found
+    return [
+        *found,
+        f"The noise, {noise.psnr:.3f} dB of a training, is how far those with other seeds are apart "
+        f"({noise.freedom} degrees of freedom): {', '.join(noise.scenes)}.",
+    ]
 
 
 def write_ablation(results: Results, settings: Settings, out: Path) -> list[Path]:
@@ -122,29 +134,47 @@ def _base(name: str) -> str:
     return name.rpartition("+")[0] or WHOLE
 
 
-def _difference(runs: _Runs, name: str, spread: float | None) -> Difference | None:
+@dataclass(frozen=True)
+class _Noise:
+    """How far results of one variant on one scene with different seeds are apart, all of them together.
+
+    Seeds are few: those of one scene would show its own noise less well than those of all scenes show the usual one.
+
+    Attributes:
+        psnr: standard deviation of one training, dB.
+        freedom: its degrees of freedom.
+        scenes: that have several seeds of a variant.
+    """
+
+    psnr: float
+    freedom: int
+    scenes: tuple[str, ...]
+
+
+def _noise(runs: Mapping[str, _Runs]) -> _Noise | None:
+    """The noise of trainings; None where each has one seed."""
+    squares, freedom, scenes = 0.0, 0, list[str]()
+    for scene, of in runs.items():
+        for name in of:
+            values = _values(of, name)
+            if len(values) > 1:
+                squares += sum((value - fmean(values)) ** 2 for value in values)
+                freedom += len(values) - 1
+                scenes.append(scene)
+    return _Noise(math.sqrt(squares / freedom), freedom, tuple(dict.fromkeys(scenes))) if freedom else None
+
+
+def _difference(runs: _Runs, name: str, noise: _Noise | None) -> Difference | None:
     """PSNR against what it is a variant of; None where either was not measured, and for the whole network."""
     if name == WHOLE:
         return None
     own, other = (_values(runs, each) for each in (name, _base(name)))
     if not own or not other:
         return None
-    error = None if spread is None else spread * math.sqrt(1 / len(own) + 1 / len(other))
-    return Difference(fmean(own) - fmean(other), error)
-
-
-def _spread(runs: Mapping[str, _Runs]) -> float | None:
-    """Standard deviation of results of one variant on one scene with different seeds, over all of them.
-
-    Seeds are few: those of one scene would show its own noise less well than those of all scenes show the usual one.
-    """
-    squares, freedom = 0.0, 0
-    for of in runs.values():
-        for name in of:
-            values = _values(of, name)
-            squares += sum((value - fmean(values)) ** 2 for value in values)
-            freedom += max(0, len(values) - 1)
-    return math.sqrt(squares / freedom) if freedom else None
+    mean = fmean(own) - fmean(other)
+    if noise is None:
+        return Difference(mean, None, 0)
+    return Difference(mean, noise.psnr * math.sqrt(1 / len(own) + 1 / len(other)), noise.freedom)
 
 
 def _values(runs: _Runs, name: str) -> list[float]:
@@ -155,12 +185,13 @@ def _values(runs: _Runs, name: str) -> list[float]:
 def _table(runs: Mapping[str, _Runs], base: str, names: Sequence[str]) -> Table:
     """What variants change: PSNR on each scene, and means over the scenes of a variant of what else is measured, speeds
     relative to those of the network that it is a variant of."""
-    spread = _spread(runs)
+    noise = _noise(runs)
 
     def row(name: str) -> list[str]:
-        cells = [name, str(max(len(of.get(name, ())) for of in runs.values()))]
+        counts = [len(of[name]) for of in runs.values() if of.get(name)] or [0]
+        cells = [name, "-".join(map(str, dict.fromkeys((min(counts), max(counts)))))]
         for of in runs.values():
-            found = _difference(of, name, spread) if name != base else None
+            found = _difference(of, name, noise) if name != base else None
             value = _mean(_values(of, name))
             effect = NOTHING if found is None else f"{found}{', noise' if found.effect == WITHIN else ''}"
             cells.append(shown(value, "{:.2f}") if name == base else effect)
