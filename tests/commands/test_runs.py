@@ -313,6 +313,7 @@ def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path, optio
     started = Train(scene, tmp_path / "run", from_scratch=True, **options)
     run = checkpoint.Run(scene, None, 0, _configuration(started), variant=started.variant)
     _require_its_options(replace(started, resume=True), run)
+    _require_its_options(replace(started, resume=True), replace(run, variant=None))  # of an older version
     for other, named in (({"method": "nerf"}, "--method nerf"), ({"variant": "views-2"}, "--variant views-2")):
         with pytest.raises(RunError, match=f"was not started with .*{named}"):
             _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=SMALL, variant=None))

@@ -231,7 +231,7 @@ def _require_its_options(options: Train, run: Run) -> None:
     for name, usual, own in (
         ("method", "tidefield", run.config.method),
         ("preset", "swift", preset),
-        ("variant", None, run.variant),
+        ("variant", None, _variant_of(run, preset, options.variant)),
     ):
         if getattr(options, name) not in (usual, own):
             others.append(f"--{name} {getattr(options, name)}")
@@ -244,6 +244,13 @@ def _require_its_options(options: Train, run: Run) -> None:
             f"{options.run} was not started with {', '.join(others)}: expected its own options with --resume; leave "
             f"{'it' if len(others) == 1 else 'them'} out"
         )
+
+
+def _variant_of(run: Run, preset: str, asked: str | None) -> str | None:
+    """The variant that a run was started with; those of older versions do not name it, and may be the one asked for."""
+    if run.variant is None and asked is not None:
+        return asked if vary(PRESETS[preset], asked) == run.config else None
+    return run.variant
 
 
 def _resumed_weights(options: Train, run: Run) -> Path | None:
