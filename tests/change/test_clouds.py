@@ -201,7 +201,7 @@ def test_clouds_over_two_ellipsoids_are_remarked_and_refused_without_registratio
         for name, system in (("a", "EPSG:32632"), ("b", "EPSG:25832"))
     )
     found = open_pair(one, other, tmp_path)
-    assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in other_zeros(found.earlier, found.later)[0]
+    assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (other_zeros(found.earlier, found.later) or "")
     with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
         open_pair(one, other, tmp_path, registered=False)
 

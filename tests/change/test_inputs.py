@@ -11,6 +11,7 @@ from surveys_of_two_dates import pair
 
 from tidefield import cli
 from tidefield.change.inputs import open_pair, open_survey
+from tidefield.change.measure import Options, measure
 from tidefield.change.surfaces import ChangeError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.maps.classes import GROUND
@@ -165,16 +166,14 @@ def test_surfaces_over_two_ellipsoids_are_refused_without_registration(tmp_path:
         write_surface(tmp_path / f"{name}.tif", heights, 1e-5, -75.0, 40.0, system)
         for name, system in (("a", "EPSG:4979"), ("b", "EPSG:6319"))
     )
-    assert open_pair(one, other, tmp_path).clouds is None
+    found = open_pair(one, other, tmp_path)
     with pytest.raises(ChangeError, match=r"WGS 84.*NAD83\(2011\).*one zero"):
-        open_pair(one, other, tmp_path, registered=False)
+        measure(found.earlier, found.later, Options(register="none"))
     with pytest.raises(ChangeError, match="one zero"):
         cli._run(["change", str(one), str(other), str(tmp_path / "out"), "--register", "none"])
 
 
 def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
-    from tidefield.change.measure import measure
-
     heights = surfaces(tmp_path)[0]
     one, two = (open_survey(write_map(tmp_path / str(g), heights, g)) for g in (True, False))
     with pytest.raises(ChangeError, match="has a coordinate system"):

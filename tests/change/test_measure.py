@@ -50,6 +50,16 @@ def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
         assert volume.value_m3 == pytest.approx(true, rel=0.1)
 
 
+def test_heights_over_other_zeros_are_refused_where_nothing_takes_the_difference(tmp_path: Path):
+    surfaces = [open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]]
+    one, other = (replace(surface, datum=datum) for surface, datum in zip(surfaces, ("sea", "take-off"), strict=True))
+    asked = Options(register="none", datum_error_m=0.02)
+    with pytest.raises(ChangeError, match=r"other zeros: sea and take-off.*leave --register none out"):
+        measure(one, other, asked)
+    assert not any("zeros" in remark for remark in measure(one, replace(other, datum="sea"), asked).remarks)
+    assert "heights are over other zeros: sea and take-off; only stable ground" in " ".join(measure(one, other).remarks)
+
+
 def test_a_shift_of_all_heights_is_taken_out_over_stable_ground(tmp_path: Path):
     earlier, later, truth = pair(tmp_path, 1, 0.10, shift=0.3)
     found = measured(earlier, later, stable=east)

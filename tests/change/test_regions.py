@@ -96,3 +96,11 @@ def test_numbers_and_dates_of_whatever_type_are_names(tmp_path: Path, values: np
         layer="ground",
     )
     assert names(tmp_path / "a.gpkg") == expected
+
+
+def test_a_list_is_a_name_of_its_parts(tmp_path: Path):
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [5, 0], [5, 5], [0, 5], [0, 0]]]}
+    features = [{"type": "Feature", "properties": {"name": n}, "geometry": square} for n in (["a", "b"], [3], [])]
+    path = tmp_path / "lists.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    assert [region.name for region in read_regions(path, Grid(None, 0.0, 10.0, 1.0, 10, 10))] == ["a, b", "3", "3 (2)"]

@@ -156,6 +156,19 @@ def test_levelled_water_in_front_of_a_quay_has_heights_where_nodata_is_declared(
     harbour[:, :40] = 0
     surface = open_surface(write_surface(tmp_path / "a.tif", harbour, 1.0, nodata=nodata))
     assert surface.unknown == ((0.0,) if nodata is None else ())
+    assert ["that is taken for levelled water" in remark for remark in surface.remarks] == [nodata is not None]
+
+
+def test_zeros_next_to_high_ground_are_none_where_nodata_is_declared(tmp_path: Path):
+    """As gdal_merge.py -a_nodata without -init leaves them; but levelled water may end at declared nodata."""
+    ground = np.random.default_rng(0).normal(45, 0.2, (100, 100)).astype(np.float32)
+    ground[:, :40] = 0
+    assert open_surface(write_surface(tmp_path / "a.tif", ground, 1.0, nodata=-9999)).unknown == (0.0,)
+    ground[:, 40:50] = -9999
+    assert open_surface(write_surface(tmp_path / "b.tif", ground, 1.0, nodata=-9999)).unknown == (0.0,)
+    ground[:, 50:] -= 44
+    surface = open_surface(write_surface(tmp_path / "c.tif", ground, 1.0, nodata=-9999))
+    assert (surface.unknown, surface.remarks) == ((), [])
 
 
 @pytest.mark.parametrize(("unit", "metre"), [("mm", 0.001), ("cm", 0.01)])
@@ -179,6 +192,13 @@ def test_a_height_is_one_though_programs_write_it_for_nodata(tmp_path: Path, nod
         file.units = ("mm",)
     assert (heights == 9999).any()
     assert open_surface(path).unknown == (-9999.0,)
+
+
+def test_values_that_are_no_heights_do_not_make_one_of_another(tmp_path: Path):
+    heights = np.random.default_rng(0).normal(10, 1, (100, 100)).astype(np.float32)
+    heights[:10], heights[10:12] = np.finfo(np.float32).min, -9999
+    heights[12:14] = -1e30
+    assert set(open_surface(write_surface(tmp_path / "a.tif", heights)).unknown) >= {-9999.0}
 
 
 @pytest.mark.parametrize(("unit", "metre"), [("mm", 0.001), ("cm", 0.01)])
@@ -319,8 +339,10 @@ def test_ellipsoidal_heights_are_not_compared_with_those_over_a_geoid(tmp_path: 
     third = write_surface(tmp_path / "c.tif", plane(20, 20, 1e-5, -4.4, 51.4), 1e-5, -4.4, 51.4, "EPSG:4937")  # ETRS89
     assert common_grid([open_surface(one), open_surface(third)]).rows > 1
     surfaces = [open_surface(path) for path in (one, third)]
-    assert "up to two metres apart: the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in other_zeros(*surfaces)[0]
-    assert other_zeros(surfaces[0], surfaces[0]) == []
+    assert "up to two metres apart: the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (
+        other_zeros(*surfaces) or ""
+    )
+    assert other_zeros(surfaces[0], surfaces[0]) is None
     with pytest.raises(ChangeError, match=r"WGS 84.*ETRS89.*leave --register none out"):
         require_one_zero([(surface.path, surface.zero) for surface in surfaces], registered=False)
 

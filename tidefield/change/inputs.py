@@ -105,7 +105,6 @@ def open_pair(
         raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
     if not is_cloud(earlier):
         surveys = [open_survey(path, date) for path, date in zip((earlier, later), dates, strict=True)]
-        require_one_zero([(survey.path, survey.zero) for survey in surveys], registered)
         clouds = None
         if with_clouds:
             paths = [survey.cloud for survey in surveys]

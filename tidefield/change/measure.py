@@ -157,11 +157,20 @@ def measure(
         regions: reads polygons whose volumes are given one by one.
 
     Raises:
-        ChangeError: the surveys do not overlap, or have too little stable ground.
+        ChangeError: the surveys do not overlap, have too little stable ground, or state other zeros of their heights
+            and are not registered.
     """
     options = options or Options()
     grid = common_grid([earlier, later], options.cell_m)
-    remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks, *other_zeros(earlier, later)])]
+    remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks])]
+    if zeros := other_zeros(earlier, later):
+        if options.register == "none":
+            raise ChangeError(
+                f"{earlier.path.name} and {later.path.name} cannot be compared without registration: {zeros}; expected "
+                "one zero; convert one of them first (gdalwarp), leave --register none out, or, if they are one zero, "
+                "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
+            )
+        remarks.append(f"{zeros}; only stable ground takes the difference")
     shift = _shift(earlier, later, grid, options, remarks)
     moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
     dz, own = read_difference(earlier, later, grid, moved, tick=tick)

@@ -54,6 +54,8 @@ def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
 
 def _name(value: Any) -> str:
     """A name in a column; empty where there is none. Whole numbers beside missing ones are read as floats."""
+    if isinstance(value, np.ndarray | list | tuple):
+        return ", ".join(filter(None, map(_name, value)))
     if value is None or value != value:  # NaN and NaT differ from themselves
         return ""
     return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)

@@ -56,6 +56,8 @@ _ELLIPSOID = "the ellipsoid"
 """How the zeros of ellipsoidal heights are named."""
 _STEP_M = 0.1
 """Where a survey ends, most of its heights are further from zero than this."""
+_QUAY_M = 10.0
+"""No quay is higher above levelled water."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -358,12 +360,18 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
         elif crs is not None and has_unstated_unit(crs):
             remarks.append(unstated_unit(path, crs, "gdal_edit.py -a_srs"))
         nodata = dataset.nodata
-        found, share = _undeclared(dataset, metres)
+        found, share, doubtful = _undeclared(dataset, metres)
         if found:
             declared = "no nodata" if nodata is None else f"nodata {nodata:g}"
             remarks.append(
                 f"{path.name} declares {declared}, but has {' and '.join(f'{value:g}' for value in found)} where no "
                 f"height can be, in {100 * share:.1f}% of its cells: read as such"
+            )
+        if doubtful:
+            remarks.append(
+                f"{path.name} has 0 next to heights far from it, in {100 * doubtful:.1f}% of its cells: as it declares "
+                f"nodata {nodata:g}, that is taken for levelled water; if it is none, leave it out with gdalwarp "
+                "-srcnodata 0"
             )
         # Where a file has a mask, GDAL reads that or the declared value, not both.
         if _masked(dataset) and nodata is not None and math.isfinite(nodata):
@@ -412,8 +420,12 @@ def _masked(dataset: Any) -> bool:
     return MaskFlags.per_dataset in dataset.mask_flag_enums[0]
 
 
-def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float]:
-    """Find the values that stand for no height where neither nodata nor a mask says so, and their share of cells."""
+def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
+    """Find the values that stand for no height where neither nodata nor a mask says so.
+
+    Returns:
+        the values; their share of cells; the share of zeros that may be levelled water, or no heights.
+    """
     height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
     raw = dataset.read(1, out_shape=(height, width), masked=True)
     values = raw.filled(0).astype(np.float64)
@@ -423,7 +435,8 @@ def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float]:
     scale, offset = dataset.scales[0], dataset.offsets[0]
     floats, found = np.issubdtype(raw.dtype, np.floating), []
     sentinels = (*_SENTINELS, float(np.finfo(np.float32).min))
-    others = values[known & ~np.isin(values, sentinels)]
+    possible = np.abs(values * scale + offset) * metres <= _IMPOSSIBLE_M
+    others = values[known & possible & ~np.isin(values, sentinels)]
     # Where many heights are lower and many higher, as 9.999 m in millimetres may be, it is one of them.
     low, high = np.quantile(others, (0.001, 0.999)) if len(others) else (math.inf, -math.inf)
     for value in sentinels:
@@ -433,12 +446,19 @@ def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float]:
         if (unlikely or dataset.nodata is None) and not among and (known & (values == value)).any():
             found.append(value)
     zero, heights = known & (values == 0), known & (values != 0) & ~np.isin(values, found)
-    if offset == 0 and dataset.nodata is None and heights.any():
+    doubtful = 0.0
+    if offset == 0 and heights.any():
         sizes_m = np.abs(values) * abs(scale) * metres
-        far = np.quantile(sizes_m[heights], 0.01) > _FAR_M
-        if (far and _is_outside(zero, heights, sizes_m)) or (floats and _is_outside(_at_edges(zero), heights, sizes_m)):
+        lowest, declared = float(np.quantile(sizes_m[heights], 0.01)), dataset.nodata is not None
+        regions = [*([zero] if lowest > _FAR_M else []), *([_at_edges(zero)] if floats else [])]
+        step = max((_step_m(region, heights, sizes_m) for region in regions), default=0.0)
+        if declared and math.isinf(step):
+            step = lowest  # nodata may lie between levelled water and its shore
+        if step > (_QUAY_M if declared else _STEP_M):
             found.append(0.0)
-    return found, float((known & np.isin(values, found)).mean())
+        elif declared and step > _FAR_M:
+            doubtful = float(zero.mean())
+    return found, float((known & np.isin(values, found)).mean()), doubtful
 
 
 def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
@@ -449,23 +469,23 @@ def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "row
     return np.isin(numbers, edges[edges > 0])
 
 
-def _is_outside(
+def _step_m(
     zero: Bool[np.ndarray, "rows columns"], heights: Bool[np.ndarray, "rows columns"], sizes_m: np.ndarray
-) -> bool:
-    """Whether zeros lie where a survey has no heights: its heights end there, those of a shore run out.
+) -> float:
+    """How far from zero heights are that end next to zeros; 0 where they run out to zero, as those of a shore do.
 
     A sea that was levelled is zero in large areas, too. Its shore rises no further to the first cell than from that to
-    the second, however steep it is and however large its cells are. Zeros that touch no height are outside.
+    the second, however steep it is and however large its cells are. Zeros that touch no height have an infinite step.
     """
     if zero.mean() <= _ZERO_SHARE:
-        return False
+        return 0.0
     near = np.asarray(binary_dilation(zero), bool)
     first, second = near & heights, binary_dilation(near) & heights & ~near
     if not first.any():
-        return True
+        return math.inf
     here = float(np.median(sizes_m[first]))
     further = float(np.median(sizes_m[second])) if second.any() else here
-    return here > max(_STEP_M, 2 * abs(further - here))
+    return here if here > 2 * abs(further - here) else 0.0
 
 
 def date_in(text: str) -> str | None:
@@ -484,13 +504,14 @@ def same_system(one: CRS, other: CRS) -> bool:
     return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
 
 
-def other_zeros(earlier: Surface, later: Surface) -> list[str]:
-    """A remark where surfaces state other zeros of their heights, by their systems or in words."""
-    for one, other in ((earlier.zero, later.zero), (earlier.datum, later.datum)):
-        if one is not None and other is not None and one != other:
-            apart = ", up to two metres apart" if one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID) else ""
-            return [f"heights are over other zeros{apart}: {one} and {other}; only stable ground takes the difference"]
-    return []
+def other_zeros(earlier: Surface, later: Surface) -> str | None:
+    """Name the zeros of two surfaces' heights, by their systems or else in words, if they state different ones."""
+    by_system = earlier.zero, later.zero
+    one, other = by_system if None not in by_system else (earlier.datum, later.datum)
+    if one is None or other is None or one == other:
+        return None
+    apart = ", up to two metres apart" if one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID) else ""
+    return f"heights are over other zeros{apart}: {one} and {other}"
 
 
 def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
