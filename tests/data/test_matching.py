@@ -232,7 +232,19 @@ def test_a_cameras_own_photograph_takes_no_part():
     other[TARGET] = 255 - other[TARGET]
     at = replace(at, photographs=replace(at.photographs, colours=tuple(other)))
     assert torch.equal(matched(at, cells), without)
-    assert not torch.equal(matched(at, cells, names=False), without)
+
+
+def test_photographs_from_the_cameras_own_place_say_nothing_of_depth():
+    """One fits at any depth, so that the others decide as if it were not there; alone they leave the start."""
+    at = wall.scene(wall.cameras(7, 128, 96, step=STEP), ())
+    camera = at.cameras[TARGET]
+    start = 1.05 * surface_prior(camera, at.points, at.cameras)
+    assert torch.equal(matched(at, start, names=False), matched(at, start))
+    place = at.cameras.T_world_camera.clone()
+    place[:, :, 3] = torch.tensor([1.3, 0.7, 0.2])
+    panorama = replace(at, cameras=replace(at.cameras, T_world_camera=place))
+    prior = Matcher(panorama)(panorama.cameras[TARGET], start)
+    torch.testing.assert_close(prior.cells, start)
 
 
 def test_a_gpu_matches_photographs_that_were_read_at_the_same_time(monkeypatch: pytest.MonkeyPatch):

@@ -57,6 +57,9 @@ WINDOW_PX, WIDE_PX, WIDE_SHARE = 5, 15, 0.5
 holds too little texture."""
 HOLD = 0.001
 """Cost of a step away from the depth of the level before, squared: what decides where there is no texture."""
+LEAST_ANGLE_RAD, WHOLE_ANGLE_RAD = math.radians(0.3), math.radians(1.0)
+"""Photographs from directions less different than the first say nothing of depth, those beyond the second all they can:
+one from the camera's own place fits at any depth."""
 SMOOTH_PX = 3
 """Side of the window of the smoothing."""
 LEAST_COST = 0.02
@@ -249,12 +252,14 @@ class Matcher:
         uv, z = sources.project(points)
         seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
         theirs = F.normalize(points - sources.position_world[:, None], dim=-1)
-        angle = angle_between(F.normalize(rays, dim=-1), theirs).masked_fill(~seen, torch.inf)
+        angle = angle_between(F.normalize(rays, dim=-1), theirs)
+        angle = angle.masked_fill(~seen | (angle < LEAST_ANGLE_RAD), torch.inf)
         nearest, which = angle.topk(min(VIEWS + 1, len(sources)), dim=0, largest=False)
         # The weight falls to 0 at the first photograph left out, so that the cost is continuous.
         limit = nearest[VIEWS] if len(sources) > VIEWS else torch.full_like(nearest[0], torch.inf)
         nearest, which = nearest[:VIEWS], which[:VIEWS]
         share = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
+        share = share * ((nearest - LEAST_ANGLE_RAD) / (WHOLE_ANGLE_RAD - LEAST_ANGLE_RAD)).clamp(max=1)
         weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
         weight = weight * from_border(uv, sources.size_px[:, None], BORDER)
         used = (weight > 0).any(1)
