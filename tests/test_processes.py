@@ -14,10 +14,8 @@ from tidefield import processes
 from tidefield.compare.run import run_measured
 
 ROOT = Path(__file__).parents[1]
-CHILD = """
-import os, sys, time
-from tidefield.processes import worker_processes
-from tidefield.compare.run import run_measured
+WORK = """
+import os, time
 
 def work(file):
     open(file, "w").write(str(os.getpid()))
@@ -25,6 +23,12 @@ def work(file):
 
 def start():
     import tidefield.survey  # whose pycolmap handles SIGTERM in its own way
+"""
+CHILD = """
+import sys
+from tidefield.processes import worker_processes
+from tidefield.compare.run import run_measured
+from own_work import start, work
 
 if __name__ == "__main__":
     from tidefield.processes import ended_by_signals
@@ -42,6 +46,7 @@ def start(folder: Path, kind: str) -> tuple[subprocess.Popen[str], int]:
     """A process with a child of a kind, and the child's number."""
     program, file = folder / "program.py", folder / "child"
     program.write_text(CHILD)
+    (folder / "own_work.py").write_text(WORK)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(program), kind, str(file)]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -141,3 +146,14 @@ def test_a_signal_waits_until_the_workers_have_been_started(tmp_path: Path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr, done.returncode) == ("ended\n", "", 0)
+
+
+def test_a_script_without_a_main_block_starts_workers(tmp_path: Path):
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from tidefield.processes import worker_processes\n"
+        "with worker_processes(2) as pool:\n    print('worked', list(pool.map(int, '12')))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr, done.returncode) == ("worked [1, 2]\n", "", 0)

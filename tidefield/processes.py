@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from multiprocessing import spawn
+from multiprocessing.context import SpawnContext, SpawnProcess
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -101,6 +103,31 @@ def _end_after_parent() -> None:
     os._exit(1)
 
 
+class _Worker(SpawnProcess):
+    """Does not run the script that started it, which may have no `if __name__ == "__main__"`: tasks are in modules."""
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        usual = spawn.get_preparation_data
+
+        def without_script(name: str) -> dict[str, Any]:
+            return {key: value for key, value in usual(name).items() if not key.startswith("init_main")}
+
+        with _STARTING:
+            spawn.get_preparation_data = without_script
+            try:
+                return SpawnProcess._Popen(process_obj)
+            finally:
+                spawn.get_preparation_data = usual
+
+
+_STARTING = threading.Lock()
+
+
+class _Context(SpawnContext):
+    Process = _Worker
+
+
 class _Pool(ProcessPoolExecutor):
     """Handles no signal while it submits: the first task starts all processes, and one whose start is interrupted waits
     in vain for what it is to run, and is not among the children yet."""
@@ -133,9 +160,10 @@ def in_order(
 def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterator[ProcessPoolExecutor]:
     """Processes that work for this one, spawned, because forking a process with threads may hang.
 
+    What they do and are given is of modules: they do not run the script that this process runs.
     They end with the block. After an error or a signal they do not finish what they are doing.
     """
-    pool = _Pool(count, multiprocessing.get_context("spawn"), start_worker, initializers)
+    pool = _Pool(count, _Context(), start_worker, initializers)
     try:
         yield pool
     except BaseException:
