@@ -154,6 +154,16 @@ def test_a_background_shows_where_nothing_is(scene: Scene):
     network.coarse, network.fine = Nothing(SMALL), Nothing(SMALL)
     view = make_render(network, replace(scene, background_rgb=(1.0, 0.5, 0.0)), CPU)(scene.cameras[0])
     torch.testing.assert_close(view.colour, torch.tensor([1.0, 0.5, 0.0]).expand(36, 48, 3))
+    torch.testing.assert_close(view.depth, scene.cameras[0].near_far.mean().expand(36, 48))
+
+
+def test_the_depth_of_thin_fog_lies_within_it(scene: Scene):
+    network = fog()
+    network.radius.fill_(20.0)
+    near, far = scene.cameras[0].near_far[0]
+    view = make_render(network, replace(scene, background_rgb=(0.0, 0.0, 0.0)), CPU)(scene.cameras[0])
+    assert view.opacity.max() < 0.9
+    assert (view.depth > near + 0.2 * (far - near)).all()
 
 
 def test_a_view_that_is_not_wanted_any_more_ends_at_the_next_rays(scene: Scene):

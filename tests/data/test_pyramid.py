@@ -90,7 +90,7 @@ def test_several_rays_give_the_mean_of_their_colours_and_of_their_inverse_depths
     assert view.colour.shape == (2, 4, 3)
     first = torch.tensor([1.0, 2.0, 9.0, 10.0]).mean()
     torch.testing.assert_close(view.colour[0, 0], first.expand(3) / 100)
-    torch.testing.assert_close((1 / view.depth)[0, 0], first)
+    torch.testing.assert_close((1 / view.depth)[0, 0], torch.tensor((1.0 + 4 + 81 + 100) / 22))  # by their opacity
     torch.testing.assert_close(view.opacity[0, 0], first / 100)
 
 

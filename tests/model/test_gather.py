@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.baselines.untrained import read_photograph
-from tidefield.model.rendering import fill_unseen
+from tidefield.model.rendering import Rendering, fill_unseen, render_with_rays
 from tidefield.model.views import (
     concatenate,
     gather,
@@ -229,3 +229,20 @@ def test_a_doubled_picture_is_read_at_its_pixels_and_up_to_its_border():
     torch.testing.assert_close(values[0, 0, :4], picture[0, :, y, x].T)
     outside = corner + torch.tensor([[-0.1, 3], [8.1, 3], [4, -0.1], [4, 6.1]]).double()
     assert not gather(maps, torch.tensor([[0]]), outside[None, None])[1].any()
+
+
+@pytest.mark.parametrize("width", [64, 65, 100])
+def test_a_ramp_is_continued_at_its_place_whatever_the_size(width: int):
+    ramp = torch.linspace(0, 1, width)[None, :, None].expand(width, width, 3)
+    seen = torch.ones(width, width, dtype=torch.bool)
+    seen[:, width // 2 - 6 : width // 2 + 6] = False
+    assert (fill_unseen(ramp, seen) - ramp).abs().max() < 0.12
+
+
+def test_the_depth_of_several_rays_is_that_of_those_that_meet_something():
+    view = Rendering(torch.zeros(2, 2, 3), torch.tensor([[4.0, 50.0], [4.0, 50.0]]), torch.tensor([[1.0, 0], [1, 0]]))
+    camera = wall.cameras(1, 1, 1)[0]
+    pixel = render_with_rays(lambda camera: view, camera, 2)
+    assert (pixel.depth.item(), pixel.opacity.item()) == pytest.approx((4.0, 0.5))
+    nothing = replace(view, opacity=torch.zeros(2, 2))
+    assert render_with_rays(lambda camera: nothing, camera, 2).depth.isfinite().all()

@@ -242,7 +242,9 @@ def make_render(network: Nerf, scene: Scene, device: torch.device) -> Render:
             check_interrupted()
             rays = Rays.of(here, torch.zeros(len(uv), dtype=torch.long, device=device), uv)
             _, seen = network(rays, scene.background_rgb is None)
-            parts.append(torch.cat([seen.colour, seen.depth[:, None], seen.opacity[:, None]], dim=-1).cpu())
+            # Expected where something is; in the middle where nothing is.
+            depth = torch.where(seen.opacity > 0, seen.depth / seen.opacity, rays.near_far.mean(1))
+            parts.append(torch.cat([seen.colour, depth[:, None], seen.opacity[:, None]], dim=-1).cpu())
         colour, depth, opacity = torch.cat(parts).reshape(camera.height, camera.width, 5).split([3, 1, 1], dim=-1)
         colour = colour * camera.gain_of_rows()
         if scene.background_rgb is not None:

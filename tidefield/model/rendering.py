@@ -51,8 +51,10 @@ def fill_unseen(colour: Float[Tensor, "H W 3"], seen: Bool[Tensor, "H W"]) -> Fl
     # The floor keeps blocks without a seen pixel finite; they are filled from the next coarser ones.
     coarse = (coarse / coarse_weight.clamp(min=1e-6))[0].permute(1, 2, 0)
     coarse = fill_unseen(coarse, coarse_weight[0, 0] > 0)
-    filled = F.interpolate(coarse.permute(2, 0, 1)[None], size=seen.shape, mode="bilinear", align_corners=False)
-    return torch.where(seen[..., None], colour, filled[0].permute(1, 2, 0))
+    # By two, also where the last block is cut off: each block stays where its pixels are.
+    filled = F.interpolate(coarse.permute(2, 0, 1)[None], scale_factor=2.0, mode="bilinear", align_corners=False)
+    height, width = seen.shape
+    return torch.where(seen[..., None], colour, filled[0, :, :height, :width].permute(1, 2, 0))
 
 
 Render = Callable[[Cameras], Rendering]
@@ -65,10 +67,13 @@ def with_rays(render: Render, sampling: Sampling) -> Render:
 
 
 def render_with_rays(render: Render, camera: Cameras, side: int) -> Rendering:
-    """Render with side x side rays per pixel: the mean colour and opacity, and the depth of the mean inverse depth."""
+    """Render with side x side rays per pixel: the mean colour and opacity, and the depth of the mean inverse depth of
+    what is not empty."""
     if side == 1:
         return render(camera)
     view = render(camera.resized(side * camera.width, side * camera.height))
     colour = F.avg_pool2d(view.colour.permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
-    inverse_depth, opacity = F.avg_pool2d(torch.stack([1 / view.depth, view.opacity])[None], side)[0]
-    return Rendering(colour=colour, depth=1 / inverse_depth, opacity=opacity)
+    inverse, opacity = 1 / view.depth, view.opacity
+    whole, opacity, covered = F.avg_pool2d(torch.stack([inverse, opacity, opacity * inverse])[None], side)[0]
+    inverse = torch.where(opacity > 0, covered / opacity.clamp(min=torch.finfo(opacity.dtype).tiny), whole)
+    return Rendering(colour=colour, depth=1 / inverse, opacity=opacity)
