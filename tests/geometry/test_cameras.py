@@ -162,6 +162,13 @@ def test_indexing_keeps_the_order_of_the_indices():
             assert torch.equal(getattr(picked, name), getattr(own, name)[expected])
 
 
+def test_an_integer_of_any_kind_selects_one_camera_with_its_name():
+    named = replace(bent(), names=("0.jpg", "1.jpg", "2.jpg"))
+    for index in (1, np.int64(1), torch.tensor(1)):
+        one = named[index]
+        assert (len(one), one.names) == (1, ("1.jpg",))
+
+
 def test_the_pixel_grid_goes_row_by_row_through_pixel_centres():
     expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
     assert pixel_grid(3, 2).tolist() == expected

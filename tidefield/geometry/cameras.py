@@ -7,9 +7,11 @@ a `Cameras` exists (see `geometry.lenses`), but for the small `residual` that a 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import PurePath
+from typing import SupportsIndex
 
 import numpy as np
 import torch
@@ -68,16 +70,16 @@ class Cameras:
     def __repr__(self) -> str:
         return f"Cameras({len(self)} of {describe_sizes(self)})"
 
-    def __getitem__(self, index: int | slice | list[int] | str | Tensor) -> Cameras:
+    def __getitem__(self, index: SupportsIndex | slice | list[int] | str | Tensor) -> Cameras:
         """Select cameras; an integer or a photograph's name gives a batch of one. A tensor's selection has no names.
 
         Raises:
             SceneError: no photograph has this name.
         """
         if isinstance(index, str):
-            index = find_name(index, self.names, "these cameras")
-        if isinstance(index, int):
-            index = [index]
+            index = [find_name(index, self.names, "these cameras")]
+        elif isinstance(index, SupportsIndex) and not (isinstance(index, Tensor) and index.ndim):
+            index = [operator.index(index)]
         names: tuple[str, ...] = ()
         if self.names and isinstance(index, slice):
             names = self.names[index]
