@@ -69,6 +69,14 @@ def test_the_hull_holds_the_ball_and_little_else(size: int):
     assert not hull.contains(CENTRE + outwards * 3).any()
 
 
+def test_the_hull_holds_an_object_that_is_larger_than_the_frames():
+    """Each place of it is in four frames of ten."""
+    views = around()
+    closer = replace(views, focal_px=2.6 * views.focal_px)
+    outwards = torch.nn.functional.normalize(CENTRE - views.position_world, dim=-1)
+    assert hull_of(closer, range(24)).contains(CENTRE + 0.97 * RADIUS * outwards).all()
+
+
 def test_a_new_views_rays_meet_the_surface_within_the_range():
     cameras = around(25)
     hull, new = hull_of(cameras, range(24)), cameras[24]

@@ -26,8 +26,9 @@ HALVINGS = 2
 """Subdivisions of the remaining voxels afterwards."""
 SILHOUETTE_PX, MOST_SILHOUETTES = 400, 100
 """Longest side and number of the silhouettes used: larger and more ones change the hull little."""
-LEAST_SEEN, LEAST_SHARE = 3, 0.5
-"""A voxel must lie in the frames of so many silhouettes, and of this share of them: others are hardly constrained."""
+LEAST_SEEN, LEAST_SHARE = 3, 0.3
+"""A voxel must lie in the frames of so many silhouettes, and of this share of them: others are hardly constrained. Each
+part of an object that is larger than the frames is in some of them only."""
 STEPS_PER_VOXEL = 1.5
 
 
