@@ -15,6 +15,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from tidefield.baselines import opensplat
+from tidefield.baselines.export import at_common_exposure, exposure_factor, point_colours
 from tidefield.config import Budget
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SceneError
@@ -268,3 +269,14 @@ def test_a_damaged_job_is_named(job: str, run: Path):
     (run / "opensplat" / "job.json").write_text(job)
     with pytest.raises(RunError, match=r"job\.json.*expected"):
         opensplat.progress_of(run)
+
+
+def test_points_have_the_exposure_of_the_photographs(scene: Scene):
+    assert scene.points is not None
+    factor, first = exposure_factor(scene, scene.train), scene.train[0]
+    mine = scene.points.camera_index == first
+    u, v = scene.points.uv_px[mine].floor().long().unbind(-1)
+    inside = (u >= 0) & (v >= 0) & (u < 48) & (v < 36)
+    found = point_colours(scene, factor)[scene.points.point_index[mine][inside].numpy()]
+    assert (found == at_common_exposure(scene, first, factor)[v[inside], u[inside]]).all()
+    assert (found != scene.photographs[first][v[inside], u[inside]].numpy()).mean() > 0.6

@@ -336,7 +336,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
         scene.cameras.T_world_camera[list(scene.train), :3].double().numpy(),
         (range(len(files)), ()),
         points.xyz_world.double().numpy(),
-        point_colours(scene),
+        point_colours(scene, factor),
         per_frame=True,
         overwrite=True,
     )

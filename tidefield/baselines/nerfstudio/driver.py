@@ -281,7 +281,7 @@ def export(scene: Scene, folder: Path) -> Colours:
         cameras.T_world_camera[:, :3].double().numpy(),
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
-        point_colours(scene),
+        point_colours(scene, colours.factor),
         masks=masks,
         overwrite=True,
     )
