@@ -200,8 +200,8 @@ def cost_table(results: Results) -> Table:
                 f"{scene}, {method}",
                 shown(seconds and seconds / 60, "{:.1f}"),
                 shown(result.trained("steps"), "{:,}"),
-                f"{result.evaluation['seconds_per_frame']:.2f}",
-                f"{result.evaluation['rays_per_second']:,.0f}",
+                shown(result.evaluation["seconds_per_frame"], "{:.2f}"),
+                shown(result.evaluation["rays_per_second"], "{:,.0f}"),
                 ", ".join(shown(peak and peak / 1e9, "{:.2f}") for peak in peaks),
             ]
         )
