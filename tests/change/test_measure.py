@@ -136,6 +136,16 @@ def test_the_comparison_is_limited_to_polygons(tmp_path: Path):
     assert found.errors.registration.stable_cells > 1000
 
 
+def test_stable_ground_is_found_outside_of_what_is_asked_about(tmp_path: Path):
+    earlier, later, truth = pair(tmp_path, 6, 0.1)
+    area = Region("pit", shapely.box(WEST + 16, NORTH - 44, WEST + 44, NORTH - 16))
+    found = measured(earlier, later, within=lambda grid: [area])
+    true = float(truth[32:88, 32:88].sum()) * AREA
+    assert found.net.value_m3 == pytest.approx(true, rel=0.1)
+    assert found.net.interval_m3[0] < true < found.net.interval_m3[1]
+    assert found.net.area_m2 == pytest.approx(28**2, rel=0.01)
+
+
 def test_parts_of_the_survey_share_what_the_choice_of_outlines_adds(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 4, 0.2)
     halves = [

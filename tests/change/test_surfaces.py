@@ -9,6 +9,7 @@ from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
 from tidefield.change.surfaces import ChangeError, common_grid, open_surface, other_zeros, require_one_zero
+from tidefield.change.write import CHANGE_BANDS
 
 
 def plane(rows: int, columns: int, cell: float, west: float = WEST, north: float = NORTH) -> np.ndarray:
@@ -380,8 +381,29 @@ def test_a_system_in_one_file_only_is_refused(tmp_path: Path):
 
 
 def test_a_picture_is_no_surface(tmp_path: Path):
+    import rasterio
+    from rasterio.enums import ColorInterp
+
     path = write_surface(tmp_path / "a.tif", np.zeros((3, 20, 20), np.uint8))
     with pytest.raises(ChangeError, match="picture"):
+        open_surface(path)
+    with pytest.raises(ChangeError, match="picture"):  # a hillshade
+        open_surface(write_surface(tmp_path / "b.tif", np.zeros((20, 20), np.uint8)))
+    deep = write_surface(tmp_path / "c.tif", np.ones((4, 20, 20), np.uint16))
+    assert [remark for remark in open_surface(deep).remarks if "has 4 bands" in remark]
+    with rasterio.open(deep, "r+") as file:
+        file.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+    with pytest.raises(ChangeError, match="picture"):
+        open_surface(deep)
+
+
+def test_a_result_of_change_is_no_surface(tmp_path: Path):
+    import rasterio
+
+    path = write_surface(tmp_path / "a.tif", np.zeros((20, 20), np.float32))
+    with rasterio.open(path, "r+") as file:
+        file.set_band_description(1, CHANGE_BANDS[0])
+    with pytest.raises(ChangeError, match="has 'dz: later minus earlier height"):
         open_surface(path)
 
 

@@ -179,12 +179,8 @@ def measure(
     given = rasterised(stable(grid), grid) if stable is not None else None
     if given is not None:
         given &= np.isfinite(dz)
-    if within is not None:
-        # Stable ground may lie outside of what is asked about.
-        area = rasterised(within(grid), grid)
-        dz[~(area | given) if given is not None else ~area] = np.nan
-    else:
-        area = None
+    # Stable ground lies outside of what is asked about, too.
+    area = rasterised(within(grid), grid) if within is not None else None
     known = int(np.isfinite(dz).sum())
     if area is not None and not np.isfinite(dz[area]).any():
         raise ChangeError(

@@ -58,6 +58,8 @@ _STEP_M = 0.1
 """Where a survey ends, most of its heights are further from zero than this."""
 _QUAY_M = 10.0
 """No quay is higher above levelled water."""
+_RESULTS = ("dz:", "standard error", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
+"""How this program describes what is no height in its rasters."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -324,11 +326,10 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
     """
     remarks: list[str] = []
     with opened(path) as dataset:
-        if dataset.count > 2 and dataset.dtypes[0] == "uint8":
-            raise ChangeError(
-                f"{path} has {dataset.count} bands of bytes, which is a picture: expected one band of heights; name "
-                "the surface model (dsm.tif)"
-            )
+        if what := _other_than_heights(dataset):
+            raise ChangeError(f"{path} {what}: expected one band of heights; name the surface model (dsm.tif)")
+        if dataset.count > 2:
+            remarks.append(f"{path.name} has {dataset.count} bands: the first is taken for heights")
         transform = dataset.transform
         if tuple(transform)[:6] == (1, 0, 0, 0, 1, 0) or abs(transform.b) + abs(transform.d) > 1e-9 * abs(transform.a):
             raise ChangeError(
@@ -397,6 +398,19 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
             remarks=remarks,
             unknown=tuple(found),
         )
+
+
+def _other_than_heights(dataset: Any) -> str | None:
+    """What a raster holds instead of heights, as far as it says so."""
+    from rasterio.enums import ColorInterp
+
+    plain = (dataset.scales[0], dataset.offsets[0]) == (1, 0)
+    if ColorInterp.red in dataset.colorinterp or (dataset.dtypes[0] == "uint8" and plain):
+        return "has colours or bytes, which is a picture"
+    described = dataset.descriptions[0] or ""
+    if described.startswith(_RESULTS):
+        return f"has {described!r}, a result of change or map"
+    return None
 
 
 def unstated_unit(path: Path, crs: CRS, tool: str) -> str:
