@@ -98,6 +98,27 @@ def test_maps_in_a_known_system_bring_it_and_their_clouds(tmp_path: Path):
     assert found.clouds[0].sigma.max() == pytest.approx(SIGMA_M)
 
 
+def test_models_of_one_kind_are_compared(tmp_path: Path):
+    from surveys_of_two_dates import write_surface
+
+    flat = np.zeros((20, 20), np.float32)
+    for name in ("both/odm_dem/dsm.tif", "both/odm_dem/dtm.tif", "bare/odm_dem/dtm.tif", "top/dsm.tif"):
+        write_surface(tmp_path / name, flat)
+    both, bare, top = (tmp_path / name for name in ("both", "bare", "top"))
+
+    def kinds(one: Path, other: Path) -> tuple[list[str], bool]:
+        found = open_pair(one, other, tmp_path)
+        remarks = [*found.earlier.remarks, *found.later.remarks]
+        return [found.earlier.path.stem, found.later.path.stem], any("a terrain model" in text for text in remarks)
+
+    assert kinds(both, both) == (["dsm", "dsm"], False)
+    assert kinds(both, bare) == (["dtm", "dtm"], False)
+    assert kinds(both, bare / "odm_dem" / "dtm.tif") == (["dtm", "dtm"], False)
+    assert kinds(top, bare) == (["dsm", "dtm"], True)
+    heights = write_surface(tmp_path / "2024.tif", flat)
+    assert kinds(both, heights) == (["dsm", "2024"], False)
+
+
 def test_surveys_that_are_called_the_same_are_told_apart_by_their_folders(tmp_path: Path):
     earlier, later, _ = surfaces(tmp_path)
     one, two = (write_map(tmp_path / name / "out" / "map", earlier, True) for name in ("spring", "autumn"))
@@ -176,5 +197,5 @@ def test_surfaces_over_two_ellipsoids_are_refused_without_registration(tmp_path:
 def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
     heights = surfaces(tmp_path)[0]
     one, two = (open_survey(write_map(tmp_path / str(g), heights, g)) for g in (True, False))
-    with pytest.raises(ChangeError, match="has a coordinate system"):
+    with pytest.raises(ChangeError, match="True has a coordinate system, False has none"):
         measure(one, two)

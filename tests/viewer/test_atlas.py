@@ -115,6 +115,13 @@ def test_a_change_between_maps_in_a_local_frame_is_in_units_of_the_scene(tmp_pat
     assert Atlas([tmp_path / "units", tmp_path / "a"]).unit == "units"
 
 
+def test_a_map_on_the_earth_and_one_in_a_frame_of_its_own_are_refused(tmp_path: Path):
+    placed = write_map(tmp_path / "placed", (1, 2, 3))
+    write_surface(tmp_path / "local" / "dsm.tif", np.zeros(SHAPE, np.float32), CELL, crs=LOCAL_WKT)
+    with pytest.raises(RunError, match=r"local lies in a local frame, .*placed in WGS 84 / UTM zone 30N"):
+        Atlas([placed, tmp_path / "local"])
+
+
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
     heights = np.ones(SHAPE, np.float32)
     heights[40:, 40:] = -9999

@@ -11,6 +11,7 @@ from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surfac
 
 FILLED = "filled.tif"
 """Of `tidefield map --fill`, next to the surface."""
+_SURFACE, _TERRAIN = "dsm", "dtm"
 SURFACES = ("odm_dem/dsm.tif", "odm_dem/dtm.tif", "dsm.tif", "dtm.tif")
 ORTHOPHOTOS = ("odm_orthophoto/odm_orthophoto.tif", "orthophoto.tif", "ortho.tif")
 CLOUDS = tuple(
@@ -20,11 +21,12 @@ CLOUDS = tuple(
 )
 
 
-def open_survey(path: Path, date: str | None = None) -> Surface:
+def open_survey(path: Path, date: str | None = None, surfaces: tuple[str, ...] = SURFACES) -> Surface:
     """Open a survey: a GeoTIFF of heights, or a folder of `tidefield map` or ODM.
 
     Args:
         date: of the survey, YYYY-MM-DD; None takes it from its files or their names.
+        surfaces: of a folder, the first that is there.
 
     Raises:
         ChangeError: there is no surface.
@@ -35,7 +37,7 @@ def open_survey(path: Path, date: str | None = None) -> Surface:
         # Another surface in that folder is none of the map's.
         mapped = path.name in {Path(name).name for name in SURFACES}
         return replace(open_surface(path, date), filled=first_of(path.parent, (FILLED,)) if mapped else None)
-    surface = first_of(path, SURFACES)
+    surface = first_of(path, surfaces)
     if surface is None:
         raise ChangeError(
             f"{path} has no surface: expected one of {', '.join(SURFACES)}, as `tidefield map` and ODM write them; "
@@ -104,7 +106,14 @@ def open_pair(
         cloud = earlier if is_cloud(earlier) else later
         raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
     if not is_cloud(earlier):
-        surveys = [open_survey(path, date) for path, date in zip((earlier, later), dates, strict=True)]
+        alike = _alike(earlier, later)
+        surveys = [open_survey(path, date, alike) for path, date in zip((earlier, later), dates, strict=True)]
+        if {survey.path.stem for survey in surveys} == {_SURFACE, _TERRAIN}:
+            remark = (
+                f"one survey is a surface model ({_SURFACE}.tif), the other a terrain model ({_TERRAIN}.tif): what "
+                "stands on the ground counts as change"
+            )
+            surveys[0] = replace(surveys[0], remarks=[*surveys[0].remarks, remark])
         clouds = None
         if with_clouds:
             paths = [survey.cloud for survey in surveys]
@@ -124,6 +133,16 @@ def open_pair(
         opened = open_surface(path, date or date_in(cloud.path.stem))
         surfaces.append(replace(opened, source=cloud.path.name, datum=cloud.zero, remarks=list(cloud.remarks)))
     return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
+
+
+def _alike(earlier: Path, later: Path) -> tuple[str, ...]:
+    """The surfaces of folders that both surveys have one of: of one kind if they do, surface models before terrain."""
+    for kind in (_SURFACE, _TERRAIN):
+        names = tuple(name for name in SURFACES if Path(name).stem == kind)
+        other = {_SURFACE, _TERRAIN} - {kind}
+        if all(first_of(path, names) if path.is_dir() else path.stem not in other for path in (earlier, later)):
+            return names
+    return SURFACES
 
 
 def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tuple[Surface, Surface]:

@@ -166,7 +166,7 @@ def measure(
     if zeros := other_zeros(earlier, later):
         if options.register == "none":
             raise ChangeError(
-                f"{earlier.path.name} and {later.path.name} cannot be compared without registration: {zeros}; expected "
+                f"{earlier.file} and {later.file} cannot be compared without registration: {zeros}; expected "
                 "one zero; convert one of them first (gdalwarp), leave --register none out, or, if they are one zero, "
                 "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
             )
@@ -184,13 +184,13 @@ def measure(
     known = int(np.isfinite(dz).sum())
     if area is not None and not np.isfinite(dz[area]).any():
         raise ChangeError(
-            f"{earlier.path.name} and {later.path.name} have no cell with heights of both within the polygons that the "
+            f"{earlier.file} and {later.file} have no cell with heights of both within the polygons that the "
             "comparison is limited to: expected some; check --within, and the surveys' nodata there"
         )
     if known < LEAST_STABLE:
         raise ChangeError(
-            f"{earlier.path.name} and {later.path.name} both have heights in {known} cells: expected at least "
-            f"{LEAST_STABLE}; check their nodata and their places"
+            f"{earlier.file} and {later.file} both have heights in {known} cells: expected at least "
+            f"{LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
         )
     model: Model = "vertical" if options.register == "auto" else options.register
     settled = _settle(dz, own, grid, given, model, options)
@@ -277,7 +277,7 @@ def _settle(
         if cells < LEAST_STABLE:
             raise ChangeError(
                 f"the surveys have {cells} cells of stable ground: expected at least {LEAST_STABLE} to measure shift "
-                "and errors on; give polygons of ground that did not change (--stable)"
+                "and errors on; give more polygons of ground that did not change (--stable), or a smaller --cell"
             )
         coefficients = fit(dz, ground, grid, model)
         before = statistics(_sampled(dz, ground))

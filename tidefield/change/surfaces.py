@@ -58,8 +58,8 @@ _STEP_M = 0.1
 """Where a survey ends, most of its heights are further from zero than this."""
 _QUAY_M = 10.0
 """No quay is higher above levelled water."""
-_RESULTS = ("dz:", "standard error", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
-"""How this program describes what is no height in its rasters."""
+_RESULTS = ("dz:", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
+"""How this program describes what is no height, nor an error of heights, in its rasters."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -176,6 +176,11 @@ class Surface:
     def name(self) -> str:
         """Date, or the file's name."""
         return self.date or self.source or self.path.stem
+
+    @property
+    def file(self) -> str:
+        """What the user named: the folder, the cloud, or the raster."""
+        return self.source or self.path.name
 
     @property
     def zero(self) -> str | None:
@@ -550,7 +555,7 @@ def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
     west, south = (max(box[k] for box in boxes) for k in (0, 1))
     east, north = (min(box[k] for box in boxes) for k in (2, 3))
     if west >= east or south >= north:
-        places = "; ".join(f"{s.path.name}: {_place(box)}" for s, box in zip(surfaces, boxes, strict=True))
+        places = "; ".join(f"{s.file}: {_place(box)}" for s, box in zip(surfaces, boxes, strict=True))
         raise ChangeError(
             f"the surveys do not overlap ({places}): expected the same ground; check the files and their coordinate "
             "systems"
@@ -632,10 +637,10 @@ def _require_same_heights(surfaces: list[Surface]) -> None:
     if named and len(named) < len(surfaces):
         bare = next(surface for surface in surfaces if surface.crs is None)
         raise ChangeError(
-            f"{named[0].path.name} has a coordinate system, {bare.path.name} has none: expected it in all files or in "
+            f"{named[0].file} has a coordinate system, {bare.file} has none: expected it in all files or in "
             "none; assign it with gdal_edit.py -a_srs"
         )
-    require_one_zero([(surface.path, surface.zero) for surface in named])
+    require_one_zero([(Path(surface.file), surface.zero) for surface in named])
 
 
 def require_one_zero(zeros: Sequence[tuple[Path, str | None]], registered: bool = True) -> None:

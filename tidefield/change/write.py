@@ -362,7 +362,7 @@ def summary(change: Change, command: str) -> dict[str, Any]:
 
 def _survey(surface: Surface) -> dict[str, Any]:
     return {
-        "file": surface.source or surface.path.name,
+        "file": surface.file,
         "date": surface.date,
         "crs": _system_name(surface),
         "pixel": [abs(surface.transform.a), abs(surface.transform.e)],

@@ -55,7 +55,7 @@ class Change:
     """Ground that did not change: polygons or lines (GeoJSON, GeoPackage, shapefile). If not given, it is what is left
     when everything that stands out is outlined, and is shown."""
     within: Path | None = None
-    """Polygons to which the comparison is limited."""
+    """Polygons to which the comparison is limited; stable ground may lie outside."""
     polygons: Path | None = None
     """Polygons whose volumes are given one by one."""
     register: Literal["auto", "none", "vertical", "tilt"] = "auto"

@@ -20,7 +20,7 @@ from PIL import Image
 
 from tidefield.change.errors import Variogram, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import date_in
+from tidefield.change.surfaces import date_in, is_local
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
@@ -163,6 +163,7 @@ class Atlas:
         rasterio = need("rasterio")
         self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
         self.crs = next(filter(None, (_system(sheet) for sheet in self.sheets)), None)
+        self._require_one_frame()
         boxes, cells = [], []
         for sheet in self.sheets:
             for layer in sheet.layers:
@@ -333,6 +334,19 @@ class Atlas:
                         values[name] = _sample(file, place, 1)
             found.append(values)
         return found
+
+    def _require_one_frame(self) -> None:
+        """Raises: RunError when some sheets lie on the Earth, and others in the frame of a scene without a place."""
+        from pyproj import CRS
+
+        systems = [(sheet, CRS.from_wkt(crs.to_wkt())) for sheet in self.sheets if (crs := _system(sheet)) is not None]
+        local = [sheet for sheet, crs in systems if is_local(crs)]
+        placed = [(sheet, crs) for sheet, crs in systems if not is_local(crs)]
+        if local and placed:
+            raise RunError(
+                f"{local[0].folder} lies in a local frame, {placed[0][0].folder} in {placed[0][1].name}: expected maps "
+                "in one frame; show them apart, or give the scene of the first a georeference and map it again"
+            )
 
     def _layer(self, sheet: int, name: str) -> Layer | None:
         if not 0 <= sheet < len(self.sheets):
