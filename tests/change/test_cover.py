@@ -14,7 +14,7 @@ from tidefield.change.light import light_gains, with_light
 from tidefield.change.measure import measure
 from tidefield.change.page import write_page
 from tidefield.change.regions import Region
-from tidefield.change.surfaces import Grid, open_surface
+from tidefield.change.surfaces import ChangeError, Grid, open_surface
 from tidefield.change.write import summary
 
 MUD, PLANTS = np.array([125, 112, 92]), np.array([95, 110, 60])
@@ -179,6 +179,16 @@ def test_ground_that_only_one_picture_shows_is_unknown():
     assert (found.classes[:, :100] == -128).all()
     assert found.known_m2 == pytest.approx(900.0)
     assert found.areas["all"]["lost"].value_m2 == 0
+
+
+def test_orthophotos_of_another_place_are_refused(tmp_path: Path):
+    colours = np.full((3, 60, 60), 120, np.uint8)
+    here = write_surface(tmp_path / "here.tif", colours)
+    there = write_surface(tmp_path / "there.tif", colours, west=WEST + 10_000)
+    grid = Grid(CRS("EPSG:32630").to_wkt(), WEST, NORTH, 0.5, 60, 60)
+    assert measure_cover(here, here, grid).known_m2 == pytest.approx(900)
+    with pytest.raises(ChangeError, match=r"here\.tif and .*there\.tif show no ground in common"):
+        measure_cover(here, there, grid)
 
 
 def test_the_marsh_of_a_built_in_flat_spreads_as_much_as_its_pictures_say():

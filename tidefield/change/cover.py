@@ -24,7 +24,7 @@ from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, smoothed, with_light
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.shift import picture_grid, read_picture
-from tidefield.change.surfaces import STRIP_CELLS, Grid
+from tidefield.change.surfaces import STRIP_CELLS, ChangeError, Grid
 
 MARGIN = 0.035
 """Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""
@@ -115,7 +115,7 @@ def measure_cover(
         known: cells of the grid that are compared; None for all.
 
     Raises:
-        ChangeError: one of the files is no orthophoto.
+        ChangeError: one of the files is no orthophoto, or they show no ground in common.
     """
     small = picture_grid((earlier, later), grid)
     times, lights = math.ceil(small.cell_m / _FINE_M), None
@@ -124,6 +124,11 @@ def measure_cover(
     one, inside = read_picture(earlier, small)
     other, also = read_picture(later, small, shift_m)
     inside &= also
+    if not inside.any():
+        raise ChangeError(
+            f"{earlier} and {later} show no ground in common where the surfaces are: expected orthophotos of the same "
+            "place; name others (--orthophotos)"
+        )
     if known is not None:
         inside &= _resampled(known, grid, small)
     return compare_cover(one, other, inside, small, regions, lights)
