@@ -103,6 +103,9 @@ def _end_after_parent() -> None:
     os._exit(1)
 
 
+_STARTING = threading.Lock()
+
+
 class _Worker(SpawnProcess):
     """Does not run the script that started it, which may have no `if __name__ == "__main__"`: tasks are in modules."""
 
@@ -119,9 +122,6 @@ class _Worker(SpawnProcess):
                 return SpawnProcess._Popen(process_obj)
             finally:
                 spawn.get_preparation_data = usual
-
-
-_STARTING = threading.Lock()
 
 
 class _Context(SpawnContext):

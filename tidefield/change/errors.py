@@ -387,7 +387,7 @@ def _near_correlation(
         count: of the offsets.
     """
     total = np.zeros(count)
-    for sill, reach in zip(variogram.sills, variogram.ranges_m, strict=True):
+    for sill, reach in variogram._structures():
         structure = Variogram((sill,), (reach,))
         down, across = ([_distances(k, n, reach / cell_m) for k in range(m)] for n, m in zip(size, count, strict=True))
         for i, (rows, of_rows) in enumerate(down):

@@ -162,7 +162,8 @@ class Atlas:
     def __init__(self, folders: Sequence[Path]) -> None:
         rasterio = need("rasterio")
         self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
-        self.crs = next(filter(None, (_system(sheet) for sheet in self.sheets)), None)
+        self._systems = [_system(sheet) for sheet in self.sheets]
+        self.crs = next(filter(None, self._systems), None)
         self._require_one_frame()
         boxes, cells = [], []
         for sheet in self.sheets:
@@ -339,7 +340,8 @@ class Atlas:
         """Raises: RunError when some sheets lie on the Earth, and others in the frame of a scene without a place."""
         from pyproj import CRS
 
-        systems = [(sheet, CRS.from_wkt(crs.to_wkt())) for sheet in self.sheets if (crs := _system(sheet)) is not None]
+        stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
+        systems = [(sheet, CRS.from_wkt(crs.to_wkt())) for sheet, crs in stated]
         local = [sheet for sheet, crs in systems if is_local(crs)]
         placed = [(sheet, crs) for sheet, crs in systems if not is_local(crs)]
         if local and placed:
@@ -369,7 +371,8 @@ class Atlas:
         """Metres in a unit of the plan and of heights, both units, and the system's name."""
         from pyproj import CRS
 
-        bare = [sheet for sheet in self.sheets if sheet.kind == "change" and _system(sheet) is None]
+        with_systems = zip(self.sheets, self._systems, strict=True)
+        bare = [sheet for sheet, crs in with_systems if sheet.kind == "change" and crs is None]
         if self.crs is None:
             if any(sheet.numbers["later"].get("crs") == LOCAL_NAME for sheet in bare):
                 return 1.0, 1.0, "units", "units", LOCAL_NAME

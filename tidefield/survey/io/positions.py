@@ -174,11 +174,13 @@ def read_gps_file(path: Path, names: PhotographNames) -> tuple[dict[str, GpsReco
     system = first_system(lines)
     titles = (row for row, line in enumerate(lines) if all(name in _columns(line)[0] for name in _REQUIRED))
     header = next(titles, None)
-    if system is not None and header is not None and not lines[header].startswith("#") and not names_a_system(lines):
-        system = None
-    # Titles in a geo.txt are a comment. A table may name the system of its degrees above them.
-    if system is not None and header is not None and (system.is_projected or lines[header].startswith("#")):
-        header = None
+    if system is not None and header is not None:
+        # Titles in a geo.txt may be a comment. A table may name the system of its degrees above them, or have a title.
+        is_comment = lines[header].startswith("#")
+        if not is_comment and not names_a_system(lines):
+            system = None
+        elif is_comment or system.is_projected:
+            header = None
     is_geo = system is not None and header is None
     if header is None and not is_geo and path.suffix.casefold() == ".csv":
         start = next((line.strip() for line in lines if line.strip()), "nothing")

@@ -18,8 +18,8 @@ _MAX_WORDS = 64
 """Of a photograph's name: each further word is one more name to look up, so that long lines would take hours."""
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
 _UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
-
 _CODE = re.compile(r"\+|\w+[:[]")
+"""How a proj4 string, a code and WKT begin."""
 
 
 class PhotographNames:
