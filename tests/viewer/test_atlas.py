@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from surveys_of_two_dates import noise, write_surface
 from tidefield.change.measure import measure
 from tidefield.change.surfaces import open_surface
 from tidefield.change.write import write_all
-from tidefield.errors import RunError
+from tidefield.errors import RunError, TidefieldError
 from tidefield.maps.grid import LOCAL_WKT
 from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
 
@@ -70,19 +71,19 @@ def test_bytes_of_a_picture_are_shown_as_they_are(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("system", "units", "measures"),
+    ("system", "unit", "measures"),
     [
-        (LOCAL_WKT, ("units", "units"), ("units", "square units", "cubic units")),
-        ('LOCAL_CS["site",UNIT["metre",1]]', ("m", "m"), ("m", "m²", "m³")),
-        ("EPSG:32630", ("m", "m"), ("m", "m²", "m³")),
+        (LOCAL_WKT, "units", ("units", "square units", "cubic units")),
+        ('LOCAL_CS["site",UNIT["metre",1]]', "m", ("m", "m²", "m³")),
+        ("EPSG:32630", "m", ("m", "m²", "m³")),
     ],
 )
 def test_lengths_are_metres_where_a_system_knows_them(
-    tmp_path: Path, system: str, units: tuple[str, str], measures: tuple[str, str, str]
+    tmp_path: Path, system: str, unit: str, measures: tuple[str, str, str]
 ):
     write_surface(tmp_path / "dsm.tif", np.ones(SHAPE, np.float32), CELL, crs=system)
     atlas = Atlas([tmp_path])
-    assert (atlas.unit, atlas.unit_up) == units
+    assert atlas.unit == unit
     assert tuple(atlas.describe()[name] for name in ("length", "area", "volume")) == measures
 
 
@@ -120,6 +121,61 @@ def test_a_map_on_the_earth_and_one_in_a_frame_of_its_own_are_refused(tmp_path: 
     write_surface(tmp_path / "local" / "dsm.tif", np.zeros(SHAPE, np.float32), CELL, crs=LOCAL_WKT)
     with pytest.raises(RunError, match=r"local lies in a local frame, .*placed in WGS 84 / UTM zone 30N"):
         Atlas([placed, tmp_path / "local"])
+
+
+US_SURVEY_FOOT_M = 1200 / 3937
+
+
+def in_millimetres(path: Path) -> None:
+    import rasterio
+
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (0.001,), (2.0,)
+
+
+def with_a_unit(path: Path) -> None:
+    import rasterio
+
+    with rasterio.open(path, "r+") as file:
+        file.units = ("ft",)
+
+
+@pytest.mark.parametrize(
+    ("crs", "kind", "missing", "unit_m", "offset", "state"),
+    [
+        ("EPSG:32630", np.int16, -32768, 0.001, 2.0, in_millimetres),
+        ("EPSG:32630", np.float32, -9999, 0.3048, 0.0, with_a_unit),
+        ("EPSG:2263+6360", np.float32, -9999, US_SURVEY_FOOT_M, 0.0, None),
+    ],
+    ids=["whole numbers with a scale", "a band in feet", "a system in feet"],
+)
+def test_heights_of_any_unit_are_shown_in_metres_and_what_is_no_height_not_at_all(
+    tmp_path: Path, crs: str, kind: type, missing: float, unit_m: float, offset: float, state: Callable | None
+):
+    rows, columns = np.indices(SHAPE)
+    true_m = 5 + 0.01 * columns + 0.02 * rows
+    known = columns < 70
+    heights = np.where(known, (true_m - offset) / unit_m, missing)
+    heights = (np.rint(heights) if kind is np.int16 else heights).astype(kind)
+    path = write_surface(tmp_path / "map" / "dsm.tif", heights, CELL, crs=crs)
+    if state is not None:
+        state(path)
+    atlas = Atlas([tmp_path / "map"])
+    (layer,) = atlas.sheets[0].layers
+    assert 5 < layer.low < layer.high < true_m[known].max()
+    for level in (0, atlas.finest):
+        content = atlas.tile(0, "height", level, 0, 0)
+        assert content is not None
+        values = decoded(content)
+        assert np.nanmin(values) > 5 - 1e-3
+        assert np.nanmax(values) < true_m[known].max() + 1e-3
+    (found,) = atlas.at(*corner(20.5, 30.5))
+    assert found["height"] == pytest.approx(true_m[30, 20], abs=1e-3)
+    (found,) = atlas.at(*corner(80.5, 30.5))
+    assert found["height"] is None
+    (volumes,) = atlas.area(box(60, 20, 80, 40))["sheets"]
+    assert volumes["cells_m2"] == pytest.approx(200 * (CELL * atlas.metre) ** 2)
+    assert volumes["above"]["value_m3"] < 1e-2 * volumes["cells_m2"]
 
 
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
@@ -241,5 +297,5 @@ def test_polygons_and_folders_that_cannot_be_used_are_one_clear_error(tmp_path: 
     with pytest.raises(RunError, match="apart: expected maps of one place"):
         Atlas([folder, far])
     (folder / "odm_dem" / "dsm.tif").write_bytes(b"II*\0 not a raster")
-    with pytest.raises(RunError, match="cannot be read"):
+    with pytest.raises(TidefieldError, match=r"dsm\.tif is not a raster that can be read"):
         Atlas([folder])

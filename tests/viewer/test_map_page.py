@@ -119,7 +119,7 @@ def test_the_swipe_shows_both_dates_the_slider_changes_them_and_the_address_brin
 
 def test_what_is_measured_on_a_map_without_a_georeference_is_in_units(tmp_path: Path, browser):
     folder = tmp_path / "map"
-    write_surface(folder / "odm_dem" / "dsm.tif", np.eye(*SHAPE, dtype=np.float32), CELL, crs=LOCAL_WKT)
+    write_surface(folder / "odm_dem" / "dsm.tif", 1 + np.eye(*SHAPE, dtype=np.float32), CELL, crs=LOCAL_WKT)
     with page_of(folder) as page:
         tab = browser.new_page(viewport=SIZE)
         found = {}
@@ -162,17 +162,14 @@ def test_the_level_of_detection_hides_smaller_changes_and_the_area_has_the_volum
     assert float(re.search(r"(-[\d.]+) m³", row).group(1)) == pytest.approx(-400 * 0.5 * 0.25, rel=0.05)
 
 
-def test_the_legend_has_the_unit_of_its_layer_and_the_detection_its_step(
-    tmp_path: Path, browser, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(Atlas, "_units", lambda _: (1.0, 0.3048, "m", "foot", "heights in feet"))
+def test_the_legend_has_the_unit_of_its_layer_and_the_detection_its_step(tmp_path: Path, browser):
     change = write_change(tmp_path / "change", np.full(SHAPE, 0.1, np.float32))
     with page_of(write_map(tmp_path / "map 2023-05-01", (90, 120, 60)), change) as page:
         tab = browser.new_page(viewport=SIZE)
         tab.goto(page.address)
         for layer, ends in (
-            ("0.height", r"\d foot$"),
-            ("0.error", r"\d foot$"),
+            ("0.height", r"\d m$"),
+            ("0.error", r"\d m$"),
             ("1.error", r"\d m$"),
             ("1.change", r"\d m \(red"),
         ):

@@ -9,14 +9,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import escape
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
-from scipy.ndimage import binary_dilation, label
 
+from tidefield.change.nodata import IMPOSSIBLE_M, cleared, is_masked, undeclared
 from tidefield.errors import TidefieldError
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
@@ -40,24 +39,8 @@ MOST_CELLS = 400_000_000
 """Of a common grid: what fits into 16 GB."""
 PLAIN = 'LOCAL_CS["metres",UNIT["metre",1]]'
 """A system for files that need one, where surfaces have none."""
-_SAMPLE = 1000
-"""Rows and columns that are read of a large surface to see what its values are."""
-_SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
-"""Values that programs write where they know no height; some do not declare them."""
-_IMPOSSIBLE_M = 20_000.0
-"""No height on Earth is further from zero."""
-_UNLIKELY_M = 3_000.0
-"""No flat is further from zero; 9999 feet are."""
-_ZERO_SHARE = 0.01
-"""Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
-_FAR_M = 1.0
-"""What is further from zero is far."""
 _ELLIPSOID = "the ellipsoid"
 """How the zeros of ellipsoidal heights are named."""
-_STEP_M = 0.1
-"""Where a survey ends, most of its heights are further from zero than this."""
-_QUAY_M = 10.0
-"""No quay is higher above levelled water."""
 _RESULTS = ("dz:", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
 """How this program describes what is no height, nor an error of heights, in its rasters."""
 _UNITS_M = {
@@ -203,9 +186,16 @@ class Surface:
                 values = read(first, last)[0]
                 if (self.scale, self.offset, self.metres) != (1, 0, 1):
                     values = (values * np.float32(self.scale) + np.float32(self.offset)) * np.float32(self.metres)
-                values[np.abs(values) > _IMPOSSIBLE_M] = np.nan
+                values[np.abs(values) > IMPOSSIBLE_M] = np.nan
                 return values
 
+            yield heights
+
+    @contextmanager
+    def in_metres(self) -> Iterator[Any]:
+        """The heights in metres on the file's own grid, as rasterio's data set; masked or NaN where there are none."""
+        scale, offset = self.metres * self.scale, self.metres * self.offset
+        with opened(self.path) as dataset, cleared(dataset, self.unknown, scale, offset) as heights:
             yield heights
 
 
@@ -255,9 +245,9 @@ def warped(
         if crs is not None or grid.crs is None:
             options["src_crs"] = source
         with (
-            _without(dataset, unknown) as cleared,
+            cleared(dataset, unknown) as known,
             WarpedVRT(
-                cleared,
+                known,
                 crs=target,
                 transform=moved,
                 width=grid.columns,
@@ -282,26 +272,6 @@ def warped(
                 return values
 
             yield read
-
-
-@contextmanager
-def _without(dataset: Any, values: tuple[float, ...]) -> Iterator[Any]:
-    """The first band of a raster, NaN where it is masked or has one of some values; the raster itself without any."""
-    if not values:
-        yield dataset
-        return
-    place = ",".join(map(repr, dataset.transform.to_gdal()))
-    source = str(dataset.name)
-    # GDAL leaves out one value in each layer, or what is masked.
-    for rule in ("<UseMaskBand>true</UseMaskBand>", *(f"<NODATA>{value!r}</NODATA>" for value in values)):
-        source = (
-            f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}"><GeoTransform>{place}'
-            '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><NoDataValue>nan</NoDataValue><ComplexSource>'
-            f"<SourceFilename>{escape(source)}</SourceFilename><SourceBand>1</SourceBand>{rule}</ComplexSource>"
-            "</VRTRasterBand></VRTDataset>"
-        )
-    with require_rasterio().open(source) as cleared:
-        yield cleared
 
 
 @contextmanager
@@ -366,7 +336,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
         elif crs is not None and has_unstated_unit(crs):
             remarks.append(unstated_unit(path, crs, "gdal_edit.py -a_srs"))
         nodata = dataset.nodata
-        found, share, doubtful = _undeclared(dataset, metres)
+        found, share, doubtful = undeclared(dataset, metres)
         if found:
             declared = "no nodata" if nodata is None else f"nodata {nodata:g}"
             remarks.append(
@@ -380,7 +350,7 @@ def open_surface(path: Path, date: str | None = None) -> Surface:
                 "-srcnodata 0"
             )
         # Where a file has a mask, GDAL reads that or the declared value, not both.
-        if _masked(dataset) and nodata is not None and math.isfinite(nodata):
+        if is_masked(dataset) and nodata is not None and math.isfinite(nodata):
             found.append(nodata)
         tags = dataset.tags()
         named, stated = date_in(path.stem), date_in(tags.get("TIFFTAG_DATETIME", ""))
@@ -430,81 +400,6 @@ def sigma_of(path: Path) -> Path | None:
     """The raster of standard errors next to a surface, by its name."""
     names = [path.with_name(f"{path.stem}_{ending}{path.suffix}") for ending in ("sigma", "standard_error", "error")]
     return next((name for name in names if name.is_file()), None)
-
-
-def _masked(dataset: Any) -> bool:
-    """Whether a raster has a mask of its own."""
-    from rasterio.enums import MaskFlags
-
-    return MaskFlags.per_dataset in dataset.mask_flag_enums[0]
-
-
-def _undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
-    """Find the values that stand for no height where neither nodata nor a mask says so.
-
-    Returns:
-        the values; their share of cells; the share of zeros that may be levelled water, or no heights.
-    """
-    height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
-    raw = dataset.read(1, out_shape=(height, width), masked=True)
-    values = raw.filled(0).astype(np.float64)
-    known = ~np.ma.getmaskarray(raw) & np.isfinite(values)
-    if dataset.nodata is not None:
-        known &= ~np.isclose(values, dataset.nodata)  # the lowest float is often declared with fewer digits
-    scale, offset = dataset.scales[0], dataset.offsets[0]
-    floats, found = np.issubdtype(raw.dtype, np.floating), []
-    sentinels = (*_SENTINELS, float(np.finfo(np.float32).min))
-    possible = np.abs(values * scale + offset) * metres <= _IMPOSSIBLE_M
-    others = values[known & possible & ~np.isin(values, sentinels)]
-    # Where many heights are lower and many higher, as 9.999 m in millimetres may be, it is one of them.
-    low, high = np.quantile(others, (0.001, 0.999)) if len(others) else (math.inf, -math.inf)
-    for value in sentinels:
-        # Whole numbers with a scale reach some of these values; where others are declared they may be heights.
-        unlikely = floats or abs(value * scale + offset) * metres > _UNLIKELY_M
-        among = low <= value <= high
-        if (unlikely or dataset.nodata is None) and not among and (known & (values == value)).any():
-            found.append(value)
-    zero, heights = known & (values == 0), known & (values != 0) & ~np.isin(values, found)
-    doubtful = 0.0
-    if offset == 0 and heights.any():
-        sizes_m = np.abs(values) * abs(scale) * metres
-        lowest, declared = float(np.quantile(sizes_m[heights], 0.01)), dataset.nodata is not None
-        regions = [*([zero] if lowest > _FAR_M else []), *([_at_edges(zero)] if floats else [])]
-        step = max((_step_m(region, heights, sizes_m) for region in regions), default=0.0)
-        if declared and math.isinf(step):
-            step = lowest  # nodata may lie between levelled water and its shore
-        if step > (_QUAY_M if declared else _STEP_M):
-            found.append(0.0)
-        elif declared and step > _FAR_M:
-            doubtful = float(zero.mean())
-    return found, float((known & np.isin(values, found)).mean()), doubtful
-
-
-def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
-    """The connected parts of a region that reach the edge of a raster."""
-    numbers = np.zeros(region.shape, np.int32)
-    label(region, output=numbers)
-    edges = np.concatenate([numbers[0], numbers[-1], numbers[:, 0], numbers[:, -1]])
-    return np.isin(numbers, edges[edges > 0])
-
-
-def _step_m(
-    zero: Bool[np.ndarray, "rows columns"], heights: Bool[np.ndarray, "rows columns"], sizes_m: np.ndarray
-) -> float:
-    """How far from zero heights are that end next to zeros; 0 where they run out to zero, as those of a shore do.
-
-    A sea that was levelled is zero in large areas, too. Its shore rises no further to the first cell than from that to
-    the second, however steep it is and however large its cells are. Zeros that touch no height have an infinite step.
-    """
-    if zero.mean() <= _ZERO_SHARE:
-        return 0.0
-    near = np.asarray(binary_dilation(zero), bool)
-    first, second = near & heights, binary_dilation(near) & heights & ~near
-    if not first.any():
-        return math.inf
-    here = float(np.median(sizes_m[first]))
-    further = float(np.median(sizes_m[second])) if second.any() else here
-    return here if here > 2 * abs(further - here) else 0.0
 
 
 def date_in(text: str) -> str | None:

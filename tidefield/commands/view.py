@@ -104,7 +104,11 @@ def _view_maps(options: View, console: Console) -> None:
     from tidefield.viewer.atlas import Atlas
     from tidefield.viewer.map_page import MapPage
 
-    page = MapPage(Atlas(options.sources), options.host, options.port)
+    atlas = Atlas(options.sources)
+    for sheet in atlas.sheets:
+        for remark in sheet.heights.remarks if sheet.heights else ():
+            log.warning(f"{sheet.title}: {remark}")
+    page = MapPage(atlas, options.host, options.port)
     try:
         serve(page.address, options.host, options.no_browser, console)
     finally:

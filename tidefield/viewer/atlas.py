@@ -1,7 +1,7 @@
 """Maps and changes to look at from straight above: layers, tiles, values, sections and volumes, in one system.
 
-All is shown in the first coordinate system that a folder states. Tiles are squares of `TILE_PX` pixels; those of level
-z have 2^-z of the side of the whole area, and are counted from its north-western corner.
+All is shown in the first coordinate system that a folder states, heights in metres. Tiles are squares of `TILE_PX`
+pixels; those of level z have 2^-z of the side of the whole area, and are counted from its north-western corner.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from PIL import Image
 
 from tidefield.change.errors import Variogram, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import date_in, is_local
+from tidefield.change.surfaces import Surface, date_in, is_local, open_surface
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
@@ -49,14 +49,14 @@ class Layer:
     Attributes:
         name: in addresses.
         title: for people.
-        path, band: of the raster.
+        source, band: the raster, or the surface that it holds.
         kind: "picture" (colours, or grey), or values that the page colours: "height", "error" or "change".
         low, high: ends of the colours; most values are between them. Of pictures: black and white.
     """
 
     name: str
     title: str
-    path: Path
+    source: Path | Surface
     band: int
     kind: str
     low: float = 0.0
@@ -73,7 +73,7 @@ class Sheet:
         date: YYYY-MM-DD, if it is known.
         kind: "map" or "change".
         layers: of it.
-        heights, sigma: rasters of a map's surface and its standard error.
+        heights, sigma: a map's surface and its standard error.
         numbers: what change.json or map.json has.
     """
 
@@ -82,8 +82,8 @@ class Sheet:
     date: str | None
     kind: str
     layers: tuple[Layer, ...]
-    heights: Path | None
-    sigma: Path | None
+    heights: Surface | None
+    sigma: Surface | None
     numbers: dict[str, Any]
 
     @property
@@ -119,7 +119,7 @@ def open_sheet(folder: Path) -> Sheet:
             Layer("error", "Error of change", dz, 2, "error", *_usual(dz, 2)),
         )
         return Sheet(folder, name, numbers["later"].get("date"), "change", layers, None, None, numbers)
-    heights, sigma = first_of(folder, SURFACES), first_of(folder, SIGMAS)
+    heights, sigma = (path and open_surface(path) for path in (first_of(folder, SURFACES), first_of(folder, SIGMAS)))
     found: list[Layer] = []
     for kind, title, path in (
         ("orthophoto", "Orthophoto", first_of(folder, ORTHOPHOTOS)),
@@ -168,7 +168,7 @@ class Atlas:
         boxes, cells = [], []
         for sheet in self.sheets:
             for layer in sheet.layers:
-                with self._reader(layer.path) as file:
+                with self._reader(layer.source) as file:
                     boxes.append(file.bounds)
                     cells.append(min(abs(file.transform.a), abs(file.transform.e)))
         box = np.array(boxes)
@@ -179,7 +179,7 @@ class Atlas:
             raise RunError(f"the folders lie {self.side:,.0f} apart: expected maps of one place; name others, or fewer")
         self.finest = min(FINEST_LEVEL, max(0, math.ceil(math.log2(self.side / self.cell / TILE_PX))) + 1)
         self._rasterio = rasterio
-        self.metre, self.metre_up, self.unit, self.unit_up, self.name = self._units()
+        self.metre, self.unit, self.name = self._units()
 
     def describe(self) -> dict[str, Any]:
         """What the page needs to know, without the name of any folder's place."""
@@ -187,8 +187,6 @@ class Atlas:
             "crs": self.name,
             "unit": self.unit,
             "metre": self.metre,
-            "metre_up": self.metre_up,
-            "unit_up": self.unit_up,
             **dict(zip(("length", "area", "volume"), self._measures(), strict=True)),
             "bounds": self.bounds,
             "side": self.side,
@@ -219,7 +217,7 @@ class Atlas:
             return None
         side = self.side / (1 << level)
         west, north = self.bounds[0] + column * side, self.bounds[3] - row * side
-        with self._reader(chosen.path) as file:
+        with self._reader(chosen.source) as file:
             bands = _picture_bands(file) if chosen.kind == "picture" else [chosen.band]
             values, seen = _read(file, bands, west, north, side / TILE_PX, self._rasterio)
         if not seen.any():
@@ -267,11 +265,11 @@ class Atlas:
             raise RunError("the polygon crosses itself, or has no area: expected one that does not; draw it again")
         results: list[dict[str, Any]] = []
         for sheet in self.sheets:
-            path = sheet.layers[0].path if sheet.kind == "change" else sheet.heights
-            if path is None:
+            source = sheet.layers[0].source if sheet.kind == "change" else sheet.heights
+            if source is None:
                 results.append({})
                 continue
-            with self._reader(path) as file:
+            with self._reader(source) as file:
                 box, inside = _cells_in(file, polygon, self._rasterio)
                 if not inside.any():
                     results.append({})
@@ -291,14 +289,21 @@ class Atlas:
                 with self._reader(sheet.sigma) as file:
                     error = _band(file, 1, box)
                 sigma = error if error.shape == values.shape else None
-            results.append(self._map_volumes(polygon, values, sigma, inside, transform, cell_area, path))
+            results.append(self._map_volumes(polygon, values, sigma, inside, transform, cell_area, source))
         return {"area_m2": polygon.area * self.metre**2, "length_m": polygon.length * self.metre, "sheets": results}
 
     def _map_volumes(
-        self, polygon: Any, heights: Any, sigma: Any, inside: Any, transform: Any, cell_area: float, path: Path
+        self,
+        polygon: Any,
+        heights: Any,
+        sigma: Any,
+        inside: Any,
+        transform: Any,
+        cell_area: float,
+        source: Path | Surface,
     ) -> dict[str, Any]:
         rim = np.array([polygon.exterior.interpolate(s, normalized=True).coords[0] for s in np.linspace(0, 1, 200)])
-        with self._reader(path) as file:
+        with self._reader(source) as file:
             z = _sample(file, rim, 1)
         known = np.isfinite(z)
         if known.sum() < 3 or not inside.any():
@@ -309,13 +314,13 @@ class Atlas:
         rows, columns = np.nonzero(inside)
         x = transform.c + (columns + 0.5) * transform.a - centre[0]
         y = transform.f + (rows + 0.5) * transform.e - centre[1]
-        above = self.metre_up * (heights[inside] - (plane[0] + plane[1] * x + plane[2] * y))
+        above = heights[inside] - (plane[0] + plane[1] * x + plane[2] * y)
         result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
         for name, chosen in (("above", above > 0), ("below", above < 0)):
             value = float(np.abs(above[chosen]).sum()) * cell_area
             result[name] = {"value_m3": value}
             if sigma is not None:
-                own = self.metre_up * np.nan_to_num(sigma[inside][chosen], nan=0.0)
+                own = np.nan_to_num(sigma[inside][chosen], nan=0.0)
                 half = BAND * float(own.sum()) * cell_area
                 result[name] |= {"low_m3": value - half, "high_m3": value + half}
         return result
@@ -326,12 +331,12 @@ class Atlas:
         for sheet in self.sheets:
             values: dict[str, Any] = {}
             if sheet.kind == "change":
-                with self._reader(sheet.layers[0].path) as file:
+                with self._reader(sheet.layers[0].source) as file:
                     for k, name in enumerate(("change", "change_sigma", "p"), start=1):
                         values[name] = _sample(file, place, k)
-            for name, path in (("height", sheet.heights), ("sigma", sheet.sigma)):
-                if path is not None:
-                    with self._reader(path) as file:
+            for name, surface in (("height", sheet.heights), ("sigma", sheet.sigma)):
+                if surface is not None:
+                    with self._reader(surface) as file:
                         values[name] = _sample(file, place, 1)
             found.append(values)
         return found
@@ -356,31 +361,31 @@ class Atlas:
         return next((layer for layer in self.sheets[sheet].layers if layer.name == name), None)
 
     @contextmanager
-    def _reader(self, path: Path) -> Iterator[Any]:
+    def _reader(self, source: Path | Surface) -> Iterator[Any]:
         """A raster in the atlas' system; opened for each use, since a data set belongs to one thread."""
         from rasterio.vrt import WarpedVRT
 
-        with _opened(path) as file:
+        with _opened(source) as file:
             if file.crs == self.crs or file.crs is None:
                 yield file
                 return
             with WarpedVRT(file, crs=self.crs) as warped:
                 yield warped
 
-    def _units(self) -> tuple[float, float, str, str, str]:
-        """Metres in a unit of the plan and of heights, both units, and the system's name."""
+    def _units(self) -> tuple[float, str, str]:
+        """Metres in a unit of the plan, that unit, and the system's name."""
         from pyproj import CRS
 
         with_systems = zip(self.sheets, self._systems, strict=True)
         bare = [sheet for sheet, crs in with_systems if sheet.kind == "change" and crs is None]
         if self.crs is None:
             if any(sheet.numbers["later"].get("crs") == LOCAL_NAME for sheet in bare):
-                return 1.0, 1.0, "units", "units", LOCAL_NAME
+                return 1.0, "units", LOCAL_NAME
             # `tidefield change` took lengths of surfaces without a system as metres.
-            return 1.0, 1.0, "m", "m", "no coordinate system"
+            return 1.0, "m", "no coordinate system"
         crs = CRS.from_wkt(self.crs.to_wkt())
         if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
-            return 1.0, 1.0, "units", "units", crs.name
+            return 1.0, "units", crs.name
         plan = crs.axis_info[0]
         if "degree" in plan.unit_name:
             raise RunError(f"the maps are in degrees ({crs.name}): expected a projected system; make them in one")
@@ -390,11 +395,8 @@ class Atlas:
                 f"metres, and the maps ({crs.name}) count in {plan.unit_name}: expected one unit; show it alone, or "
                 "assign the surfaces their system (gdal_edit.py -a_srs) and measure it again"
             )
-        up = next((axis for axis in crs.axis_info if axis.direction == "up"), None)
-        unit, unit_up = (
-            "m" if name in ("metre", "meter") else name for name in (plan.unit_name, up.unit_name if up else "metre")
-        )
-        return plan.unit_conversion_factor, up.unit_conversion_factor if up else 1.0, unit, unit_up, crs.name
+        unit = "m" if plan.unit_name in ("metre", "meter") else plan.unit_name
+        return plan.unit_conversion_factor, unit, crs.name
 
     def _measures(self) -> tuple[str, str, str]:
         """What lengths, areas and volumes are in: metres in every system that knows how long they are."""
@@ -402,23 +404,27 @@ class Atlas:
 
 
 def _system(sheet: Sheet) -> Any:
-    with _opened(sheet.layers[0].path) as file:
+    with _opened(sheet.layers[0].source) as file:
         return file.crs
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(source: Path | Surface) -> Iterator[Any]:
+    if isinstance(source, Surface):
+        with source.in_metres() as file:
+            yield file
+        return
     rasterio = need("rasterio")
     try:
-        with rasterio.open(path) as file:
+        with rasterio.open(source) as file:
             yield file
     except rasterio.errors.RasterioIOError as error:
-        raise RunError(f"{path} cannot be read ({error}): expected a GeoTIFF; make the map again") from error
+        raise RunError(f"{source} cannot be read ({error}): expected a GeoTIFF; make the map again") from error
 
 
-def _usual(path: Path, band: int) -> tuple[float, float]:
+def _usual(source: Path | Surface, band: int) -> tuple[float, float]:
     """The 2nd and 98th percentile of a raster's values, from a small picture of it."""
-    with _opened(path) as file:
+    with _opened(source) as file:
         step = max(1.0, max(file.shape) / 512)
         shape = tuple(max(1, round(side / step)) for side in file.shape)
         values = file.read(band, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)

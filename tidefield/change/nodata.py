@@ -1,0 +1,137 @@
+"""What stands for no height in rasters, declared or not, and rasters without it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.ndimage import binary_dilation, label
+
+_SAMPLE = 1000
+"""Rows and columns that are read of a large surface to see what its values are."""
+_SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
+"""Values that programs write where they know no height; some do not declare them."""
+IMPOSSIBLE_M = 20_000.0
+"""No height on Earth is further from zero."""
+_UNLIKELY_M = 3_000.0
+"""No flat is further from zero; 9999 feet are."""
+_ZERO_SHARE = 0.01
+"""Exact zeros in more cells than this are no heights if the others are all far from zero, or if they are a frame."""
+_FAR_M = 1.0
+"""What is further from zero is far."""
+_STEP_M = 0.1
+"""Where a survey ends, most of its heights are further from zero than this."""
+_QUAY_M = 10.0
+"""No quay is higher above levelled water."""
+
+
+def undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
+    """Find the values that stand for no height where neither nodata nor a mask says so.
+
+    Returns:
+        the values; their share of cells; the share of zeros that may be levelled water, or no heights.
+    """
+    height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
+    raw = dataset.read(1, out_shape=(height, width), masked=True)
+    values = raw.filled(0).astype(np.float64)
+    known = ~np.ma.getmaskarray(raw) & np.isfinite(values)
+    if dataset.nodata is not None:
+        known &= ~np.isclose(values, dataset.nodata)  # the lowest float is often declared with fewer digits
+    scale, offset = dataset.scales[0], dataset.offsets[0]
+    floats, found = np.issubdtype(raw.dtype, np.floating), []
+    sentinels = (*_SENTINELS, float(np.finfo(np.float32).min))
+    possible = np.abs(values * scale + offset) * metres <= IMPOSSIBLE_M
+    others = values[known & possible & ~np.isin(values, sentinels)]
+    # Where many heights are lower and many higher, as 9.999 m in millimetres may be, it is one of them.
+    low, high = np.quantile(others, (0.001, 0.999)) if len(others) else (math.inf, -math.inf)
+    for value in sentinels:
+        # Whole numbers with a scale reach some of these values; where others are declared they may be heights.
+        unlikely = floats or abs(value * scale + offset) * metres > _UNLIKELY_M
+        among = low <= value <= high
+        if (unlikely or dataset.nodata is None) and not among and (known & (values == value)).any():
+            found.append(value)
+    zero, heights = known & (values == 0), known & (values != 0) & ~np.isin(values, found)
+    doubtful = 0.0
+    if offset == 0 and heights.any():
+        sizes_m = np.abs(values) * abs(scale) * metres
+        lowest, declared = float(np.quantile(sizes_m[heights], 0.01)), dataset.nodata is not None
+        regions = [*([zero] if lowest > _FAR_M else []), *([_at_edges(zero)] if floats else [])]
+        step = max((_step_m(region, heights, sizes_m) for region in regions), default=0.0)
+        if declared and math.isinf(step):
+            step = lowest  # nodata may lie between levelled water and its shore
+        if step > (_QUAY_M if declared else _STEP_M):
+            found.append(0.0)
+        elif declared and step > _FAR_M:
+            doubtful = float(zero.mean())
+    return found, float((known & np.isin(values, found)).mean()), doubtful
+
+
+def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The connected parts of a region that reach the edge of a raster."""
+    numbers = np.zeros(region.shape, np.int32)
+    label(region, output=numbers)
+    edges = np.concatenate([numbers[0], numbers[-1], numbers[:, 0], numbers[:, -1]])
+    return np.isin(numbers, edges[edges > 0])
+
+
+def _step_m(
+    zero: Bool[np.ndarray, "rows columns"], heights: Bool[np.ndarray, "rows columns"], sizes_m: np.ndarray
+) -> float:
+    """How far from zero heights are that end next to zeros; 0 where they run out to zero, as those of a shore do.
+
+    A sea that was levelled is zero in large areas, too. Its shore rises no further to the first cell than from that to
+    the second, however steep it is and however large its cells are. Zeros that touch no height have an infinite step.
+    """
+    if zero.mean() <= _ZERO_SHARE:
+        return 0.0
+    near = np.asarray(binary_dilation(zero), bool)
+    first, second = near & heights, binary_dilation(near) & heights & ~near
+    if not first.any():
+        return math.inf
+    here = float(np.median(sizes_m[first]))
+    further = float(np.median(sizes_m[second])) if second.any() else here
+    return here if here > 2 * abs(further - here) else 0.0
+
+
+def is_masked(dataset: Any) -> bool:
+    """Whether a raster has a mask of its own."""
+    from rasterio.enums import MaskFlags
+
+    return MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+
+
+@contextmanager
+def cleared(dataset: Any, unknown: tuple[float, ...], scale: float = 1.0, offset: float = 0.0) -> Iterator[Any]:
+    """The first band of a raster times a scale plus an offset, NaN where it is masked or has one of some values.
+
+    Args:
+        dataset: of rasterio; it is what comes back where there is nothing to do.
+        unknown: values of the file that are no heights, besides what it declares.
+    """
+    import rasterio
+
+    plain = (scale, offset) == (1, 0)
+    if plain and not unknown:
+        yield dataset
+        return
+    place = ",".join(map(repr, dataset.transform.to_gdal()))
+    system = f"<SRS>{escape(dataset.crs.to_wkt())}</SRS>" if dataset.crs is not None else ""
+    source = str(dataset.name)
+    rules = ["<UseMaskBand>true</UseMaskBand>", *(f"<NODATA>{value!r}</NODATA>" for value in unknown)]
+    if not plain:
+        rules.append(f"<ScaleOffset>{offset!r}</ScaleOffset><ScaleRatio>{scale!r}</ScaleRatio>")
+    # GDAL leaves out one value in each layer, or what is masked.
+    for rule in rules:
+        source = (
+            f'<VRTDataset rasterXSize="{dataset.width}" rasterYSize="{dataset.height}">{system}<GeoTransform>{place}'
+            '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><NoDataValue>nan</NoDataValue><ComplexSource>'
+            f"<SourceFilename>{escape(source)}</SourceFilename><SourceBand>1</SourceBand>{rule}</ComplexSource>"
+            "</VRTRasterBand></VRTDataset>"
+        )
+    with rasterio.open(source) as layered:
+        yield layered
