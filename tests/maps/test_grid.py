@@ -103,3 +103,30 @@ def test_heights_in_metres_are_not_stated_in_feet():
         _vertical("unknown", "EPSG:6360")
     assert _vertical("NAVD88 height (ftUS)", None) is None
     assert _vertical("NAVD88 height", None) == CRS("EPSG:5703")
+
+
+@pytest.mark.parametrize(
+    ("datum", "stated", "given"),
+    [
+        ("the WGS 84 ellipsoid", None, "EPSG:5701"),
+        ("the place of take-off", None, "EPSG:5701"),
+        ("NAVD88 height", None, "EPSG:5701"),
+        ("ODN height", "EPSG:5701", "EPSG:5703"),
+    ],
+)
+def test_heights_whose_zero_is_known_get_no_other(datum: str, stated: str | None, given: str):
+    with pytest.raises(RunError, match=f"but the scene's heights are over {datum}: expected the option only where"):
+        _vertical(datum, given, None if stated is None else CRS(stated))
+
+
+@pytest.mark.parametrize(
+    ("datum", "stated", "expected"),
+    [
+        ("mean sea level, as the receivers know it", None, "EPSG:5703"),
+        ("unknown; heights are as they were given", None, "EPSG:5703"),
+        ("NAVD88 height", None, "EPSG:5703"),
+        ("NAVD88 height (ftUS)", "EPSG:6360", "EPSG:6360"),
+    ],
+)
+def test_heights_get_the_zero_that_is_given_where_it_may_be_theirs(datum: str, stated: str | None, expected: str):
+    assert _vertical(datum, "EPSG:5703", None if stated is None else CRS(stated)) == CRS(expected)

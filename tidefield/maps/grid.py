@@ -28,7 +28,8 @@ from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
 LOCAL_WKT = f'LOCAL_CS["{LOCAL_NAME}",UNIT["unknown",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
-UNKNOWN_HEIGHTS = "unknown"
+OPEN_ZEROS = ("unknown", "mean sea level")
+"""How the words for zeros of heights begin that a vertical system may still define."""
 """Begins the vertical datum of a frame whose heights are as they were given."""
 FINEST = 0.9
 """Finest cells, as a share of the photographs' ground sampling distance: finer ones would show no more."""
@@ -114,7 +115,8 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
         heights: vertical system of the heights, such as "EPSG:5701", where the scene does not state it.
 
     Raises:
-        RunError: `heights` is no vertical system, or the scene has no frame to which it could belong.
+        RunError: `heights` is no vertical system, or another one than the scene states, or the scene has no frame to
+            which it could belong.
     """
     origin = scene.origin_world.double().numpy()
     frame = None if georeference is None else georeference.frame
@@ -127,7 +129,8 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
         return MapFrame(None, origin, _upright(scene), LOCAL_WKT, LOCAL_WKT, "local, without a datum")
     system = parse_crs(frame.crs)
     plan = horizontal(system)
-    vertical = system.sub_crs_list[1] if system.is_compound else _vertical(frame.vertical_datum, heights)
+    stated = system.sub_crs_list[1] if system.is_compound else None
+    vertical = _vertical(frame.vertical_datum, heights, stated)
     metre = 1 / plan.axis_info[0].unit_conversion_factor
     metre_up = 1 / vertical.axis_info[0].unit_conversion_factor if vertical is not None and system.is_compound else 1.0
     named = frame.vertical_datum if vertical is None else vertical.name
@@ -138,8 +141,10 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
     return MapFrame(frame, origin, np.eye(3), whole.to_wkt(), plan.to_wkt(), named, metre, metre_up)
 
 
-def _vertical(datum: str, given: str | None) -> CRS | None:
-    """The vertical system that is given, or that has the datum's name; None where there is none."""
+def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS | None:
+    """The vertical system that is stated or given, or that has the datum's name; None where there is none."""
+    names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
+    known = CRS.from_epsg(int(names[datum])) if stated is None and datum in names else stated
     if given is not None:
         try:
             crs = CRS.from_user_input(given)
@@ -147,17 +152,26 @@ def _vertical(datum: str, given: str | None) -> CRS | None:
             raise RunError(f"--heights {given} was given: expected a vertical system, such as EPSG:5701") from error
         if not crs.is_vertical:
             raise RunError(f"--heights {given} is {crs.name}: expected a vertical system, such as EPSG:5701")
+        other = not datum.startswith(OPEN_ZEROS) if known is None else _datum_name(known) != _datum_name(crs)
+        if other:
+            raise RunError(
+                f"--heights {given} is {crs.name}, but the scene's heights are over {datum}: expected the option only "
+                "where their zero is not known; leave it out, and convert the map's files (gdalwarp -t_srs with a "
+                "compound system)"
+            )
+        if stated is not None:
+            return stated
         if not in_metres(crs):
             raise RunError(
                 f"--heights {given} is {crs.name}, in {crs.axis_info[0].unit_name}: expected a system in metres, which "
                 "the heights of the scene are in; give that of the same datum"
             )
         return crs
-    if datum.startswith(UNKNOWN_HEIGHTS):
-        return None
-    names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
-    named = CRS.from_epsg(int(names[datum])) if datum in names else None
-    return named if named is not None and in_metres(named) else None
+    return known if known is None or known is stated or in_metres(known) else None
+
+
+def _datum_name(vertical: CRS) -> str:
+    return vertical.name if vertical.datum is None else vertical.datum.name
 
 
 def _upright(scene: Scene) -> Float64[np.ndarray, "3 3"]:
