@@ -17,7 +17,8 @@ from tidefield.change.regions import Region, read_regions
 from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
-from tidefield.change.volumes import ErrorModel
+from tidefield.change.volumes import ErrorModel, Volume
+from tidefield.change.write import volume_rows
 
 AREA = 0.25
 
@@ -108,11 +109,96 @@ def test_volumes_of_polygons_are_given_one_by_one(tmp_path: Path):
     earlier, later, truth = pair(tmp_path, 4, 0.2)
     pit = Region("pit", shapely.Point(WEST + 30, NORTH - 30).buffer(14))
     found = measured(earlier, later, regions=lambda grid: [pit])
-    ((region, net, cut, fill),) = found.per_region
+    ((region, net, cut, fill, compared),) = found.per_region
     assert region.name == "pit"
+    assert compared == 1
     assert net.value_m3 == pytest.approx(truth[:100, :110].sum() * AREA, rel=0.05)
     assert cut.value_m3 == pytest.approx(-net.value_m3, rel=0.05)
     assert fill.value_m3 == 0
+
+
+def test_polygons_that_are_compared_in_part_say_so(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 4, 0.2)
+    with rasterio.open(later, "r+") as file:
+        heights = file.read(1)
+        heights[:, 200:] = np.nan
+        file.write(heights, 1)
+    regions = [
+        Region("whole", shapely.box(WEST + 10, NORTH - 30, WEST + 40, NORTH - 10)),
+        Region("over the edge", shapely.box(WEST - 30, NORTH - 30, WEST + 10, NORTH - 10)),
+        Region("over a gap", shapely.box(WEST + 90, NORTH - 30, WEST + 110, NORTH - 10)),
+        Region("a line over both", shapely.LineString([(WEST - 20, NORTH - 20), (WEST + 140, NORTH - 20)])),
+        Region("in the gap", shapely.box(WEST + 105, NORTH - 30, WEST + 110, NORTH - 10)),
+    ]
+    found = measured(earlier, later, regions=lambda grid: regions)
+    compared = {one.region.name: one.compared for one in found.per_region}
+    assert compared == pytest.approx(
+        {"whole": 1, "over the edge": 0.25, "over a gap": 0.5, "a line over both": 100 / 160}, abs=0.01
+    )
+    assert any(
+        r.startswith("polygons over the edge (25%), over a gap (50%), a line over both (6") for r in found.remarks
+    )
+    assert "polygon in the gap: no cell of both surveys is in it" in found.remarks
+    rows = {(row["region"], row["volume"]): row["compared"] for row in volume_rows(found)}
+    assert rows["over the edge", "cut"] == pytest.approx(0.25, abs=0.01)
+    assert rows["all", "net"] is None
+
+
+@pytest.mark.parametrize("stable", [False, True])
+def test_what_one_survey_has_from_the_other_is_left_out(tmp_path: Path, stable: bool):
+    earlier, later, _ = pair(tmp_path, 14, 0.2)
+    with rasterio.open(earlier) as file:
+        old = file.read(1)
+    with rasterio.open(later, "r+") as file:
+        heights = file.read(1) + 0.05  # another datum
+        heights[:, :100] = old[:, :100]
+        file.write(heights, 1)
+    half = Region("half", shapely.box(WEST + 1, NORTH - 99, WEST + 119, NORTH - 70))
+    found = measured(earlier, later, stable=(lambda grid: [half]) if stable else None)
+    assert any("42% of the cells have the same height" in r and "left out" in r for r in found.remarks)
+    assert np.isnan(found.dz[:, :100]).all()
+    assert found.net.area_m2 == pytest.approx(70 * 100)
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    for path in (earlier, later):
+        with rasterio.open(path) as file:
+            write_surface(alone / path.name, file.read(1)[:, 100:], west=WEST + 50)
+    expected = measured(alone / earlier.name, alone / later.name, stable=(lambda grid: [half]) if stable else None)
+    assert found.net.value_m3 == pytest.approx(expected.net.value_m3, rel=1e-3, abs=0.1)
+    assert found.net.sigma_m3 == pytest.approx(expected.net.sigma_m3, rel=0.1)
+
+
+def test_heights_that_are_nearly_all_the_same_are_said_to_have_no_errors(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 15, 0.2)
+    with rasterio.open(earlier) as file:
+        heights = file.read(1)
+    heights[20:40, 20:40] += 0.3  # as those who try it do
+    write_surface(later, heights)
+    found = measured(earlier, later)
+    assert found.fill.value_m3 == pytest.approx(0.3 * 100, rel=0.05)
+    assert any("99% of the cells have the same height" in r and "too small" in r for r in found.remarks)
+    found = measured(earlier, earlier)
+    assert any("all heights are the same" in r for r in found.remarks)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.25])
+def test_errors_of_rounded_heights_are_at_least_those_of_the_rounding(tmp_path: Path, step: float):
+    rng, rows, columns = np.random.default_rng(16), *np.indices((100, 120))
+    for name, lift in (("a", 0.0), ("b", 0.3)):
+        heights = (
+            4 + 0.01 * columns + lift * (np.hypot(rows - 50, columns - 60) < 20) + rng.normal(0, 0.004, rows.shape)
+        )
+        write_surface(tmp_path / f"{name}.tif", (np.rint(heights / step) * step).astype(np.float32))
+    found = measured(tmp_path / "a.tif", tmp_path / "b.tif")
+    assert any(f"heights are rounded to {step:g} m" in r for r in found.remarks)
+    assert 0.999 * step < found.errors.sigma * math.sqrt(6) < 1.5 * step
+    assert not any("the same height" in r for r in found.remarks)
+
+
+def test_what_the_choice_of_an_outline_adds_takes_no_more_than_there_is():
+    few = Volume(1.0, 0.1, 0.1, 0.1, 10.0).chosen(3.0, 0.5)
+    assert (few.value_m3, few.bias_m3) == (0.0, 1.0)
+    assert Volume(5.0, 0.1, 0.1, 0.1, 10.0).chosen(3.0, 0.5).value_m3 == 2.0
 
 
 def test_standard_errors_of_the_cells_are_used_and_calibrated(tmp_path: Path):

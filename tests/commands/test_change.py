@@ -296,6 +296,7 @@ def test_scenes_of_which_one_has_no_georeference_are_refused_at_once(tmp_path: P
 def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
+    import rasterio
     from surveys_of_two_dates import NORTH, WEST, noise, write_surface
 
     rng, shape = np.random.default_rng(3), (80, 100)
@@ -333,6 +334,18 @@ def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_fir
     for link in ("step_1/change.html", "step_2/change.html"):
         assert link in page
         assert (out / link).is_file()
+    assert numbers["different_ground_m2"] == {}
+    assert "different ground" not in page
+    with rasterio.open(names[1], "r+") as file:
+        heights = file.read(1)
+        heights[:, 60:] = np.nan
+        file.write(heights, 1)
+    call("change", *names[:2], tmp_path / "gap", *words)
+    numbers = json.loads((tmp_path / "gap" / "series.json").read_text())
+    (low, high), *others = numbers["different_ground_m2"].values()
+    assert (low, high) == pytest.approx((80 * 60 / 4, 80 * 100 / 4))
+    assert others == []
+    assert "1\u202f200 to 2\u202f000 m²" in (tmp_path / "gap" / "series.html").read_text()
     message = fails(capsys, monkeypatch, "change", names[0], names[2], tmp_path / "new", "--series", names[1], "-q")
     assert "order of time" in message or "earlier survey first" in message
     message = fails(capsys, monkeypatch, "change", *names[:2], tmp_path / "new", "--series", names[2], "--water", 0, 0)

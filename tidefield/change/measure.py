@@ -11,10 +11,10 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from tidefield.change.choice import repeat_choice
@@ -33,6 +33,7 @@ from tidefield.change.registration import (
 from tidefield.change.shift import Shift, find_shift
 from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_zeros, warped
 from tidefield.change.volumes import ErrorModel, Volume
+from tidefield.errors import list_names
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +43,16 @@ _STANDS_OUT = 3.0
 """Deviations of a window's mean."""
 _MOST_SAMPLED = 2_000_000
 """Cells that quantiles are computed from."""
+_REPEATED = 0.01
+"""Heights that are measured twice are alike to the last bit in fewer cells than this, unless they are rounded."""
+_MOST_REPEATED = 0.5
+"""Of more cells, what is left is too little to tell change from a shift."""
+_ROUNDED = 0.99
+"""Share of small differences that are multiples of a step where heights are rounded."""
+_FEW_STEPS = 20
+"""Differences of more are no multiples any more, because the step is known to a percent only."""
+_WHOLE = 0.99
+"""Share of a polygon that is all of it but for its edges."""
 _NMAD_CELLS = 1000
 """With fewer cells of stable ground their 95% quantile is uncertain, and the NMAD is used if it is larger."""
 
@@ -65,6 +76,21 @@ class Options:
     windows: tuple[int, ...] = WINDOWS
 
 
+class InPolygon(NamedTuple):
+    """What changed in one of the user's polygons.
+
+    Attributes:
+        cut, fill: in the outlines; both positive.
+        compared: share of the polygon where both surveys have heights, which the volumes are of.
+    """
+
+    region: Region
+    net: Volume
+    cut: Volume
+    fill: Volume
+    compared: float
+
+
 @dataclass(frozen=True)
 class Change:
     """What changed between two surveys.
@@ -77,7 +103,7 @@ class Change:
         false_alarms: share of stable cells that are significant by themselves: the null test.
         net: of all cells, without a threshold.
         cut, fill: in the outlines; both positive.
-        per_region: net, cut and fill in each of the user's polygons.
+        per_region: the same in each of the user's polygons.
     """
 
     earlier: Surface
@@ -94,7 +120,7 @@ class Change:
     fill: Volume
     outside: Volume
     each: list[tuple[int, Volume, float]]
-    per_region: list[tuple[Region, Volume, Volume, Volume]]
+    per_region: list[InPolygon]
     threshold_cut_m3: float
     threshold_fill_m3: float
     detection_m: tuple[float, float, float]
@@ -192,8 +218,9 @@ def measure(
             f"{earlier.file} and {later.file} both have heights in {known} cells: expected at least "
             f"{LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
         )
+    step = _leave_out_repeated(dz, earlier, grid, given, remarks)
     model: Model = "vertical" if options.register == "auto" else options.register
-    settled = _settle(dz, own, grid, given, model, options)
+    settled = _settle(dz, own, grid, given, model, options, step)
     registration, variogram, sigma, ground = settled
     slopes = None
     if shift is not None and shift.known:
@@ -267,8 +294,13 @@ def _settle(
     given: Bool[np.ndarray, "rows columns"] | None,
     model: Model,
     options: Options,
+    step: float,
 ) -> tuple[Registration, Variogram, Float32[np.ndarray, "rows columns"] | float, Bool[np.ndarray, "rows columns"]]:
-    """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given."""
+    """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given.
+
+    Args:
+        step: what heights are rounded to, metres; the errors of both surveys are at least those of the rounding.
+    """
     ground = guess = _unchanged(dz, own) if given is None else given
     turns = _TURNS if given is None else 1
     found = None
@@ -297,8 +329,7 @@ def _settle(
         size = deviation95(values)
         if len(values) < _NMAD_CELLS:
             size = max(size, nmad(values))
-        if size == 0:
-            size = 1e-6
+        size = max(size, 1e-6 if own is not None else step / math.sqrt(6), 1e-6)
         sigma = size if own is None else own * np.float32(size)
         residual -= middle
         residual /= np.float32(size)
@@ -322,6 +353,66 @@ def _settle(
         del moved
         ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
     raise AssertionError("the last turn returns")
+
+
+def _leave_out_repeated(
+    dz: Float32[np.ndarray, "rows columns"],
+    earlier: Surface,
+    grid: Grid,
+    given: Bool[np.ndarray, "rows columns"] | None,
+    remarks: list[str],
+) -> float:
+    """Leave out cells that one survey has from the other, which were not measured twice, and say so.
+
+    Args:
+        given: stable ground, if the user named it.
+
+    Returns:
+        what heights are rounded to, metres; 0 where they are not.
+    """
+    known, repeated = int(np.isfinite(dz).sum()), dz == 0
+    share = np.count_nonzero(repeated) / known
+    if share <= _REPEATED:
+        return 0.0
+    differences = np.abs(_sampled(dz, np.isfinite(dz) & ~repeated)).astype(np.float64)
+    if len(differences) and (step := _step_of(earlier, grid, differences)):
+        remarks.append(f"heights are rounded to {step:.3g} m: errors are taken to be at least those of the rounding")
+        return step
+    alike = f"{100 * share:.0f}% of the cells have the same height in both surveys, as if one had them from the other"
+    if share == 1:
+        remarks.append(
+            "all heights are the same in both surveys, so that no errors can be measured: intervals have none"
+        )
+    elif share > _MOST_REPEATED or (given is not None and np.count_nonzero(given & ~repeated) < LEAST_STABLE):
+        remarks.append(
+            f"{alike}: errors are too small if these cells were not measured twice; limit the comparison to what was "
+            "(--within), and name stable ground there (--stable)"
+        )
+    else:
+        dz[repeated] = np.nan
+        if given is not None:
+            given &= ~repeated
+        remarks.append(f"{alike}: left out, since they were not measured twice")
+    return 0.0
+
+
+def _step_of(earlier: Surface, grid: Grid, differences: Float64[np.ndarray, " N"]) -> float:
+    """The step that heights are rounded to; 0 without one.
+
+    Args:
+        differences: of the surveys, of which none is zero: all are multiples of it.
+    """
+    step = float(np.quantile(differences, 0.001))
+    few = differences[differences < _FEW_STEPS * step]
+    step = float(np.median(few / np.maximum(1, np.rint(few / step))))
+    middle = next(rows for rows in grid.strips() if rows.stop > grid.rows // 2)
+    with earlier.on_grid(grid) as read:
+        heights = read(middle.start, middle.stop)
+    # A change that is the same everywhere is no step: cells next to each other tell.
+    steps = np.abs(np.diff(heights, axis=1)).astype(np.float64) / step
+    steps = np.concatenate([few / step, steps[(steps > 0) & (steps < _FEW_STEPS)]])
+    multiples = np.maximum(1, np.rint(steps))
+    return step if len(steps) > len(few) and float((np.abs(steps - multiples) < 0.1).mean()) > _ROUNDED else 0.0
 
 
 def _unchanged(
@@ -409,13 +500,23 @@ def _summed(
     each = []
     for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
         each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
-    per_region = []
+    per_region, empty = [], []
     for region in regions(grid) if regions is not None else []:
-        inside = region.cells(grid) & known
+        cells = region.cells(grid)
+        inside = cells & known
         if not inside.any():
-            remarks.append(f"polygon {region.name}: no cell of both surveys is in it")
+            empty.append(region.name)
             continue
-        per_region.append((region, errors.volume(dz, inside), *chosen(inside)))
+        compared = region.share_on(grid) * np.count_nonzero(inside) / np.count_nonzero(cells)
+        per_region.append(InPolygon(region, errors.volume(dz, inside), *chosen(inside), compared))
+    partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in per_region if one.compared < _WHOLE]
+    if empty:
+        remarks.append(f"polygon{'s'[: len(empty) > 1]} {list_names(empty)}: no cell of both surveys is in it")
+    if partial:
+        remarks.append(
+            f"polygon{'s'[: len(partial) > 1]} {list_names(partial)}: only this part is compared, where both surveys "
+            "have heights, and its volumes are of that part"
+        )
     return Change(
         earlier,
         later,

@@ -32,6 +32,12 @@ class Region:
         """Cells whose centres are in a polygon, or that a line touches."""
         return rasterised([self], grid)
 
+    def share_on(self, grid: Grid) -> float:
+        """Share of a polygon's area, or of a line's length, that lies on a grid; 1 for points."""
+        measure = shapely.area if shapely.area(self.geometry) else shapely.length
+        whole = float(measure(self.geometry))
+        return float(measure(self.geometry & shapely.box(*grid.bounds))) / whole if whole else 1.0
+
 
 def rasterised(regions: list[Region], grid: Grid) -> Bool[np.ndarray, "rows columns"]:
     """Cells that are in any of the regions."""

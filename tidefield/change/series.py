@@ -26,6 +26,8 @@ from tidefield.pages import template_environment
 
 VOLUMES = ("net", "cut", "fill")
 _MOST_PLOTS = 12
+_SAME_GROUND = 0.99
+"""Areas of comparisons that are alike to this share are taken to be of the same ground."""
 Since = Literal["step", "first"]
 
 
@@ -51,7 +53,7 @@ class Entry:
 def entries_of(change: Change, since: Since, start: int, end: int) -> list[Entry]:
     """The volumes of one comparison."""
     found = [("all", change.net, change.cut, change.fill)]
-    found += [(region.name, net, cut, fill) for region, net, cut, fill in change.per_region]
+    found += [(one.region.name, one.net, one.cut, one.fill) for one in change.per_region]
     return [
         Entry(since, start, end, region, what, volume)
         for region, *volumes in found
@@ -87,6 +89,12 @@ def closure(entries: Sequence[Entry], region: str) -> list[dict[str, Any]]:
     return found
 
 
+def areas_m2(entries: Sequence[Entry], region: str) -> tuple[float, float] | None:
+    """Area of the ground that comparisons have in common at least, and at most; None where it is the same for all."""
+    areas = [entry.volume.area_m2 for entry in entries if entry.region == region and entry.what == "net"]
+    return None if min(areas) > _SAME_GROUND * max(areas) else (min(areas), max(areas))
+
+
 def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, command: str) -> dict[str, Any]:
     """Write series.csv, series.json and series.html."""
     rows = series_rows(entries, names)
@@ -97,6 +105,7 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
         "surveys": list(names),
         "volumes": rows,
         "closure": {region: closure(entries, region) for region in regions},
+        "different_ground_m2": {region: areas for region in regions if (areas := areas_m2(entries, region))},
     }
     write_json(folder / "series.json", numbers)
     environment = template_environment("tidefield.change")
@@ -104,7 +113,9 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
     shown = regions[:_MOST_PLOTS]
     html = environment.get_template("series.html").render(
         names=names,
-        regions=[(name, draw_series(entries, names, name), _table(entries, name)) for name in shown],
+        regions=[
+            (name, draw_series(entries, names, name), _table(entries, name), areas_m2(entries, name)) for name in shown
+        ],
         more=len(regions) - len(shown),
         steps=[(k, names[k - 1], names[k]) for k in range(1, len(names))],
         closure=closure(entries, "all"),

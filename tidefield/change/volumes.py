@@ -62,7 +62,7 @@ class Volume:
         return float(stdtrit(self.degrees_of_freedom * (self.sigma_m3**2 / measured) ** 2, 0.975))
 
     def chosen(self, bias_m3: float, deviation_m3: float) -> Volume:
-        """The volume of outlines that were chosen by the heights themselves (`tidefield.change.choice`).
+        """The volume of outlines that were chosen by the heights themselves (`tidefield.change.choice`); not below 0.
 
         Args:
             bias_m3: what the choice adds.
@@ -70,7 +70,8 @@ class Volume:
         """
         own = math.hypot(self.random_m3, self.correlated_m3)
         choice = math.sqrt(max(0.0, deviation_m3**2 - own**2))
-        return replace(self, value_m3=self.value_m3 - bias_m3, choice_m3=choice, bias_m3=bias_m3)
+        value = max(0.0, self.value_m3 - bias_m3)
+        return replace(self, value_m3=value, choice_m3=choice, bias_m3=self.value_m3 - value)
 
     @property
     def significant(self) -> bool:

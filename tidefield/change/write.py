@@ -153,15 +153,18 @@ def outline_rows(change: Change) -> list[dict[str, Any]]:
 
 def volume_rows(change: Change) -> list[dict[str, Any]]:
     """One row for each volume: of the whole, and of the user's polygons."""
-    named: list[tuple[str, str, Volume]] = [
-        ("all", "net", change.net),
-        ("all", "cut", change.cut),
-        ("all", "fill", change.fill),
-        ("all", "net outside of the outlines", change.outside),
+    named: list[tuple[str, str, Volume, float | None]] = [
+        ("all", "net", change.net, None),
+        ("all", "cut", change.cut, None),
+        ("all", "fill", change.fill, None),
+        ("all", "net outside of the outlines", change.outside, None),
     ]
-    for region, net, cut, fill in change.per_region:
-        named += [(region.name, "net", net), (region.name, "cut", cut), (region.name, "fill", fill)]
-    return [{"region": region, "volume": what, **volume.to_json()} for region, what, volume in named]
+    for region, net, cut, fill, compared in change.per_region:
+        named += [(region.name, what, one, compared) for what, one in (("net", net), ("cut", cut), ("fill", fill))]
+    return [
+        {"region": region, "volume": what, **volume.to_json(), "compared": compared}
+        for region, what, volume, compared in named
+    ]
 
 
 def write_tables(change: Change, folder: Path) -> None:
@@ -245,10 +248,11 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
     layers.append(
         (
             "polygons",
-            [region.geometry for region, *_ in change.per_region],
+            [one.region.geometry for one in change.per_region],
             [
                 {
                     "name": region.name,
+                    "compared": compared,
                     **{
                         f"{what}_{key}": value
                         for what, volume in (("net", net), ("cut", cut), ("fill", fill))
@@ -259,7 +263,7 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
                         )
                     },
                 }
-                for region, net, cut, fill in change.per_region
+                for region, net, cut, fill, compared in change.per_region
             ],
         )
     )
@@ -353,8 +357,14 @@ def summary(change: Change, command: str) -> dict[str, Any]:
             "cells_beyond_level_of_detection": {"cut_m3": change.threshold_cut_m3, "fill_m3": change.threshold_fill_m3},
         },
         "regions": [
-            {"name": region.name, "net": net.to_json(), "cut": cut.to_json(), "fill": fill.to_json()}
-            for region, net, cut, fill in change.per_region
+            {
+                "name": region.name,
+                "net": net.to_json(),
+                "cut": cut.to_json(),
+                "fill": fill.to_json(),
+                "compared": compared,
+            }
+            for region, net, cut, fill, compared in change.per_region
         ],
         "remarks": change.remarks,
     }

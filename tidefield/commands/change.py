@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Verbosity, ZeroShot, open_source
-from tidefield.errors import RunError
+from tidefield.errors import RunError, list_names
 from tidefield.files import completed_folder, refuse_existing, require_writable
 
 if TYPE_CHECKING:
@@ -154,7 +154,12 @@ def _series(options: Change, console: Console, work: Path) -> None:
                     _write(found, options, folder / f"step_{end}", console)
                     console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
                     _say(found, console)
-        write_series(entries, _distinct(names), folder, command_line())
+        numbers = write_series(entries, _distinct(names), folder, command_line())
+        if uneven := numbers["different_ground_m2"]:
+            log.warning(
+                f"{list_names(list(uneven))}: not all surveys have heights everywhere, so that volumes are of "
+                "different ground (series.html); a polygon that all surveys cover (--within) compares the same"
+            )
     console.print(str(options.out), soft_wrap=True)
 
 
