@@ -22,6 +22,7 @@ def evaluation(scene: Scene, psnr: float) -> dict:
         "mean": {**values, "reasons": {"lpips_alex": "no weights"}},
         "rays_per_second": 1234.0,
         "seconds_per_frame": 0.5,
+        "width": 48,
         "split": {"train": [], "test": []},
         "lpips_weights": {"lpips_alex": "7be5be79" + 56 * "0", "lpips_vgg": 64 * "f"},
         "configuration": {"trained": {"steps": 7, "seconds": 600.0}},

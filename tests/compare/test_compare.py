@@ -44,6 +44,7 @@ from tidefield.compare.tables import (
     paper_table,
     quality_tables,
     trainings,
+    widths,
     write_comparison,
 )
 from tidefield.config import PAPER, Budget
@@ -155,6 +156,12 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     ]
     page = (out / "tables.md").read_text()
     assert "| flats | 20.00 | - | **28.00** |" in page
+    assert "; photographs 48 px wide; " in page
+    wider = replace(
+        results.by["flats", "nearest"], evaluation={**results.by["flats", "nearest"].evaluation, "width": 40}
+    )
+    both = replace(results, scenes=("flats", "narrow"), by={**results.by, ("narrow", "nearest"): wider})
+    assert widths(both) == "48 (flats), 40 (narrow)", "files of a scene may be narrower than what was asked for"
     assert "LPIPS, VGG" in page
     assert "LPIPS with alexnet-owt-7be5be79.pth, the published file (SHA-256 7be5be79" in page
     assert "LPIPS with vgg16-397923af.pth, which is another file than the published one (SHA-256 ffff" in page

@@ -206,6 +206,17 @@ def test_an_evaluation_is_only_overwritten_on_request(scene, tmp_path):
     assert json.loads((tmp_path / "evaluation.json").read_text())["version"] == __version__
 
 
+def test_weights_are_downloaded_when_an_evaluation_can_be_written_only(scene, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("tidefield.evaluation.evaluate.download_lpips_weights", lambda: asked.append(True))
+    evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())
+    with pytest.raises(RunError):
+        evaluate(perfect, scene, tmp_path, configuration={}, console=quiet(), download_lpips=True)
+    assert asked == []
+    evaluate(perfect, scene, tmp_path, configuration={}, console=quiet(), overwrite=True, download_lpips=True)
+    assert asked == [True]
+
+
 def test_a_rendering_that_is_not_finite_is_named(scene, tmp_path):
     def diverged(camera: Cameras) -> Rendering:
         return replace(perfect(camera), colour=perfect(camera).colour * torch.nan)

@@ -63,13 +63,10 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     from tidefield.data.load import at_width
     from tidefield.device import choose_device
     from tidefield.evaluation.evaluate import evaluate as evaluate_method
-    from tidefield.evaluation.lpips import download_lpips_weights
 
-    if options.download_lpips:
-        download_lpips_weights()
     source, out, method, zero_shot = options.source, options.out, options.method, options.zero.checked().zero_shot
     sampling = options.footprint.sampling
-    settings = {"overwrite": options.overwrite, "console": console}
+    settings = {"overwrite": options.overwrite, "console": console, "download_lpips": options.download_lpips}
     if method is not None and zero_shot:
         raise RunError("both --method and --zero-shot are given: expected one of them; leave one out")
     if options.opened_width is not None and not zero_shot:

@@ -361,6 +361,14 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     return files
 
 
+def widths(results: Results) -> str:
+    """The widths that photographs were compared at, which those of small files are not asked for."""
+    by_scene = {scene: result.evaluation["width"] for (scene, _), result in results.by.items()}
+    if len(set(by_scene.values())) == 1:
+        return str(next(iter(by_scene.values())))
+    return ", ".join(f"{width} ({scene})" for scene, width in by_scene.items())
+
+
 def write_tables(
     stem: str,
     title: str,
@@ -382,7 +390,7 @@ def write_tables(
         f"and {budget} of training, one after another. Our presets and methods without training read what lies between "
         "pixels from files of twice the width, where there are such.",
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
-        f"{settings.device}; photographs {settings.width or 'as they are'} px wide; Tidefield {made['version']}, torch "
+        f"{settings.device}; photographs {widths(results)} px wide; Tidefield {made['version']}, torch "
         f"{machine['torch']}; {made['date']}.",
         *nerfacto_limits(results),
         *opensplat_limits(results),

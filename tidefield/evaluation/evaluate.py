@@ -25,7 +25,7 @@ from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.evaluation.lpips import Lpips, load_lpips
+from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
@@ -59,6 +59,7 @@ def evaluate(
     configuration: Mapping[str, Any],
     overwrite: bool = False,
     console: Console | None = None,
+    download_lpips: bool = False,
 ) -> Evaluation:
     """Render every held-out photograph's camera, measure the metrics, and print a table.
 
@@ -72,6 +73,7 @@ def evaluate(
         configuration: of the method, for the record; must be JSON.
         overwrite: replace an existing evaluation.
         console: where to print; standard output if None.
+        download_lpips: download the weights that LPIPS needs if they are missing.
 
     Raises:
         RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
@@ -84,6 +86,8 @@ def evaluate(
     files = picture_names([scene.names[i] for i in scene.test])
     delete_partials(path, *(out / folder / file for folder in FOLDERS for file in files))
     photographs: dict[str, dict[str, Any]] = {}
+    if download_lpips:
+        download_lpips_weights()
     networks = load_lpips()
     with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
