@@ -14,6 +14,7 @@ from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.maps import surface
 from tidefield.maps.grid import Grid, MapFrame, Tile, map_frame
+from tidefield.maps.orthophoto import prior_of
 from tidefield.maps.stereo import Pairs, Rectified, choose_pairs, fill_gaps
 from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
@@ -129,6 +130,28 @@ def test_heights_that_are_tried_do_not_depend_on_where_the_map_counts_heights_fr
         ground = float(np.median(start.on(tile, 0))) - zero
         found.append(surface._parallax(choice.views, choice.chosen, ground))
     assert found[0] == pytest.approx(found[1], rel=1e-3)
+
+
+def test_parallax_is_the_same_where_lengths_and_heights_have_other_units():
+    metre, foot = 1.0, 0.3048
+    found = []
+    for across, up in ((metre, metre), (foot, metre), (metre, foot), (foot, foot)):
+        views = [object.__new__(View) for _ in range(3)]
+        for view, x in zip(views, (-8.0, 0.0, 8.0), strict=True):
+            view.position, view.up = np.array([x / across, 0, 40 / up]), up / across
+        found.append(surface._parallax(views, range(3), 2.0 / up))
+    assert found == pytest.approx([found[0]] * 4)
+    assert 0.3 < found[0] < 16 / 38
+
+
+def test_the_range_that_colours_are_looked_for_in_has_the_unit_of_heights(scene):
+    loaded, _ = scene
+    frame, found = map_frame(loaded, None), []
+    flat, sigma = np.zeros((64, 64), np.float32), np.full((64, 64), 1e6, np.float32)
+    for metre in (1.0, 1 / 0.3048):
+        [tile] = Grid(replace(frame, metre=metre), -6.4, 6.4, CELL * metre, 64, 64, 0.0).tiles(64, 0)
+        found.append(prior_of(flat, sigma, tile, 100.0).numpy())
+    np.testing.assert_allclose(*found, rtol=1e-5)
 
 
 def test_the_error_is_large_where_neither_pairs_nor_photographs_determine_the_height(

@@ -207,6 +207,11 @@ class Grid:
     height: float
 
     @property
+    def cell_up(self) -> float:
+        """Side of a cell, in the unit of heights."""
+        return self.cell / self.frame.up
+
+    @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
         """Affine coefficients from column and row to easting and northing, in rasterio's order."""
         return self.cell, 0.0, self.west, 0.0, -self.cell, self.north

@@ -72,7 +72,8 @@ def prior_of(
         above: height of the camera above `Grid.height`, scene units.
     """
     units_up = float(np.linalg.norm(tile.affine()[:, 2]))
-    reach = np.minimum(MARGIN_SIGMAS * sigma, 100 * tile.grid.cell) + MARGIN_CELLS * tile.grid.cell
+    cell = tile.grid.cell_up
+    reach = np.minimum(MARGIN_SIGMAS * sigma, 100 * cell) + MARGIN_CELLS * cell
     around = np.ones((3 * STRIDE, 3 * STRIDE), np.uint8)
     high, low = cv2.dilate(height + reach, around), cv2.erode(height - reach, around)
     rows, columns = -(-height.shape[0] // STRIDE), -(-height.shape[1] // STRIDE)

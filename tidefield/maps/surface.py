@@ -377,7 +377,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     matching = score = np.zeros_like(height)
     used = [(views[k], indices[k]) for k in choice.chosen]
     east, north = tile.offsets(PAD)
-    step = STEP_PX * tile.grid.cell / _parallax(views, choice.chosen, float(np.median(expected)))
+    step = STEP_PX * tile.grid.cell_up / _parallax(views, choice.chosen, float(np.median(expected)))
     for share, half in SWEEPS:
         offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
         found, matching, score = _sweep(used, grey, factor, east, north, height, offsets)
@@ -385,8 +385,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     matching = np.nan_to_num(matching, nan=10 * step).astype(np.float32)
     score = np.nan_to_num(score).astype(np.float32)
     by_gap = (1 - _blur(_determined(matching, step * SWEEPS[-1][0]), BRIDGED_CELLS)) * spread
-    cell = tile.grid.cell / tile.grid.frame.metre * tile.grid.frame.metre_up
-    sigma = np.hypot(standard_error(height, matching, cell), by_gap).astype(np.float32)
+    sigma = np.hypot(standard_error(height, matching, tile.grid.cell_up), by_gap).astype(np.float32)
     inner = slice(PAD, PAD + tile.side)
     height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
     east, north = tile.offsets()
@@ -423,8 +422,9 @@ def standard_error(height: Height, matching: Height, cell: float) -> Height:
 
 
 def _parallax(views: list[View], chosen: Sequence[int], ground: float) -> float:
-    """Shift of the photographs farthest apart per height, in the middle of the tile."""
-    slope = np.array([views[k].position[:2] / max(views[k].position[2] - ground, 1e-6) for k in chosen])
+    """Shift of the photographs farthest apart per height, both in one unit, in the middle of the tile."""
+    above = [max(views[k].position[2] - ground, 1e-6) * views[k].up for k in chosen]
+    slope = np.array([views[k].position[:2] / height for k, height in zip(chosen, above, strict=True)])
     apart = np.linalg.norm(slope[:, None] - slope[None], axis=-1)
     return float(np.clip(np.percentile(apart[np.triu_indices(len(slope), 1)], 90), 0.1, 2.0))
 

@@ -171,7 +171,7 @@ def hillshade(height: Float[np.ndarray, "h w"], cell: float) -> Float[np.ndarray
 
 def write_hillshade(heights: Path, out: Raster, grid: Any) -> None:
     """Write the hillshade of a raster of heights: 1 to 255, 0 where there is none."""
-    cell = grid.cell / grid.frame.metre * grid.frame.metre_up
+    cell = grid.cell_up
     with raster_writer(out, grid) as writer:
         for row, count, values in blocks(heights, around=1):
             shade = np.round(1 + 254 * np.nan_to_num(hillshade(values, cell)[1 : count + 1]))
