@@ -199,3 +199,10 @@ def test_a_local_map_and_a_georeferenced_one_are_refused(tmp_path: Path):
     one, two = (open_survey(write_map(tmp_path / str(g), heights, g)) for g in (True, False))
     with pytest.raises(ChangeError, match="True has a coordinate system, False has none"):
         measure(one, two)
+
+
+def test_a_cloud_of_another_format_is_named_as_one(tmp_path: Path):
+    path = tmp_path / "odm.ply"
+    path.write_bytes(b"ply\n")
+    with pytest.raises(ChangeError, match="is a point cloud of another format: expected LAS or LAZ; convert it"):
+        open_survey(path)

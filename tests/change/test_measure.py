@@ -139,6 +139,10 @@ def test_polygons_that_are_compared_in_part_say_so(tmp_path: Path):
         r.startswith("polygons over the edge (25%), over a gap (50%), a line over both (6") for r in found.remarks
     )
     assert "polygon in the gap: no cell of both surveys is in it" in found.remarks
+    inner = Region("all", shapely.box(WEST, NORTH - 100, WEST + 20, NORTH))
+    limited = measured(earlier, later, within=lambda grid: [inner], regions=lambda grid: regions[:1])
+    assert limited.per_region[0].compared == pytest.approx(1 / 3, abs=0.02)
+    assert any("have heights and --within reaches" in r for r in limited.remarks)
     rows = {(row["region"], row["volume"]): row["compared"] for row in volume_rows(found)}
     assert rows["over the edge", "cut"] == pytest.approx(0.25, abs=0.01)
     assert rows["all", "net"] is None
@@ -181,18 +185,62 @@ def test_heights_that_are_nearly_all_the_same_are_said_to_have_no_errors(tmp_pat
     assert any("all heights are the same" in r for r in found.remarks)
 
 
+def rounded_pair(
+    folder: Path, step: float, noise_m: float, offset_m: float = 0.0, copied: int = 0, lift_m: float = 0.0
+) -> list[Path]:
+    """Two surveys on a flat with a slope, rounded; the later one has some columns from the earlier."""
+    rng, (rows, columns) = np.random.default_rng(16), np.indices((160, 180))
+    flat, paths, first = 4 + 0.013 * columns + 0.007 * rows, [], None
+    for name, lift in (("a", 0.0), ("b", lift_m * (np.hypot(rows - 80, columns - 120) < 20) + offset_m)):
+        heights = np.rint((flat + lift + rng.normal(0, noise_m, flat.shape)) / step) * step
+        first = heights if first is None else first
+        heights[:, :copied] = first[:, :copied]
+        paths.append(write_surface(folder / f"{name}.tif", heights.astype(np.float32)))
+    return paths
+
+
 @pytest.mark.parametrize("step", [0.1, 0.25])
-def test_errors_of_rounded_heights_are_at_least_those_of_the_rounding(tmp_path: Path, step: float):
-    rng, rows, columns = np.random.default_rng(16), *np.indices((100, 120))
-    for name, lift in (("a", 0.0), ("b", 0.3)):
-        heights = (
-            4 + 0.01 * columns + lift * (np.hypot(rows - 50, columns - 60) < 20) + rng.normal(0, 0.004, rows.shape)
-        )
-        write_surface(tmp_path / f"{name}.tif", (np.rint(heights / step) * step).astype(np.float32))
-    found = measured(tmp_path / "a.tif", tmp_path / "b.tif")
-    assert any(f"heights are rounded to {step:g} m" in r for r in found.remarks)
-    assert 0.999 * step < found.errors.sigma * math.sqrt(6) < 1.5 * step
+@pytest.mark.parametrize("with_sigma", [False, True])
+def test_errors_of_rounded_heights_are_at_least_those_of_the_rounding(tmp_path: Path, step: float, with_sigma: bool):
+    paths = rounded_pair(tmp_path, step, 0.004, lift_m=0.6)
+    for path in paths if with_sigma else ():
+        write_surface(path.with_name(f"{path.stem}_sigma.tif"), np.full((160, 180), 0.004, np.float32))
+    found = measured(*paths)
+    least = step / math.sqrt(6)
+    assert any(f"heights are rounded, by which they are off by {least:.3g} m" in r for r in found.remarks)
+    assert 0.999 * least < np.median(found.errors.sigma) < 1.7 * least
     assert not any("the same height" in r for r in found.remarks)
+    low, high = found.fill.interval_m3
+    assert low < 0.6 * math.pi * 20**2 * AREA < high
+
+
+@pytest.mark.parametrize(("step", "noise_m", "offset_m"), [(0.1, 0.03, 0.03), (0.05, 0.015, 0.02), (0.05, 0.004, 0.01)])
+@pytest.mark.parametrize("register", ["vertical", "none"])
+def test_the_shift_of_rounded_heights_is_no_whole_step(
+    tmp_path: Path, step: float, noise_m: float, offset_m: float, register: Register
+):
+    found = measured(*rounded_pair(tmp_path, step, noise_m, offset_m), options=Options(register=register))
+    if register == "vertical":
+        assert found.errors.registration.vertical_m == pytest.approx(offset_m, abs=0.1 * step)
+    else:
+        assert found.errors.registration.systematic_m == pytest.approx(offset_m, abs=0.1 * step)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01])
+def test_copied_cells_are_found_among_rounded_ones(tmp_path: Path, step: float):
+    found = measured(*rounded_pair(tmp_path, step, 0.03, copied=60))
+    assert np.isnan(found.dz[:, :58]).all()
+    assert np.isfinite(found.dz[:, 62:]).mean() > 0.99
+    assert any("33% of the cells have the same height" in r for r in found.remarks)
+    assert not any("rounded" in r for r in found.remarks), "the noise is larger"
+
+
+def test_copied_cells_are_found_where_the_later_survey_is_shifted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tidefield.change.measure.find_shift", lambda *_: Shift(0.13, -0.08, 0.01, 50, 50, 0.5))
+    paths = rounded_pair(tmp_path, 0.001, 0.03, copied=60)
+    found = measure(*(replace(open_surface(path), orthophoto=path) for path in paths), Options(shift="images"))
+    assert np.isnan(found.dz[5:-5, 5:58]).all()
+    assert np.isfinite(found.dz[5:-5, 64:-5]).all()
 
 
 def test_what_the_choice_of_an_outline_adds_takes_no_more_than_there_is():

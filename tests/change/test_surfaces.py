@@ -443,3 +443,15 @@ def test_the_date_in_a_name_is_believed_before_that_of_the_processing(tmp_path: 
     assert open_surface(path, "2023-05-02").remarks == []
     bare = path.rename(tmp_path / "flight.tif")
     assert open_surface(bare).date == "2024-02-03"
+
+
+@pytest.mark.parametrize("value", [99999.0, 65535.0, 32767.0, -1e6])
+def test_values_beyond_all_heights_are_left_out_before_they_are_interpolated(tmp_path: Path, value: float):
+    heights = np.random.default_rng(0).normal(2, 0.5, (300, 300)).astype(np.float32)
+    heights[100:140, 80:160] = value
+    surface = open_surface(write_surface(tmp_path / "a.tif", heights))
+    grid = common_grid([surface])
+    with surface.on_grid(grid, (0.05, 0.05)) as read:
+        found = read(0, grid.rows)
+    assert np.nanmax(np.abs(found)) < 10
+    assert any(f"{value:g}" in remark for remark in surface.remarks)

@@ -36,6 +36,8 @@ ROUGH = 0.08
 """Variation of light that is plants' whatever bare ground has, as of grass beside gravel."""
 LEAST_M2 = 1.0
 """Smaller patches that were gained or lost are left out."""
+_COUNTED = 1 << 24
+"""Cells that are counted at once, which takes 8 bytes of each."""
 _BIN = 0.004
 """Of the histogram of greenness."""
 _COMMON = 0.4
@@ -250,8 +252,11 @@ def _numbered(
 ) -> tuple[Int32[np.ndarray, "rows columns"], Int64[np.ndarray, " parts"]]:
     """Numbers of the connected parts of a region, 0 outside of it, and their sizes in pixels."""
     numbers = np.empty(region.shape, np.int32)
-    label(region, output=numbers)
-    return numbers, np.bincount(numbers.ravel())
+    count = int(label(region, output=numbers))  # type: ignore[arg-type]
+    sizes = np.zeros(count + 1, np.int64)
+    for part in np.array_split(numbers, max(1, numbers.size // _COUNTED)):
+        sizes += np.bincount(part.ravel(), minlength=count + 1)
+    return numbers, sizes
 
 
 def small_patches(

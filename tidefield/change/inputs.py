@@ -19,6 +19,7 @@ CLOUDS = tuple(
     for folder, name in (("odm_georeferencing/", "odm_georeferenced_model"), ("", "cloud"))
     for ending in ("laz", "las")
 )
+_OTHER_CLOUDS = (".ply", ".pcd", ".e57", ".pts", ".ptx")
 
 
 def open_survey(path: Path, date: str | None = None, surfaces: tuple[str, ...] = SURFACES) -> Surface:
@@ -33,6 +34,10 @@ def open_survey(path: Path, date: str | None = None, surfaces: tuple[str, ...] =
     """
     if is_cloud(path):
         raise ChangeError(f"{path} is a point cloud: expected a surface; compare it with another cloud")
+    if path.suffix.lower() in _OTHER_CLOUDS:
+        raise ChangeError(
+            f"{path} is a point cloud of another format: expected LAS or LAZ; convert it (pdal translate, CloudCompare)"
+        )
     if not path.is_dir():
         # Another surface in that folder is none of the map's.
         mapped = path.name in {Path(name).name for name in SURFACES}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from tidefield.change.choice import repeat_choice
@@ -30,6 +30,7 @@ from tidefield.change.registration import (
     fit,
     statistics,
 )
+from tidefield.change.repeats import repeated, rounding_m
 from tidefield.change.shift import Shift, find_shift
 from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_zeros, warped
 from tidefield.change.volumes import ErrorModel, Volume
@@ -43,14 +44,8 @@ _STANDS_OUT = 3.0
 """Deviations of a window's mean."""
 _MOST_SAMPLED = 2_000_000
 """Cells that quantiles are computed from."""
-_REPEATED = 0.01
-"""Heights that are measured twice are alike to the last bit in fewer cells than this, unless they are rounded."""
 _MOST_REPEATED = 0.5
-"""Of more cells, what is left is too little to tell change from a shift."""
-_ROUNDED = 0.99
-"""Share of small differences that are multiples of a step where heights are rounded."""
-_FEW_STEPS = 20
-"""Differences of more are no multiples any more, because the step is known to a percent only."""
+"""Of more cells that are the same in both surveys, what is left is too little to tell change from a shift."""
 _WHOLE = 0.99
 """Share of a polygon that is all of it but for its edges."""
 _NMAD_CELLS = 1000
@@ -98,7 +93,8 @@ class Change:
     Attributes:
         dz: later minus earlier height after co-registration, metres; NaN where one of them is unknown.
         errors: of dz.
-        stable: cells that co-registration and errors were measured on.
+        stable: cells that co-registration and errors were measured on; they may lie outside of what is compared.
+        stable_dz: dz in these, or in every second, third, ... of them.
         stable_given: whether the user named them.
         false_alarms: share of stable cells that are significant by themselves: the null test.
         net: of all cells, without a threshold.
@@ -112,6 +108,7 @@ class Change:
     dz: Float32[np.ndarray, "rows columns"]
     errors: ErrorModel
     stable: Bool[np.ndarray, "rows columns"]
+    stable_dz: Float32[np.ndarray, " N"]
     stable_given: bool
     outlines: Outlines
     false_alarms: float
@@ -218,9 +215,13 @@ def measure(
             f"{earlier.file} and {later.file} both have heights in {known} cells: expected at least "
             f"{LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
         )
-    step = _leave_out_repeated(dz, earlier, grid, given, remarks)
+    unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)[0]
+    steps = rounding_m(earlier), rounding_m(later)
+    _leave_out_repeated(dz, unmoved, max(steps), given, remarks)
+    del unmoved
+    rounding = math.hypot(*steps) / math.sqrt(12)  # each error is uniform within a step
     model: Model = "vertical" if options.register == "auto" else options.register
-    settled = _settle(dz, own, grid, given, model, options, step)
+    settled = _settle(dz, own, grid, given, model, options, rounding, remarks)
     registration, variogram, sigma, ground = settled
     slopes = None
     if shift is not None and shift.known:
@@ -234,6 +235,7 @@ def measure(
     degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
     errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
     alarms = _false_alarms(dz, errors, ground)
+    shown = _sampled(dz, ground)
     if area is not None:
         dz[~area] = np.nan
     if not variogram.reached:
@@ -251,7 +253,15 @@ def measure(
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
     outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, options.windows)
-    return _summed(earlier, later, dz, errors, ground, given is not None, outlines, alarms, regions, remarks)
+    found = _summed(earlier, later, dz, errors, ground, shown, given is not None, outlines, alarms, regions, remarks)
+    partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in found.per_region if one.compared < _WHOLE]
+    if partial:
+        limited = " and --within reaches" if area is not None else ""
+        remarks.append(
+            f"polygon{'s'[: len(partial) > 1]} {list_names(partial)}: only this part is compared, where both surveys "
+            f"have heights{limited}, and its volumes are of that part"
+        )
+    return found
 
 
 def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remarks: list[str]) -> Shift | None:
@@ -294,14 +304,15 @@ def _settle(
     given: Bool[np.ndarray, "rows columns"] | None,
     model: Model,
     options: Options,
-    step: float,
+    rounding: float,
+    remarks: list[str],
 ) -> tuple[Registration, Variogram, Float32[np.ndarray, "rows columns"] | float, Bool[np.ndarray, "rows columns"]]:
     """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given.
 
     Args:
-        step: what heights are rounded to, metres; the errors of both surveys are at least those of the rounding.
+        rounding: one sigma of what the rounding of heights does to dz, metres; errors are at least as large.
     """
-    ground = guess = _unchanged(dz, own) if given is None else given
+    ground = guess = _unchanged(dz, own, rounding) if given is None else given
     turns = _TURNS if given is None else 1
     found = None
     for turn in range(turns):
@@ -311,7 +322,7 @@ def _settle(
                 f"the surveys have {cells} cells of stable ground: expected at least {LEAST_STABLE} to measure shift "
                 "and errors on; give more polygons of ground that did not change (--stable), or a smaller --cell"
             )
-        coefficients = fit(dz, ground, grid, model)
+        coefficients = fit(dz, ground, grid, model, rounding)
         before = statistics(_sampled(dz, ground))
         bare = Registration(model, coefficients, np.zeros((3, 3)), centre(grid), cells, before, before)
         # Residuals over stable ground only: everything else is NaN.
@@ -319,7 +330,7 @@ def _settle(
         for rows in grid.strips():
             inside = ground[rows]
             residual[rows][inside] = (dz[rows] - bare.plane(grid, rows))[inside]
-        left = float(np.nanmedian(_sampled(residual, ground)))
+        left = fit(residual, ground, grid, "vertical", rounding)[0]
         after = statistics(_sampled(residual, ground))
         if own is not None:
             residual /= own
@@ -329,10 +340,20 @@ def _settle(
         size = deviation95(values)
         if len(values) < _NMAD_CELLS:
             size = max(size, nmad(values))
-        size = max(size, 1e-6 if own is not None else step / math.sqrt(6), 1e-6)
-        sigma = size if own is None else own * np.float32(size)
+        size = max(size, 1e-6)
         residual -= middle
-        residual /= np.float32(size)
+        if own is None:
+            sigma = max(size, rounding)
+            residual /= np.float32(sigma)
+        else:
+            sigma = np.maximum(own * np.float32(size), np.float32(rounding))
+            residual *= own / sigma
+        is_last = given is not None or turn == turns - 1
+        if is_last and rounding > np.median(_sampled(own, ground) * size if own is not None else size):
+            remarks.append(
+                f"heights are rounded, by which they are off by {rounding:.3g} m (one sigma): errors are taken to be "
+                "at least that"
+            )
         variogram = fit_variogram(residual, grid.cell_m)
         del residual
         found = Registration(
@@ -344,7 +365,7 @@ def _settle(
             before,
             after,
         )
-        if given is not None or turn == turns - 1:
+        if is_last:
             return found, variogram, sigma, ground
         moved = np.empty_like(dz)
         for rows in grid.strips():
@@ -357,70 +378,47 @@ def _settle(
 
 def _leave_out_repeated(
     dz: Float32[np.ndarray, "rows columns"],
-    earlier: Surface,
-    grid: Grid,
+    unmoved: Float32[np.ndarray, "rows columns"],
+    step_m: float,
     given: Bool[np.ndarray, "rows columns"] | None,
     remarks: list[str],
-) -> float:
+) -> None:
     """Leave out cells that one survey has from the other, which were not measured twice, and say so.
 
     Args:
+        unmoved: dz without a horizontal shift, which interpolates: only there are the cells the same.
+        step_m: what heights are rounded to.
         given: stable ground, if the user named it.
-
-    Returns:
-        what heights are rounded to, metres; 0 where they are not.
     """
-    known, repeated = int(np.isfinite(dz).sum()), dz == 0
-    share = np.count_nonzero(repeated) / known
-    if share <= _REPEATED:
-        return 0.0
-    differences = np.abs(_sampled(dz, np.isfinite(dz) & ~repeated)).astype(np.float64)
-    if len(differences) and (step := _step_of(earlier, grid, differences)):
-        remarks.append(f"heights are rounded to {step:.3g} m: errors are taken to be at least those of the rounding")
-        return step
+    same, share = repeated(unmoved, step_m)
+    if not share:
+        return
+    if unmoved is not dz:
+        same = dilated(same, 1)
     alike = f"{100 * share:.0f}% of the cells have the same height in both surveys, as if one had them from the other"
     if share == 1:
         remarks.append(
             "all heights are the same in both surveys, so that no errors can be measured: intervals have none"
         )
-    elif share > _MOST_REPEATED or (given is not None and np.count_nonzero(given & ~repeated) < LEAST_STABLE):
+    elif share > _MOST_REPEATED or (given is not None and np.count_nonzero(given & ~same) < LEAST_STABLE):
         remarks.append(
             f"{alike}: errors are too small if these cells were not measured twice; limit the comparison to what was "
             "(--within), and name stable ground there (--stable)"
         )
     else:
-        dz[repeated] = np.nan
+        dz[same] = np.nan
         if given is not None:
-            given &= ~repeated
+            given &= ~same
         remarks.append(f"{alike}: left out, since they were not measured twice")
-    return 0.0
-
-
-def _step_of(earlier: Surface, grid: Grid, differences: Float64[np.ndarray, " N"]) -> float:
-    """The step that heights are rounded to; 0 without one.
-
-    Args:
-        differences: of the surveys, of which none is zero: all are multiples of it.
-    """
-    step = float(np.quantile(differences, 0.001))
-    few = differences[differences < _FEW_STEPS * step]
-    step = float(np.median(few / np.maximum(1, np.rint(few / step))))
-    middle = next(rows for rows in grid.strips() if rows.stop > grid.rows // 2)
-    with earlier.on_grid(grid) as read:
-        heights = read(middle.start, middle.stop)
-    # A change that is the same everywhere is no step: cells next to each other tell.
-    steps = np.abs(np.diff(heights, axis=1)).astype(np.float64) / step
-    steps = np.concatenate([few / step, steps[(steps > 0) & (steps < _FEW_STEPS)]])
-    multiples = np.maximum(1, np.rint(steps))
-    return step if len(steps) > len(few) and float((np.abs(steps - multiples) < 0.1).mean()) > _ROUNDED else 0.0
 
 
 def _unchanged(
-    dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None
+    dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None, rounding: float
 ) -> Bool[np.ndarray, "rows columns"]:
     """Ground where no window's mean stands out from what most windows have in common, as a first guess."""
     known = np.isfinite(dz)
     ground = known
+    least = rounding if own is None else rounding / float(np.median(_sampled(own, known)))
     for window in (5, 11):
         mean = np.where(known, dz if own is None else dz / own, np.float32(0))
         uniform_filter(mean, window, output=mean, mode="constant")
@@ -429,7 +427,7 @@ def _unchanged(
         for _ in range(_TURNS):
             some = _sampled(mean, ground)
             middle, spread = float(np.median(some)), nmad(some)
-            ground = known & (np.abs(mean - middle) <= _STANDS_OUT * spread)
+            ground = known & (np.abs(mean - middle) <= _STANDS_OUT * max(spread, least / window))
     return ground
 
 
@@ -462,6 +460,7 @@ def _summed(
     dz: Float32[np.ndarray, "rows columns"],
     errors: ErrorModel,
     ground: Bool[np.ndarray, "rows columns"],
+    stable_dz: Float32[np.ndarray, " N"],
     stable_given: bool,
     outlines: Outlines,
     alarms: float,
@@ -509,14 +508,8 @@ def _summed(
             continue
         compared = region.share_on(grid) * np.count_nonzero(inside) / np.count_nonzero(cells)
         per_region.append(InPolygon(region, errors.volume(dz, inside), *chosen(inside), compared))
-    partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in per_region if one.compared < _WHOLE]
     if empty:
         remarks.append(f"polygon{'s'[: len(empty) > 1]} {list_names(empty)}: no cell of both surveys is in it")
-    if partial:
-        remarks.append(
-            f"polygon{'s'[: len(partial) > 1]} {list_names(partial)}: only this part is compared, where both surveys "
-            "have heights, and its volumes are of that part"
-        )
     return Change(
         earlier,
         later,
@@ -524,6 +517,7 @@ def _summed(
         dz,
         errors,
         ground,
+        stable_dz,
         stable_given,
         outlines,
         alarms,

@@ -18,6 +18,8 @@ _SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
 """Values that programs write where they know no height; some do not declare them."""
 IMPOSSIBLE_M = 20_000.0
 """No height on Earth is further from zero."""
+_MOST_FAR = 8
+"""Different values that are further away: programs write one of them."""
 _UNLIKELY_M = 3_000.0
 """No flat is further from zero; 9999 feet are."""
 _ZERO_SHARE = 0.01
@@ -68,6 +70,8 @@ def undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
             found.append(0.0)
         elif declared and step > _FAR_M:
             doubtful = float(zero.mean())
+    far, cells = np.unique(values[known & ~possible & ~np.isin(values, found)], return_counts=True)
+    found += far[np.argsort(-cells)[:_MOST_FAR]].tolist()
     return found, float((known & np.isin(values, found)).mean()), doubtful
 
 

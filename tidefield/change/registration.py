@@ -125,9 +125,17 @@ def centre(grid: Grid) -> tuple[float, float]:
 
 
 def fit(
-    dz: Float32[np.ndarray, "rows columns"], stable: Bool[np.ndarray, "rows columns"], grid: Grid, model: Model
+    dz: Float32[np.ndarray, "rows columns"],
+    stable: Bool[np.ndarray, "rows columns"],
+    grid: Grid,
+    model: Model,
+    rounding: float = 0.0,
 ) -> tuple[float, float, float]:
     """The shift or plane of dz over stable ground, by means without outliers.
+
+    Args:
+        rounding: one sigma of what the rounding of heights does to dz, metres: of heights that are mostly the same
+            after it, the few others tell the shift.
 
     Raises:
         ChangeError: a tilt is asked for, and stable ground is not on all sides.
@@ -148,7 +156,7 @@ def fit(
     for _ in range(6):
         residual = values - basis @ solution
         residual -= np.median(residual)
-        kept = np.abs(residual) <= _TRIM * max(nmad(residual), 1e-9)
+        kept = np.abs(residual) <= _TRIM * max(nmad(residual), rounding, 1e-9)
         solution = np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
     c, gx, gy = np.pad(solution, (0, 3 - len(solution))).tolist()
     return c, gx, gy

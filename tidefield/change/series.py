@@ -40,6 +40,7 @@ class Entry:
         start, end: numbers of the surveys, from 0.
         region: "all", or the name of one of the user's polygons.
         what: net, cut or fill.
+        compared: share of the polygon where both surveys have heights; None for all ground.
     """
 
     since: Since
@@ -48,15 +49,16 @@ class Entry:
     region: str
     what: str
     volume: Volume
+    compared: float | None = None
 
 
 def entries_of(change: Change, since: Since, start: int, end: int) -> list[Entry]:
     """The volumes of one comparison."""
-    found = [("all", change.net, change.cut, change.fill)]
-    found += [(one.region.name, one.net, one.cut, one.fill) for one in change.per_region]
+    found = [("all", (change.net, change.cut, change.fill), None)]
+    found += [(one.region.name, (one.net, one.cut, one.fill), one.compared) for one in change.per_region]
     return [
-        Entry(since, start, end, region, what, volume)
-        for region, *volumes in found
+        Entry(since, start, end, region, what, volume, compared)
+        for region, volumes, compared in found
         for what, volume in zip(VOLUMES, volumes, strict=True)
     ]
 
@@ -71,6 +73,7 @@ def series_rows(entries: Sequence[Entry], names: Sequence[str]) -> list[dict[str
             "earlier": names[entry.start],
             "later": names[entry.end],
             **entry.volume.to_json(),
+            "compared": entry.compared,
         }
         for entry in entries
     ]
@@ -131,7 +134,8 @@ def _table(entries: Sequence[Entry], region: str) -> list[dict[str, Any]]:
     for entry in entries:
         if entry.region == region:
             key = (entry.since, entry.start, entry.end)
-            row = rows.setdefault(key, {"since": entry.since, "start": entry.start, "end": entry.end})
+            about = {"since": entry.since, "start": entry.start, "end": entry.end, "compared": entry.compared}
+            row = rows.setdefault(key, about)
             row[entry.what] = entry.volume
     return list(rows.values())
 
