@@ -215,14 +215,63 @@ def test_the_volume_of_a_change_and_its_interval_are_the_closed_form(tmp_path: P
     found = atlas.area(box(10, 10, 40, 20), detection_m=0.1)
     (volumes,) = found["sheets"]
     assert found["area_m2"] == pytest.approx(300 * CELL**2)
-    for name, cells, value in (("net", 300, 200 * 0.4 - 100 * 0.2), ("cut", 100, 100 * 0.2), ("fill", 200, 200 * 0.4)):
-        half = 1.96 * CELL**2 * math.hypot(0.03 * math.sqrt(cells), 0.01 * cells)
+    for name, value in (("net", 200 * 0.4 - 100 * 0.2), ("cut", 100 * 0.2), ("fill", 200 * 0.4)):
         assert volumes[name]["value_m3"] == pytest.approx(value * CELL**2, rel=1e-4)
-        assert volumes[name]["high_m3"] - volumes[name]["value_m3"] == pytest.approx(half, rel=1e-3)
-    assert "cut" in volumes
+    half = 1.96 * CELL**2 * math.hypot(0.03 * math.sqrt(300), 0.01 * 300)
+    assert volumes["net"]["high_m3"] - volumes["net"]["value_m3"] == pytest.approx(half, rel=1e-3)
+    assert "low_m3" not in volumes["cut"] | volumes["fill"], "their cells are chosen by their own errors"
+    assert volumes["share"] == 1
     beyond = atlas.area(box(10, 10, 40, 20), detection_m=0.3)["sheets"][0]
     assert beyond["cut"]["value_m3"] == 0
     assert beyond["fill"] == volumes["fill"]
+
+
+def test_volumes_say_which_share_of_the_polygon_they_are_of(tmp_path: Path):
+    heights = np.full(SHAPE, 5, np.float32)
+    heights[:, 50:] = -9999
+    sigma = np.where(np.arange(SHAPE[1]) < 30, np.float32(0.1), np.float32(-9999)) + np.zeros((SHAPE[0], 1), np.float32)
+    folder = write_map(tmp_path / "map", (1, 2, 3), heights)
+    write_surface(folder / "odm_dem" / "dsm_sigma.tif", sigma, CELL, nodata=-9999.0)
+    dz = np.where(heights > 0, np.float32(0.4), np.float32(np.nan))
+    atlas = Atlas([folder, write_change(tmp_path / "change", dz)])
+    for volumes in atlas.area(box(40, 10, 60, 20))["sheets"]:
+        assert volumes["share"] == pytest.approx(0.5)
+    for volumes in atlas.area(box(-20, 10, 20, 20))["sheets"]:
+        assert volumes["share"] == pytest.approx(0.5, abs=0.01)
+    heap = np.full(SHAPE, 5, np.float32)
+    heap[11:19, 21:39] = 4.9
+    heap[13:17, 24:36] = 6
+    write_surface(folder / "odm_dem" / "dsm.tif", heap, CELL, nodata=-9999.0)
+    above = Atlas([folder]).area(box(20, 10, 40, 20))["sheets"][0]["above"]
+    half = 1.96 * 0.1 * 48 * CELL**2  # of the heap; of level ground beside it, too, where rounding puts that above
+    assert above["high_m3"] - above["value_m3"] > 0.999 * half, "cells without an error have that of the others"
+
+
+@pytest.mark.parametrize(("crs", "cell"), [("EPSG:3857", 1.0), ("EPSG:4326", 1e-5)])
+def test_lengths_are_those_of_the_ground_in_any_system(tmp_path: Path, crs: str, cell: float):
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(5.0, 53.5)
+    write_surface(tmp_path / "map" / "dsm.tif", np.full((200, 200), 3, np.float32), cell, x, y, crs)
+    atlas = Atlas([tmp_path / "map"])
+    assert (atlas.name, atlas.unit, atlas.metre) == ("WGS 84 / UTM zone 31N", "m", 1.0)
+    west, south, east, north = atlas.bounds
+    metres = 200 * cell * (0.597 if crs == "EPSG:3857" else 111_300)
+    assert north - south == pytest.approx(metres, rel=0.05)
+    middle = np.array([(west + east) / 2, (south + north) / 2])
+    assert atlas.at(*middle)[0]["height"] == 3
+    assert atlas.tile(0, "height", 0, 0, 0) is not None
+
+
+def test_errors_are_in_the_unit_of_their_heights(tmp_path: Path):
+    import rasterio
+
+    folder = write_map(tmp_path / "map", (1, 2, 3))
+    with rasterio.open(folder / "odm_dem" / "dsm.tif", "r+") as file:
+        file.units = ("ft",)
+    (found,) = Atlas([folder]).at(*corner(20.5, 30.5))
+    assert found["height"] == pytest.approx(0.3048 * (5 + 0.2 + 0.6), abs=1e-4)
+    assert found["sigma"] == pytest.approx(0.3048 * 0.02, abs=1e-5)
 
 
 def test_what_is_systematic_on_a_slope_adds_up_in_its_volume(tmp_path: Path):

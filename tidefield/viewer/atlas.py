@@ -1,7 +1,8 @@
 """Maps and changes to look at from straight above: layers, tiles, values, sections and volumes, in one system.
 
-All is shown in the first coordinate system that a folder states, heights in metres. Tiles are squares of `TILE_PX`
-pixels; those of level z have 2^-z of the side of the whole area, and are counted from its north-western corner.
+All is shown in the first coordinate system that a folder states, or a UTM zone where lengths in that are not those of
+the ground, and heights in metres. Tiles are squares of `TILE_PX` pixels; those of level z have 2^-z of the side of the
+whole area, and are counted from its north-western corner.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from PIL import Image
 
 from tidefield.change.errors import Variogram, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import Surface, date_in, is_local, open_surface
+from tidefield.change.surfaces import Surface, date_in, is_local, open_surface, same_system
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
+from tidefield.geometry.geodesy import in_metres, metric_system
 from tidefield.maps.grid import LOCAL_NAME
 from tidefield.maps.rasters import need
 
@@ -127,6 +129,8 @@ def open_sheet(folder: Path) -> Sheet:
     ):
         if path is not None:
             found.append(Layer(kind, title, path, 1, "picture", *_black_white(path)))
+    if heights is not None and sigma is not None:
+        sigma = replace(sigma, metres=heights.metres)  # whatever unit of heights its file states
     if heights is not None:
         found.append(Layer("height", "Height", heights, 1, "height", *_usual(heights, 1)))
     if sigma is not None:
@@ -163,7 +167,8 @@ class Atlas:
         rasterio = need("rasterio")
         self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
         self._systems = [_system(sheet) for sheet in self.sheets]
-        self.crs = next(filter(None, self._systems), None)
+        stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
+        self.crs = next((_of_the_ground(sheet, crs) for sheet, crs in stated), None)
         self._require_one_frame()
         boxes, cells = [], []
         for sheet in self.sheets:
@@ -253,10 +258,11 @@ class Atlas:
     def area(self, points: Float64[np.ndarray, "N 2"], detection_m: float = 0.0) -> dict[str, Any]:
         """Return the area of a polygon, and in it the volumes of every sheet in cubic metres.
 
-        Of a change: net of all cells; cut and fill of those beyond a level of detection; with 95% intervals from the
-        random, correlated and systematic errors that `tidefield change` measured. Of a map: above and below the plane
-        through the surface along the polygon's edge, where intervals take the errors of all cells to be alike, which
-        makes them wide.
+        Of a change: net of all cells, with its 95% interval from the random, correlated and systematic errors that
+        `tidefield change` measured; cut and fill of the cells beyond a level of detection, without: these are chosen by
+        their own errors. Of a map: above and below the plane through the surface along the polygon's edge, where
+        intervals take the errors of all cells to be alike, which makes them wide. "share" is that of the polygon where
+        there are values.
         """
         import shapely
 
@@ -278,18 +284,23 @@ class Atlas:
                 transform = _corner_at(file.transform, box)
                 cell = abs(transform.a) * self.metre
                 cell_area = cell * abs(transform.e) * self.metre
+                on = polygon.intersection(shapely.box(*file.bounds)).area / polygon.area
                 bands = (2, 4) if sheet.kind == "change" else ()
                 errors = [_band(file, band, box) for band in bands if band <= file.count]
+            cells = np.count_nonzero(inside)
             inside &= np.isfinite(values)
+            share = {"share": on * np.count_nonzero(inside) / cells}
             if sheet.kind == "change":
-                results.append(_change_volumes(values, errors, inside, cell, cell_area, sheet.numbers, detection_m))
+                volumes = _change_volumes(values, errors, inside, cell, cell_area, sheet.numbers, detection_m)
+                results.append(volumes | share)
                 continue
             sigma = None
             if sheet.sigma is not None:
                 with self._reader(sheet.sigma) as file:
                     error = _band(file, 1, box)
                 sigma = error if error.shape == values.shape else None
-            results.append(self._map_volumes(polygon, values, sigma, inside, transform, cell_area, source))
+            volumes = self._map_volumes(polygon, values, sigma, inside, transform, cell_area, source)
+            results.append(volumes and volumes | share)
         return {"area_m2": polygon.area * self.metre**2, "length_m": polygon.length * self.metre, "sheets": results}
 
     def _map_volumes(
@@ -320,8 +331,9 @@ class Atlas:
             value = float(np.abs(above[chosen]).sum()) * cell_area
             result[name] = {"value_m3": value}
             if sigma is not None:
-                own = np.nan_to_num(sigma[inside][chosen], nan=0.0)
-                half = BAND * float(own.sum()) * cell_area
+                errors = sigma[inside][chosen]
+                known = np.isfinite(errors)
+                half = BAND * float(errors[known].mean() if known.any() else 0.0) * len(errors) * cell_area
                 result[name] |= {"low_m3": value - half, "high_m3": value + half}
         return result
 
@@ -387,8 +399,6 @@ class Atlas:
         if crs.name == LOCAL_NAME:  # its axes say metre: GeoTIFFs keep no unknown unit
             return 1.0, "units", crs.name
         plan = crs.axis_info[0]
-        if "degree" in plan.unit_name:
-            raise RunError(f"the maps are in degrees ({crs.name}): expected a projected system; make them in one")
         if bare and plan.unit_conversion_factor != 1:
             raise RunError(
                 f"{bare[0].folder} is between surfaces without a coordinate system, whose lengths were taken as "
@@ -401,6 +411,26 @@ class Atlas:
     def _measures(self) -> tuple[str, str, str]:
         """What lengths, areas and volumes are in: metres in every system that knows how long they are."""
         return ("units", "square units", "cubic units") if self.unit == "units" else ("m", "m²", "m³")
+
+
+def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
+    """A sheet's system; a UTM zone where that is in degrees, or in metres that are shorter on the ground."""
+    from pyproj import CRS
+    from pyproj.exceptions import ProjError
+
+    own = CRS.from_wkt(crs.to_wkt())
+    if is_local(own) or not (own.is_geographic or (own.is_projected and in_metres(own))):
+        return crs
+    with _opened(sheet.layers[0].source) as file:
+        west, south, east, north = file.bounds
+    try:
+        metric = metric_system(own, (west + east) / 2, (south + north) / 2)
+    except ProjError as error:
+        raise RunError(
+            f"{sheet.folder} lies outside of {own.name} ({error}): expected coordinates of its system; assign the "
+            "right one (gdal_edit.py -a_srs)"
+        ) from error
+    return crs if same_system(metric, own) else type(crs).from_wkt(metric.to_wkt())
 
 
 def _system(sheet: Sheet) -> Any:
@@ -563,7 +593,7 @@ def _change_volumes(
     numbers: dict[str, Any],
     detection_m: float,
 ) -> dict[str, Any]:
-    """Volumes in a polygon, with their intervals.
+    """Volumes in a polygon, net with its interval.
 
     The systematic error is taken to have one sign in all cells, so that on a hill, where that of a shift cancels out,
     intervals are wider than those of the report.
@@ -582,22 +612,21 @@ def _change_volumes(
     datum = float(numbers.get("registration", {}).get("datum_error_m", 0.0))
     freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
     result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
-    chosen = {"net": inside, "cut": inside & (dz < -detection_m), "fill": inside & (dz > detection_m)}
-    for name, region in chosen.items():
-        error = region_error(sigma.astype(np.float32), region, variogram, cell_m)
-        area = float(region.sum()) * cell_area
-        value = float(dz[region].sum()) * cell_area
-        volume = Volume(
-            value if name == "net" else abs(value),
-            error.random * cell_area,
-            error.correlated * cell_area,
-            float(shared[region].sum()) * cell_area,
-            area,
-            degrees_of_freedom=freedom,
-            datum_m3=datum * area,
-        )
-        low, high = volume.interval_m3
-        result[name] = {"value_m3": volume.value_m3, "low_m3": low, "high_m3": high}
+    error = region_error(sigma.astype(np.float32), inside, variogram, cell_m)
+    area = float(inside.sum()) * cell_area
+    net = Volume(
+        float(dz[inside].sum()) * cell_area,
+        error.random * cell_area,
+        error.correlated * cell_area,
+        float(shared[inside].sum()) * cell_area,
+        area,
+        degrees_of_freedom=freedom,
+        datum_m3=datum * area,
+    )
+    low, high = net.interval_m3
+    result["net"] = {"value_m3": net.value_m3, "low_m3": low, "high_m3": high}
+    for name, region in (("cut", inside & (dz < -detection_m)), ("fill", inside & (dz > detection_m))):
+        result[name] = {"value_m3": abs(float(dz[region].sum())) * cell_area}
     return result
 
 
