@@ -245,3 +245,12 @@ def test_a_file_of_somebody_else_is_one_clear_error(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(Path, "read_bytes", refuse)
     with pytest.raises(RunError, match=r"a\.json cannot be read \(Permission denied\)"):
         read_json(tmp_path / "a.json")
+
+
+def test_what_a_killed_process_left_is_deleted_whatever_stage_it_was_in(tmp_path: Path):
+    left = [".dsm-0123abcd.partial.tif", ".dsm-0123abcd.rough.partial.tif"]
+    others = ["dsm.tif", ".dsm_sigma-0123abcd.partial.tif", ".dsm-0123abcd.partial.json"]
+    for name in (*left, *others):
+        (tmp_path / name).touch()
+    delete_partials(tmp_path / "dsm.tif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)

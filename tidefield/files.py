@@ -155,7 +155,7 @@ def is_partial(path: Path) -> bool:
 def delete_partials(*paths: Path) -> None:
     """Delete what processes that were killed while they wrote these files have left of them."""
     for path in paths:
-        for partial in path.parent.glob(f".{escape(path.stem)}-????????.partial{escape(path.suffix)}"):
+        for partial in path.parent.glob(f".{escape(path.stem)}-????????.*partial{escape(path.suffix)}"):
             with writing_to(partial):
                 partial.unlink(missing_ok=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from tidefield.data.georeference import Georeference, Residuals, read_georeferen
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity
-from tidefield.maps.check_points import _intersected, check, read_check_points, remark, summary
+from tidefield.maps.check_points import _intersected, all_check_points, check, read_check_points, remark, summary
 from tidefield.maps.grid import Grid, MapFrame, map_frame
 from tidefield.maps.rasters import Raster, raster_writer
 from tidefield.survey.io.gcp_file import write_check_points
@@ -165,6 +166,48 @@ def test_a_damaged_file_is_refused(scene: Scene, frame: MapFrame, tmp_path: Path
     (tmp_path / "check.txt").write_text(text)
     with pytest.raises(RunError, match="cannot be read as check points"):
         read_check_points(tmp_path / "check.txt", scene, frame)
+
+
+def test_marks_that_undistorting_crops_are_left_out(tmp_path: Path):
+    truth = disk.survey(disk.BARREL)
+    disk.write_colmap(tmp_path / "scene", truth)
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    Georeference(FRAME, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", hold_out=False, calibrate=False, cache=tmp_path / "cache")
+    width, height = truth.lenses[0].width, truth.lenses[0].height
+    corners = (-0.4 * width, -0.4 * height), (width / 2, height / 2), (width / 2, height / 3)
+    each = zip(corners, truth.names, strict=False)
+    lines = [f"351200 512900 260 {u:.3f} {v:.3f} {name} peg" for (u, v), name in each]
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", *lines]))
+    own = map_frame(scene, read_georeference(scene.root))
+    [found] = read_check_points(tmp_path / "check.txt", scene, own)
+    assert len(found.marks) == 2
+    assert np.isfinite(_intersected(found, scene, own)).all()
+
+
+def test_each_point_checks_once_and_those_that_were_fitted_to_do_not(
+    scene: Scene, frame: MapFrame, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    own = replace(scene, root=tmp_path)
+    write_check_points(control(scene), tmp_path)
+    (tmp_path / "again.txt").write_text((tmp_path / CHECK_FILE).read_text() + "351201 512902 260.3 G3\n")
+    assert [p.name for p in all_check_points(own, frame, None, ())] == ["CHK1", "chk 2"]
+    assert [p.name for p in all_check_points(own, frame, tmp_path / "again.txt", ())] == ["CHK1", "chk 2", "G3"]
+    assert [p.name for p in all_check_points(own, frame, tmp_path / "again.txt", ("G3",))] == ["CHK1", "chk 2"]
+    assert "the scene was fitted to G3" in caplog.text
+    assert all_check_points(own, map_frame(scene, None), None, ()) == []
+    assert "is not georeferenced" in caplog.text
+
+
+def test_check_points_over_another_zero_are_refused(
+    scene: Scene, frame: MapFrame, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    (tmp_path / "check.txt").write_text("EPSG:27700+5701\n351200 512900 210 peg\n")
+    assert len(read_check_points(tmp_path / "check.txt", scene, frame)) == 1
+    assert "heights in check.txt are over Ordnance Datum Newlyn, those of the map: unknown" in caplog.text
+    known = replace(frame, wkt=parse_crs("EPSG:27700+5732").to_wkt())
+    with pytest.raises(RunError, match="its heights are over Ordnance Datum Newlyn, those of the map over Belfast"):
+        read_check_points(tmp_path / "check.txt", scene, known)
 
 
 def test_a_scene_without_coordinates_has_no_check_points(scene: Scene, tmp_path: Path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import textured_wall as wall
@@ -12,8 +15,10 @@ from tidefield.data.georeference import Georeference, Residuals
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
-from tidefield.maps.grid import Grid, MapFrame, _vertical, feather, map_frame
+from tidefield.maps.grid import Grid, MapFrame, _vertical, feather, ground_sampling_distance, map_frame
+from tidefield.maps.make import Job
 from tidefield.maps.orthophoto import camera_above
+from tidefield.maps.surface import Start
 
 FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
 
@@ -101,7 +106,7 @@ def test_a_map_in_feet_has_a_metre_of_as_many_feet(system: str, up: float):
 def test_heights_in_metres_are_not_stated_in_feet():
     with pytest.raises(RunError, match="US survey foot: expected a system in metres"):
         _vertical("unknown", "EPSG:6360")
-    assert _vertical("NAVD88 height (ftUS)", None) is None
+    assert _vertical("NAVD88 height (ftUS)", None) == CRS("EPSG:5703"), "its twin in metres"
     assert _vertical("NAVD88 height", None) == CRS("EPSG:5703")
 
 
@@ -130,3 +135,38 @@ def test_heights_whose_zero_is_known_get_no_other(datum: str, stated: str | None
 )
 def test_heights_get_the_zero_that_is_given_where_it_may_be_theirs(datum: str, stated: str | None, expected: str):
     assert _vertical(datum, "EPSG:5703", None if stated is None else CRS(stated)) == CRS(expected)
+
+
+def test_tiles_of_a_coarse_map_are_as_large_on_the_ground(tmp_path: Path):
+    sides = {}
+    for factor in (1, 3, 20):
+        own = wall.scene(wall.cameras(3))
+        frame = map_frame(own, None)
+        cell = factor * ground_sampling_distance(own)
+        sides[factor] = Job(own, Grid(frame, 0.0, 0.0, cell, 4000, 4000, 0.0), None, False, {}).tile_side
+    assert sides == {1: 96, 3: 32, 20: 32}
+
+
+def test_a_map_that_was_placed_anew_is_another_map():
+    own = wall.scene(wall.cameras(3))
+    there = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
+    keys = set()
+    for height_m in (there.height_m, there.height_m + 48):
+        similarity = Similarity(1.0, np.eye(3), np.zeros(3))
+        frame = replace(there, height_m=height_m)
+        placed = Georeference(frame, "GPS", similarity, Residuals(), Residuals(), Residuals(), (), ())
+        grid = Grid(map_frame(own, placed), 351_200.0, 512_900.0, 0.1, 100, 100, 260.0)
+        keys.add(Job(own, grid, None, False, {}).key)
+    assert len(keys) == 2
+
+
+def test_the_start_of_a_tile_is_read_from_coarse_cells_of_any_number():
+    own = grid(40_000 * 8, 200, 0.05)
+    coarse = own.coarser(8)
+    height = np.broadcast_to(np.arange(coarse.columns, dtype=np.float32), (coarse.rows, coarse.columns))
+    start = Start(coarse, np.ascontiguousarray(height))
+    assert coarse.columns > 32_767
+    for tile in (own.tiles(96, 16)[0], own.tiles(96, 16)[3000]):
+        found = start.on(tile, 0)
+        expected = (tile.column + np.arange(tile.side) + 0.5) / 8 - 0.5
+        np.testing.assert_allclose(found[0], expected.clip(0, coarse.columns - 1), atol=1e-2)

@@ -124,6 +124,16 @@ def test_hillshade_is_that_of_a_plane():
     assert hillshade(0.0 * y, 1.0).mean() == pytest.approx(np.sqrt(0.5))
 
 
+def test_cells_next_to_holes_are_shaded_as_their_own_slope(tmp_path: Path):
+    _, x = np.mgrid[:20, :20].astype(float)
+    slope = 0.5 * x
+    slope[5:9, 5:9] = np.nan
+    shade = hillshade(slope, 1.0)
+    rim = shade[4, 5:9], shade[9, 5:9]
+    np.testing.assert_allclose(rim, hillshade(0.5 * x, 1.0)[4, 5], atol=1e-6)
+    assert np.isfinite(shade[np.isfinite(slope)]).all()
+
+
 def test_terrain_and_hillshade_of_a_map_in_feet_are_those_of_the_map_in_metres(tmp_path: Path):
     """A plant and a low mound, with all in metres, lengths alone in feet, and heights alone in feet."""
     foot = 1200 / 3937

@@ -129,7 +129,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
     from tidefield.data.load import at_width
     from tidefield.device import choose_device
     from tidefield.maps.area import bounds_of, read_shapes
-    from tidefield.maps.check_points import check_files, read_check_points
+    from tidefield.maps.check_points import all_check_points
     from tidefield.maps.grid import make_grid, map_frame
     from tidefield.maps.make import Job
 
@@ -139,7 +139,8 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
         render,
         record,
     ):
-        frame = map_frame(scene, read_georeference(scene.root), options.heights)
+        georeference = read_georeference(scene.root)
+        frame = map_frame(scene, georeference, options.heights)
         area, interval = None, options.contours and options.contours * frame.metre_up
         if options.area is not None:
             area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
@@ -147,7 +148,8 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, bounds_of(area))
         lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
-        points = [p for path in check_files(scene, options.check) for p in read_check_points(path, full, frame)]
+        control = () if georeference is None else georeference.control.names
+        points = all_check_points(full, frame, options.check, control)
         job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)
         yield job, render, {"scene": scene.root.resolve().name, "method": record}
 

@@ -6,6 +6,7 @@ adjustment and writes them to the scene, as `check_points.txt`. Other files are 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +17,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from tidefield.data.scene import Scene
-from tidefield.errors import RunError, SurveyError
+from tidefield.errors import RunError, SurveyError, list_names
+from tidefield.geometry.geodesy import parse_crs, zero_of_heights
 from tidefield.maps.grid import Grid, MapFrame
 from tidefield.maps.rasters import sample
 from tidefield.survey.io.gcp_file import split_unknown
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
 from tidefield.survey.survey import CHECK_FILE
 
+log = logging.getLogger(__name__)
+
 ENOUGH = 30
 """Fewest check points for a statement of accuracy (ASPRS, Positional Accuracy Standards, edition 2, 2023)."""
+_SAME = 0.001
+"""Metres between positions of one point in two files, at most."""
 _EXPECTED = "expected `x y z name` or `x y z px py image [name]`"
 
 
@@ -65,10 +71,33 @@ class Checked:
         return np.append((self.found - self.point.surveyed)[:2], self.height - self.point.surveyed[2])
 
 
-def check_files(scene: Scene, given: Path | None) -> list[Path]:
-    """List the files of check points: the scene's own and the one that is given."""
+def all_check_points(scene: Scene, frame: MapFrame, given: Path | None, control: Sequence[str]) -> list[CheckPoint]:
+    """Read the check points of the scene's own file and of the one that is given, each of them once.
+
+    Args:
+        control: names of the points that the scene was fitted to, which check nothing.
+
+    Raises:
+        RunError: as `read_check_points`.
+    """
     own = scene.root / CHECK_FILE
-    return [path for path in (own if own.is_file() else None, given) if path is not None]
+    found: list[CheckPoint] = []
+    if own.is_file() and frame.frame is None:
+        log.warning(
+            f"{own.name} of the scene is not used: the scene is not georeferenced, so that nothing can be checked"
+        )
+    elif own.is_file():
+        found = read_check_points(own, scene, frame)
+    fitted = []
+    for point in [] if given is None else read_check_points(given, scene, frame):
+        same = (np.abs(point.surveyed - other.surveyed).max() < _SAME * frame.metre for other in found)
+        if point.name in control:
+            fitted.append(point.name)
+        elif not any(same):
+            found.append(point)
+    if fitted:
+        log.warning(f"the scene was fitted to {list_names(fitted)}, which are left out: they check nothing")
+    return found
 
 
 def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPoint]:
@@ -111,19 +140,37 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
                 own.append((scene.names.index(photograph), (pixel[0], pixel[1])))
         if not surveyed:
             raise SurveyError(f"{path} has no check points: {_EXPECTED} after its first line; add them")
+        _require_one_zero(path, crs, frame)
         xyz = np.array(list(surveyed.values()), dtype=np.float64)
         world = frame.frame.from_system(crs, xyz)
     except (SurveyError, ValueError) as error:
         raise RunError(f"{path} cannot be read as check points: {error}") from error
     there = frame.to_map(world - frame.origin_world)
+    shown = {name: [_undistorted(scene, index, uv) for index, uv in own] for name, own in marks.items()}
+    # Undistorting crops photographs.
     return [
-        CheckPoint(name, there[i], tuple(_undistorted(scene, index, uv) for index, uv in marks[name]))
+        CheckPoint(name, there[i], tuple(mark for mark in shown[name] if all(map(math.isfinite, mark[1]))))
         for i, name in enumerate(surveyed)
     ]
 
 
+def _require_one_zero(path: Path, crs: str, frame: MapFrame) -> None:
+    """Raises: SurveyError when a file states heights over another zero than the map's."""
+    zero, own = zero_of_heights(parse_crs(crs)), zero_of_heights(parse_crs(frame.wkt))
+    if zero is None:
+        return
+    if own is None:
+        log.warning(
+            f"heights in {path.name} are over {zero}, those of the map: {frame.heights}; the mean error has both"
+        )
+    elif zero != own:
+        raise SurveyError(
+            f"its heights are over {zero}, those of the map over {own}: expected one zero; convert the points first"
+        )
+
+
 def _undistorted(scene: Scene, index: int, uv_px: tuple[float, float]) -> tuple[int, tuple[float, float]]:
-    """A mark in the scene's photograph, which is undistorted and may have another size."""
+    """A mark in the scene's photograph, which is undistorted and may have another size; NaN outside of it."""
     camera, lens = scene.cameras[index], scene.photographs.files[index].lens
     u, v = lens.to_pinhole(np.array([uv_px], dtype=np.float64), lens.pinhole())[0]
     return index, (float(u) * camera.width / lens.width, float(v) * camera.height / lens.height)

@@ -8,6 +8,7 @@ some 20 m of a tile the curvature of the Earth and of the projection stay below 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,6 +29,8 @@ from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
 LOCAL_WKT = f'LOCAL_CS["{LOCAL_NAME}",UNIT["unknown",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
+_IN_FEET = re.compile(r" \(ft\w*\)$")
+"""How names of vertical systems end that have a twin in metres."""
 OPEN_ZEROS = ("unknown", "mean sea level")
 """How the words for zeros of heights begin that a vertical system may still define."""
 """Begins the vertical datum of a frame whose heights are as they were given."""
@@ -144,6 +147,8 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
 def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS | None:
     """The vertical system that is stated or given, or that has the datum's name; None where there is none."""
     names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
+    # Scenes have heights in metres, whatever system their control was in.
+    datum = _IN_FEET.sub("", datum) if stated is None else datum
     known = CRS.from_epsg(int(names[datum])) if stated is None and datum in names else stated
     if given is not None:
         try:
@@ -167,7 +172,7 @@ def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS |
                 "the heights of the scene are in; give that of the same datum"
             )
         return crs
-    return known if known is None or known is stated or in_metres(known) else None
+    return known
 
 
 def _datum_name(vertical: CRS) -> str:
@@ -294,6 +299,7 @@ def make_grid(
         bounds = (max(bounds[0], seen[0]), max(bounds[1], seen[1]), min(bounds[2], seen[2]), min(bounds[3], seen[3]))
     west, north = math.floor(bounds[0] / cell + 1e-9), math.ceil(bounds[3] / cell - 1e-9)
     columns, rows = math.ceil(bounds[2] / cell - 1e-9) - west, north - math.floor(bounds[1] / cell + 1e-9)
+    columns, rows = max(2, columns), max(2, rows)  # contours and slopes need two
     if columns * rows > MOST_CELLS:
         raise RunError(
             f"{columns} x {rows} cells were asked for: expected at most {MOST_CELLS:,}; choose a larger --gsd or "
@@ -337,7 +343,8 @@ def _seen_bounds(frame: MapFrame, scene: Scene) -> tuple[float, float, float, fl
         count[near[inside.numpy()]] += 1
     seen = places[count >= 2, :2]
     if len(seen):
-        low, high = np.minimum(low, seen.min(0)), np.maximum(high, seen.max(0))
+        between = np.ptp(corners, axis=0) / SAMPLES
+        low, high = np.minimum(low, seen.min(0) - between), np.maximum(high, seen.max(0) + between)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1]), height
 
 

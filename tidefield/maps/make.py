@@ -11,9 +11,9 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,8 @@ STRIP_CELLS = 1_000_000
 GDAL_CACHE_BYTES = 128_000_000
 """Memory of GDAL for blocks, beside those of a row of them in each raster, which would be written again and again
 otherwise. By itself it takes a twentieth of the machine's."""
-VERSION = 4
+VERSION = 5
+"""Of tiles; to be raised with what they hold."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +103,14 @@ class Job:
     interval: float | None = None
     sections: tuple[tuple[BaseGeometry, dict[str, Any]], ...] = ()
 
-    @property
+    @cached_property
     def tile_side(self) -> int:
         """Cells along the side of a tile: photographs that see one of its corners should see most of it."""
         width = int(self.scene.cameras.size_px[:, 0].median())
-        return int(np.clip(width // 4 // 32 * 32, SMALLEST_TILE, LARGEST_TILE))
+        side = int(np.clip(width // 4 // 32 * 32, SMALLEST_TILE, LARGEST_TILE))
+        # Each cell of a coarse map shows several pixels.
+        pixels = max(1, round(self.grid.cell / (ground_sampling_distance(self.scene) * self.grid.frame.metre)))
+        return max(32, side // pixels // 32 * 32)
 
     def tiles(self) -> list[Tile]:
         side = -(-(self.tile_side + 2 * MARGIN) // 32) * 32 - 2 * MARGIN
@@ -132,6 +136,9 @@ class Job:
         grid = self.grid
         about = [VERSION, grid.west, grid.north, grid.cell, grid.columns, grid.rows, grid.frame.wkt, self.settings]
         about += [str(self.area), self.fill, list(self.scene.names), self.scene.cameras.T_world_camera.tolist()]
+        frame, origin = grid.frame.frame, self.scene.origin_world.double().numpy()
+        about += [np.round(origin, 6).tolist(), grid.frame.heights, None if frame is None else frame.to_json()]
+        about += [self.tile_side, self.scene.cameras.size_px.tolist()]
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
@@ -528,6 +535,7 @@ def begin(out: Path, key: str, overwrite: bool) -> None:
         delete_tiles(out)
     if there is None or overwrite:
         write_json(out / MAP_FILE, {"key": key, "complete": False})
+    delete_partials(*(out / name for name in (*PRODUCTS, MAP_FILE)))
     # What an earlier map has and this one lacks, such as FILLED, would be taken for this one's.
     delete_files(out, [out / name for name in PRODUCTS])
 
@@ -537,4 +545,5 @@ def delete_tiles(out: Path) -> None:
     for path in (out / TILES).glob("*.npz"):
         path.unlink()
     if (out / TILES).is_dir():
-        (out / TILES).rmdir()
+        with suppress(OSError):  # other programs keep notes in folders
+            (out / TILES).rmdir()

@@ -149,8 +149,17 @@ class Start:
         middle = tile.centre
         u = (middle[0] + east.astype(np.float64) - self.grid.west) / self.grid.cell - 0.5
         v = (self.grid.north - middle[1] - north.astype(np.float64)) / self.grid.cell - 0.5
-        u, v = np.broadcast_arrays(u.astype(np.float32), v.astype(np.float32))
-        return cv2.remap(self.height, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        # OpenCV's remap has no more than 32,766 columns, less than the coarse cells of a long coast.
+        columns, rows = (_around(at, side) for at, side in zip((u, v), self.height.shape[::-1], strict=True))
+        u, v = (u - columns.start).astype(np.float32), (v - rows.start).astype(np.float32)
+        u, v = np.broadcast_arrays(u, v)
+        return cv2.remap(self.height[rows, columns], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _around(at: np.ndarray, side: int) -> slice:
+    """The cells of a side that positions in cells lie between; the nearest one outside of it."""
+    first = int(np.clip(math.floor(at.min()), 0, side - 1))
+    return slice(first, int(np.clip(math.ceil(at.max()), first, side - 1)) + 1)
 
 
 def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:

@@ -33,6 +33,8 @@ GROUND_SIGMAS = 2.0
 """A fine cell belongs to the ground if it is not higher above it than so many standard errors, or `LEAST_RISE_M`."""
 RIM_M = 0.15
 """So far around what is taken off, or one cell, higher fine cells are no ground either: matching widens rims."""
+MOST_RIM = 100
+"""Cells: in a local frame a unit may be a hundred metres."""
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
 ROWS = 512
 """Of a raster that are read at once."""
@@ -116,7 +118,7 @@ def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:
         first += whole
         held = [joined[whole * factor :]]
     ground, _ = coarse_ground(low, factor * cell_m, grid.frame.metre_up)
-    rim = max(1, round(RIM_M / cell_m))
+    rim = int(np.clip(round(RIM_M / cell_m), 1, MOST_RIM))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
     columns_of = (np.arange(grid.columns) + 0.5) / factor - 0.5
     with raster_writer(out, grid) as writer:
@@ -159,10 +161,23 @@ def hillshade(height: Float[np.ndarray, "h w"], cell: float) -> Float[np.ndarray
         height: of cells, row 0 in the north.
         cell: side of a cell, in the heights' unit.
     """
-    kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]], dtype=np.float32) / (8 * cell)
     values = height.astype(np.float32)
-    east = cv2.filter2D(values, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
-    north = -cv2.filter2D(values, cv2.CV_32F, kernel.T, borderType=cv2.BORDER_REPLICATE)
+    padded = np.pad(values, 1, mode="edge")
+    rows, columns = values.shape
+
+    def other(down: int, across: int) -> np.ndarray:
+        """Neighbours of all cells; what the opposite one makes of those without a height, else the cell's own."""
+        found, opposite = (
+            padded[1 + k * down : 1 + k * down + rows, 1 + k * across : 1 + k * across + columns] for k in (1, -1)
+        )
+        found = np.where(np.isfinite(found), found, 2 * values - opposite)
+        return np.where(np.isfinite(found), found, values)
+
+    def side(one: tuple[int, int], middle: tuple[int, int], two: tuple[int, int]) -> np.ndarray:
+        return other(*one) + 2 * other(*middle) + other(*two)
+
+    east = (side((-1, 1), (0, 1), (1, 1)) - side((-1, -1), (0, -1), (1, -1))) / np.float32(8 * cell)
+    north = (side((-1, -1), (-1, 0), (-1, 1)) - side((1, -1), (1, 0), (1, 1))) / np.float32(8 * cell)
     azimuth, elevation = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ELEVATION_DEG)
     sun = np.array([math.sin(azimuth), math.cos(azimuth)]) * math.cos(elevation)
     shade = (math.sin(elevation) - sun[0] * east - sun[1] * north) / np.sqrt(1 + east**2 + north**2)
