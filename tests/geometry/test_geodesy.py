@@ -164,3 +164,12 @@ def test_coordinates_outside_the_domain_of_a_system_are_refused():
 def test_the_unit_of_heights_is_unstated_in_flat_systems_of_other_units_than_metres(crs: str):
     flat_in_feet = ("EPSG:2263", "+proj=lcc +lat_1=41 +lat_2=40 +units=us-ft")
     assert has_unstated_unit(parse_crs(crs)) == (crs in flat_in_feet)
+
+
+def test_products_of_control_in_web_mercator_are_in_true_metres():
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True).transform(5.0, 53.5)
+    frame = LocalFrame.at("EPSG:3857", (x, y, 2.0))
+    assert frame.crs == "EPSG:32631"
+    placed = frame.from_system("EPSG:3857", np.array([[x, y, 2.0], [x + 168.0, y, 2.0]]))
+    assert np.linalg.norm(placed[1] - placed[0]) == pytest.approx(100, rel=0.01)
+    assert LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0)).crs == "EPSG:27700"

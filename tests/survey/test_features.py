@@ -66,6 +66,16 @@ def test_photographs_of_one_camera_size_and_zoom_share_a_lens():
     assert lens_groups(own) == [0, 1, 2, 3, 0]
 
 
+def test_other_orientations_undistorted_photographs_and_digital_zooms_have_lenses_of_their_own():
+    lens = LensPrior(400.0, None, None, "EXIF", trusted=False)
+    own = [replace(unlocated_photograph(k, None), lens=lens) for k in range(6)]
+    own[1] = replace(own[1], orientation=3)
+    own[2] = replace(own[2], lens=replace(lens, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0)))
+    own[3] = replace(own[3], lens=replace(lens, focal_px=800.0))
+    own[4] = replace(own[4], lens=replace(lens, focal_px=403.0))
+    assert lens_groups(own) == [0, 1, 2, 3, 0, 0]
+
+
 def test_a_nominal_focal_length_is_a_prior_and_the_default_is_not():
     known = replace(unlocated_photograph(0, None), lens=LensPrior(350.0, None, None, "EXIF", trusted=False))
     assert initial_camera(known).has_prior_focal_length

@@ -226,3 +226,14 @@ def test_control_is_at_the_site_of_photographs_on_both_sides_of_the_date_line(tm
     assert list(found.points) == ["A"]
     assert remarks == []
     assert "longitude -179.99990" in refusal("EPSG:32701", x + 1e4, y, (180.0001, -16.5))
+
+
+def test_control_at_one_end_of_a_long_beach_is_control_of_it(tmp_path):
+    places = [(54.512 + 0.009 * k, -2.752) for k in range(9)]  # 8 km
+    for k, place in enumerate(places):
+        photograph(tmp_path / f"{k}.jpg", table=exif(place=place))
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:27700", always_xy=True).transform(-2.752, 54.512)
+    found, _ = control(tmp_path, f"EPSG:27700\n{x:.3f} {y:.3f} 4.0 1 2 0.jpg A\n")
+    assert list(found.points) == ["A"]
+    with pytest.raises(SurveyError, match="km from the photographs"):
+        control(tmp_path, f"EPSG:27700\n{x + 12_000:.3f} {y:.3f} 4.0 1 2 0.jpg A\n", "elsewhere.txt")

@@ -14,6 +14,7 @@ from PIL import Image
 from rich.console import Console
 
 from tidefield.data.load import load_scene
+from tidefield.errors import SurveyError
 from tidefield.survey.import_project import import_project
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, prepare
@@ -174,3 +175,11 @@ def test_held_out_photographs_are_no_photographs_without_features_in_the_report(
     assert len(observed) == 13
     title = "Points per photograph"
     assert dict(draw_charts(statistics, True))[title] == draw_histogram(title, "points", "photographs", observed, 0)
+
+
+def test_too_few_photographs_beside_the_held_out_ones_are_one_clear_error(flight: Flight, tmp_path: Path):
+    (tmp_path / "card").mkdir()
+    for name in flight.names[:3]:
+        shutil.copy(flight.folder / name, tmp_path / "card" / name)
+    with pytest.raises(SurveyError, match="2 photographs are left beside those that --holdout keeps out"):
+        run(tmp_path / "card", tmp_path / "scene")

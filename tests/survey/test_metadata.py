@@ -203,6 +203,25 @@ def test_deviations_without_a_position_fix_are_ignored(tmp_path):
     assert math.isnan(read.vertical_m)
 
 
+UNSIGNED = {GPS.GPSLatitude: (46.0, 50.0, 33.36), GPS.GPSLongitude: (91.0, 59.0, 40.56)}
+"""As exiftool writes "-GPSLatitude=46.8426 -GPSLongitude=-91.9946" without their references."""
+
+
+def test_a_position_without_its_hemisphere_is_not_used_and_that_is_said(tmp_path):
+    survey_folder(tmp_path, count=2)
+    photograph(tmp_path / "odd.jpg", table=exif(gps=UNSIGNED))
+    survey = read_survey(tmp_path)
+    assert named(survey, "odd.jpg").position is None
+    assert any("EXIF positions of odd.jpg are not used" in remark for remark in survey.remarks)
+    packet = xmp({"GpsLatitude": "46.8426", "GpsLongitude": "-91.9946"})
+    photograph(tmp_path / "odd.jpg", table=exif(gps=UNSIGNED), packet=packet)
+    survey = read_survey(tmp_path)
+    position = named(survey, "odd.jpg").position
+    assert position is not None
+    assert (position.latitude_deg, position.longitude_deg, position.source) == (46.8426, -91.9946, "XMP")
+    assert not any("odd.jpg are not used" in remark for remark in survey.remarks)
+
+
 def test_xmp_gives_a_position_where_exif_has_none(tmp_path):
     packet = xmp({"GpsLatitude": "46.8426", "GpsLongtitude": "-91.9946"})
     read = one(tmp_path, packet=packet).position

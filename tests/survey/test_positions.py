@@ -5,6 +5,7 @@ import os
 import re
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from camera_files import BRIGHTON, exif, named, photograph, survey_folder
@@ -16,6 +17,11 @@ from tidefield.survey.io.positions import read_gps_file
 from tidefield.survey.io.text_files import PhotographNames
 
 NAMES = PhotographNames(["DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "Watt, Süd 3.jpeg"])
+
+
+def whatever_grids_are_there(remarks: list[str]) -> list[str]:
+    """Remarks without that on the grids of PROJ, which differ from machine to machine."""
+    return [remark for remark in remarks if "PROJ lacks" not in remark]
 
 
 def written(folder: Path, text: str, name: str = "gps.csv") -> Path:
@@ -121,10 +127,11 @@ def test_heights_of_a_system_in_feet_without_a_vertical_one_are_metres_with_a_re
     found, remarks = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
     metre = 1200 / 3937 if vertical == "+6360" else 1
     assert found["DJI_0001.JPG"].position.height_m == pytest.approx(1000 * metre, rel=1e-9)
+    remarks = whatever_grids_are_there(remarks)
     assert len(remarks) == (vertical == "")
     assert all("US survey foot" in remark and "EPSG:2263+6360" in remark for remark in remarks)
     without = written(tmp_path, f"EPSG:2263{vertical}\nDJI_0001.JPG 1000000 200000\n", "geo.txt")
-    assert read_gps_file(without, NAMES)[1] == []
+    assert whatever_grids_are_there(read_gps_file(without, NAMES)[1]) == []
 
 
 @pytest.mark.parametrize("name", ["geo.txt", "gps.csv"])
@@ -162,7 +169,7 @@ def test_a_title_above_a_table_is_no_system_though_proj_knows_one(tmp_path, titl
 
 def test_a_system_above_a_table_is_named(tmp_path):
     text = "OSGB36\nname,lat,lon,alt\nDJI_0001.JPG,54.5,-2.75,344\n"
-    assert read_gps_file(written(tmp_path, text), NAMES)[1] == [
+    assert whatever_grids_are_there(read_gps_file(written(tmp_path, text), NAMES)[1]) == [
         "gps.csv: positions are in OSGB36, as its first line has it."
     ]
 
@@ -436,3 +443,71 @@ def test_positions_come_from_regular_files_only(tmp_path):
     for path in (tmp_path / "gps.csv", Path("/dev/zero")):
         with pytest.raises(SurveyError, match="is no regular file"):
             read_gps_file(path, NAMES)
+
+
+def test_the_folder_in_a_path_of_another_machine_distinguishes_names():
+    names = PhotographNames(["100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG", "DJI_0003.JPG"])
+    for path in ("/data/photos/100MEDIA/DJI_0001.JPG", "photos/100MEDIA/dji_0001", "C:\\f\\100MEDIA\\DJI_0001.JPG"):
+        assert names.find(path) == "100MEDIA/DJI_0001.JPG"
+    assert names.find("/elsewhere/DJI_0003.JPG") == "DJI_0003.JPG"
+    with pytest.raises(SurveyError, match=r"names 2 photographs .*write its folder, too"):
+        names.find("/elsewhere/DJI_0001.JPG")
+
+
+def test_letters_of_the_hemispheres_beside_unsigned_degrees_are_signs(tmp_path):
+    text = "SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef\nDJI_0001.JPG,33.9,South,58.4,W\n"
+    found, remarks = read_gps_file(written(tmp_path, text), NAMES)
+    position = found["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg) == (-33.9, pytest.approx(-58.4))
+    assert not any("Ref" in remark for remark in remarks)
+
+
+def test_longitudes_that_count_to_360_are_those_of_the_west(tmp_path):
+    found, _ = read_gps_file(written(tmp_path, "name,lat,lon,height\nDJI_0001.JPG,40.0,285.0,10\n"), NAMES)
+    assert found["DJI_0001.JPG"].position.longitude_deg == pytest.approx(-75.0)
+
+
+def test_positions_that_proj_converts_to_metres_only_are_remarked(tmp_path, monkeypatch):
+    class Group:
+        best_available = False
+        transformers = (SimpleNamespace(accuracy=2.0),)
+        unavailable_operations = (
+            SimpleNamespace(
+                accuracy=0.05, grids=[SimpleNamespace(short_name="grid.tif", full_name="", available=False)]
+            ),
+        )
+
+    monkeypatch.setattr("tidefield.survey.io.positions.TransformerGroup", lambda *_, **__: Group())
+    text = "EPSG:27700\nDJI_0001.JPG 351139.7 512875.7 264.3\n"
+    _, remarks = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    assert any("converted to WGS 84 to 2 m only, because PROJ lacks grid.tif: install it" in r for r in remarks)
+    monkeypatch.setattr(Group, "best_available", True)
+    _, remarks = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
+    assert not any("PROJ lacks" in r for r in remarks)
+
+
+def test_a_file_of_positions_that_is_not_used_is_named(tmp_path):
+    for index in range(4):
+        photograph(tmp_path / f"{index}.jpg", table=exif(place=(54.5, -2.75 + 1e-4 * index)))
+    (tmp_path / "geo.txt").write_text("EPSG:4326\n0.jpg -2.75 54.5 10\n")
+    survey = read_survey(tmp_path)
+    assert any("geo.txt is not used, because all photographs have positions" in remark for remark in survey.remarks)
+
+
+@pytest.mark.parametrize(
+    ("titles", "unread"),
+    [
+        ("Accuracy Horz [m],Accuracy Vert [m]", False),
+        ("Lateral RMS,Elevation RMS", False),
+        ("StdE (m),StdU (m)", True),
+    ],
+)
+def test_accuracies_are_read_by_the_titles_of_receivers_or_named(tmp_path, titles, unread):
+    text = f"Name,Latitude,Longitude,Ellipsoidal height,{titles}\nDJI_0001.JPG,54.5,-2.75,344.17,0.02,0.03\n"
+    found, remarks = read_gps_file(written(tmp_path, text), NAMES)
+    position = found["DJI_0001.JPG"].position
+    if unread:
+        assert any("gps.csv: StdE (m), StdU (m) are not read." in remark for remark in remarks)
+    else:
+        assert (position.horizontal_m, position.vertical_m) == (0.02, 0.03)
+        assert not any("not read" in remark for remark in remarks)

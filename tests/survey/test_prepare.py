@@ -13,22 +13,24 @@ import numpy as np
 import pycolmap
 import pytest
 from ground_flight import ABOVE, FOCAL, Flight, fly
+from located_surveys import unlocated_photograph
 from PIL import Image
 from rich.console import Console
 
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene, read_posed
-from tidefield.errors import RunError, SurveyError
+from tidefield.errors import RunError, SceneError, SurveyError
 from tidefield.files import LOCK_FILE, only_writer
 from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.prepare import Prepared, _is_rounded, prepare
+from tidefield.survey.prepare import Prepared, _is_rounded, _require_control, prepare
+from tidefield.survey.quality.assessment import without
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.blocks import cut
 from tidefield.survey.sfm.features import FeatureOptions
 from tidefield.survey.stages import Stages
-from tidefield.survey.survey import CHECK_FILE
+from tidefield.survey.survey import CHECK_FILE, Control, Mark, Survey
 
 GAINS = np.exp(np.random.default_rng(5).normal(0, 0.15, (12, 3)))
 OPTIONS = FeatureOptions(count=1500)
@@ -257,6 +259,40 @@ def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypa
     assert written == [*flight.names[:7], *flight.names[6:]]
 
 
+def test_a_scene_whose_photographs_are_being_written_is_not_opened(
+    made: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    import tidefield.survey.prepare as preparing
+
+    scene, survey = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(preparing, "write_transforms", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), redo="images")
+    with pytest.raises(SceneError, match="is not prepared to its end: expected a whole scene"):
+        load_scene(scene)
+    prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    assert len(load_scene(scene).names) == 12
+
+
+def test_a_mask_of_a_photograph_that_has_no_pose_repeats_nothing(
+    flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    card = shutil.copytree(flight.folder, tmp_path / "card")
+    texture = np.random.default_rng(0).integers(0, 255, (ground_flight.HEIGHT, ground_flight.WIDTH, 3), np.uint8)
+    Image.fromarray(texture).save(card / "other.jpg")
+    (card / "masks").mkdir()
+    Image.new("L", (ground_flight.WIDTH, ground_flight.HEIGHT), 255).save(card / "masks" / "other.jpg.png")
+    assert "other.jpg" not in run(card, tmp_path / "scene").models[0]
+    caplog.set_level("INFO", "tidefield")
+    run(card, tmp_path / "scene")
+    assert "images: complete already" in caplog.text
+
+
 def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
     made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -466,3 +502,18 @@ def test_photographs_of_a_fisheye_become_a_scene_for_nerfstudio_and_for_us(tmp_p
     page = write_report(collect_findings(prepared, scene, {}), scene)
     assert "FISHEYE" in (scene / "report.json").read_text(encoding="utf-8")
     assert page.is_file()
+
+
+def test_control_whose_photographs_are_left_out_is_named(tmp_path: Path):
+    points = {"A": (1.0, 2.0, 3.0), "B": (4.0, 5.0, 6.0), "CHK1": (7.0, 8.0, 9.0)}
+    marks = (Mark("A", "0.jpg", (1.0, 2.0)), Mark("B", "1.jpg", (1.0, 2.0)), Mark("CHK1", "2.jpg", (1.0, 2.0)))
+    photographs = tuple(replace(unlocated_photograph(k, None), name=f"{k}.jpg") for k in range(4))
+    whole = Survey(tmp_path, photographs, Control("EPSG:27700", points, marks))
+    assert _require_control(whole, whole) is None
+    assert _require_control(whole, without(whole, ["3.jpg"])) is None
+    said = _require_control(whole, without(whole, ["0.jpg"]))
+    assert said == "1 of 3 points of ground control are marked only in photographs that are left out: A."
+    with pytest.raises(SurveyError, match=r"2 of 3 points .*: A, B: expected some in photographs that are used"):
+        _require_control(whole, without(whole, ["0.jpg", "1.jpg"]))
+    found = replace(whole, control_was_found=True)
+    assert _require_control(found, without(found, ["0.jpg", "1.jpg"])) is not None

@@ -32,6 +32,7 @@ from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
 from tidefield.errors import SceneError, list_names
+from tidefield.files import read_json as read_own_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import Lens, LensModel
 
@@ -108,6 +109,7 @@ def load_scene(
     calibrate: bool = True,
     progress: Progress | None = None,
     cache: Path | None = None,
+    unfinished: bool = False,
 ) -> Scene:
     """Load a scene: poses, sparse points, and undistorted photographs at the working resolution.
 
@@ -121,12 +123,15 @@ def load_scene(
             and 14).
         progress: called with (ready, all) while photographs are decoded; not called when they are cached.
         cache: folder for decoded photographs; the user's if not given.
+        unfinished: open a scene that `tidefield prepare` has not finished.
 
     Raises:
-        SceneError: the folder is not a scene, or is damaged.
+        SceneError: the folder is not a scene, is damaged, or has not been prepared to its end.
     """
     root = Path(root)
     require_width(width)
+    if not unfinished:
+        _require_finished(root)
     posed = read_posed(root, allow_missing)
     files = []
     masks = posed.masks or (None,) * len(posed.names)
@@ -289,6 +294,16 @@ def _reopened(scene: Scene, files: list[PhotographFile], progress: Progress | No
         photographs=open_photographs(files, scene.photographs.background_rgb, progress, cache),
         points=points,
     )
+
+
+def _require_finished(root: Path) -> None:
+    """Raises: SceneError when `tidefield prepare` was interrupted, and photographs may have several exposures."""
+    stages = read_own_json(root / "prepare" / "stages.json")
+    if isinstance(stages, dict) and stages and not (stages.get("images") or {}).get("done"):
+        raise SceneError(
+            f"{root} is not prepared to its end: expected a whole scene; let `tidefield prepare` end, or repeat the "
+            "same command, which continues"
+        )
 
 
 def require_width(width: int | None) -> None:

@@ -15,6 +15,7 @@ Longitude, easting and x come before latitude, northing and y, whatever a system
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -60,8 +61,9 @@ class LocalFrame:
         """Create a frame with its origin at a coordinate of a projected or geographic system.
 
         Args:
-            crs: in any form that pyproj reads. A projected system is used for products too; for a geographic one
-                products use the UTM zone of the origin, on the same datum where that exists and on WGS 84 otherwise.
+            crs: in any form that pyproj reads. A projected system is used for products too; for a geographic one, and
+                for one whose metres are not those of the ground, such as Web Mercator, products use the UTM zone of
+                the origin, on the same datum where that exists and on WGS 84 otherwise.
             origin: (easting, northing, height) or (longitude, latitude, height).
             vertical_datum: None reads it from the system, if this defines one.
 
@@ -73,6 +75,10 @@ class LocalFrame:
         if system.is_geographic:
             degrees = np.rad2deg(_base(system).axis_info[0].unit_conversion_factor)
             products = _utm(origin[0] * degrees, origin[1] * degrees, system)
+        elif system.is_projected and in_metres(system):
+            with suppress(ProjError):  # below, the origin is refused
+                metric = metric_system(system, origin[0], origin[1])
+                products = system if metric.equals(horizontal(system), ignore_axis_order=True) else metric
         name = _name(products)
         heights = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
         frame = cls(0.0, 0.0, 0.0, name, heights)

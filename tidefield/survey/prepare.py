@@ -19,14 +19,14 @@ from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.holdout import Holdout
 from tidefield.data.load import load_scene
 from tidefield.data.readers.posed import every_eighth
-from tidefield.errors import RunError, SurveyError
+from tidefield.errors import RunError, SurveyError, list_names
 from tidefield.files import is_empty, only_writer, writing_to
 from tidefield.progress import ProgressBar
 from tidefield.survey.colour import ExposureCorrection, estimate_correction
 from tidefield.survey.export import reduced_folders, write_images, write_masks, write_reduced_images, write_transforms
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.io.gcp_file import write_check_points
-from tidefield.survey.io.photographs import control_remark
+from tidefield.survey.io.photographs import FEWEST, control_remark
 from tidefield.survey.quality.assessment import QualityDecision, assess_quality, select_photographs, without
 from tidefield.survey.quality.measures import Measures
 from tidefield.survey.sfm.blocks import cut, matched_pairs, merge, reconstruct_blocks, settle
@@ -138,6 +138,12 @@ def prepare(
         good = select_photographs(survey, verdicts, keep_all)
         names = [photograph.name for photograph in good.photographs]
         mapped = without(good, held_out)
+        if len(mapped.photographs) < FEWEST:
+            raise SurveyError(
+                f"{len(mapped.photographs)} photographs are left beside those that --holdout keeps out: expected at "
+                f"least {FEWEST}; leave --holdout out, or add photographs"
+            )
+        lost = _require_control(survey, mapped)
 
         def extract_features(resume: bool) -> Facts:
             if not resume or not is_database(database):
@@ -198,17 +204,18 @@ def prepare(
             "georeference",
             {"control": repr(good.control)} | ({"optional": True} if good.control and good.control_was_found else {}),
             [*model_files(sparse), scene / "georeference.json"],
-            lambda _: georeference_model(mapped, model, sparse, console, database, held_out & {*names}),
+            lambda _: georeference_model(mapped, model, sparse, console, database, held_out & {*names}, lost),
             read_located,
         )
         registered = set(models[0])
         placed = [photograph for photograph in good.photographs if photograph.name in registered]
+        has_masks = any(photograph.mask is not None or photograph.has_alpha for photograph in placed)
         correction = stages.run(
             "images",
             {"colour": colour},
             [
                 *(images / photograph.name for photograph in placed),
-                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if masks),
+                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if has_masks),
                 *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
                 *([scene / HOLDOUT_FILE] if holdout else []),
             ],
@@ -236,6 +243,31 @@ def prepare(
             correction=correction,
             seconds=stages.seconds,
         )
+
+
+def _require_control(survey: Survey, used: Survey) -> str | None:
+    """A remark on ground control that is marked only in photographs that are left out; None if there is none.
+
+    Raises:
+        SurveyError: no point is left of ground control that the user named.
+    """
+    if survey.control is None:
+        return None
+    left = used.control.points if used.control is not None else {}
+    lost = [name for name in survey.control.points if name not in left]
+    if not lost:
+        return None
+    said = (
+        f"{len(lost)} of {len(survey.control.points)} points of ground control are marked only in photographs that are "
+        f"left out: {list_names(lost)}."
+    )
+    fitted = used.control is not None and used.control.fitted() is not None
+    if survey.control.fitted() is not None and not fitted and not survey.control_was_found:
+        raise SurveyError(
+            f"{said.removesuffix('.')}: expected some in photographs that are used; mark others, keep photographs of "
+            "low quality with --keep-all, or leave --holdout out"
+        )
+    return said
 
 
 def choose_pairs(
@@ -289,7 +321,13 @@ def estimate_poses(
 
 
 def georeference_model(
-    good: Survey, model: Path, sparse: Path, console: Console, database: Path, held_out: Collection[str]
+    good: Survey,
+    model: Path,
+    sparse: Path,
+    console: Console,
+    database: Path,
+    held_out: Collection[str],
+    remark_on_control: str | None = None,
 ) -> Facts:
     """Georeference the largest model and place held-out photographs; write it, and `georeference.json`."""
     reconstruction = read_model(model)
@@ -304,6 +342,9 @@ def georeference_model(
             reconstruction, good = read_model(model), replace(good, control=None)
             located = georeference(reconstruction, good, bar)
             located = replace(located, notes=(*located.notes, remark))
+    if remark_on_control is not None:
+        log.warning(remark_on_control)
+        located = replace(located, notes=(*located.notes, remark_on_control))
     placed: list[str] = []
     if held_out:
         with ProgressBar(console, "Placing held-out photographs") as bar:
@@ -353,7 +394,7 @@ def write_scene(
     correction = None
     if colour != "off":
         with ProgressBar(console, "Measuring exposures") as bar:
-            loaded = load_scene(scene, width=COLOUR_WIDTH, hold_out=bool(held_out), progress=bar)
+            loaded = load_scene(scene, width=COLOUR_WIDTH, hold_out=bool(held_out), progress=bar, unfinished=True)
         correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
         if correction.helps:
             with ProgressBar(console, "Correcting exposures") as bar:

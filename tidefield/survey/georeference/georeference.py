@@ -49,7 +49,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         frame = positions.frame()
     else:
         if positions.names:
-            refuse_elsewhere(control, *positions.middle)
+            refuse_elsewhere(control, *positions.middle, positions.radius_m)
         # In the system of the control, with a round coordinate as origin.
         middle = np.median(np.array(list(control.points.values()), dtype=np.float64), axis=0)
         digits = 5 if parse_crs(control.crs).is_geographic else 0

@@ -15,6 +15,7 @@ from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
 from tidefield.geometry.geodesy import WGS84, LocalFrame, metres_per_degree
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
+from tidefield.survey.io.positions import radius_m
 from tidefield.survey.survey import Photograph, Position
 
 DIFFERENTIAL_M = 0.3
@@ -67,6 +68,11 @@ class GivenPositions:
         """Median longitude and latitude."""
         longitude, latitude, _ = np.median(self.longitude_latitude_height, axis=0)
         return float(longitude), float(latitude)
+
+    @property
+    def radius_m(self) -> float:
+        """How far they reach from there."""
+        return radius_m(self.longitude_latitude_height[:, :2], self.middle)
 
     def frame(self) -> LocalFrame:
         """Create a local frame at their middle, with products in its UTM zone and heights as given."""

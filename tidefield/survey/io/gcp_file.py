@@ -23,7 +23,7 @@ from tidefield.errors import SurveyError, list_names
 from tidefield.files import write_text
 from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
-from tidefield.survey.io.positions import degrees_of
+from tidefield.survey.io.positions import degrees_of, radius_m
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list, unit_remarks
 from tidefield.survey.survey import CHECK_FILE, Control, Mark, Photograph
 
@@ -105,7 +105,8 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     control = Control(crs, {name: xyz for name, xyz in points.items() if name in marked}, tuple(marks.values()))
     degrees = degrees_of(photographs)
     if np.isfinite(degrees).any():
-        refuse_elsewhere(control, *np.nanmedian(degrees, axis=0).tolist())
+        longitude, latitude = np.nanmedian(degrees, axis=0).tolist()
+        refuse_elsewhere(control, longitude, latitude, radius_m(degrees, (longitude, latitude)))
     remarks = unit_remarks(path, parse_crs(crs))
     if missing:
         remarks.append(
@@ -150,22 +151,23 @@ def split_unknown(rest: str) -> tuple[str, list[str]]:
     return " ".join(words[: end + 1]), words[end + 1 :]
 
 
-def refuse_elsewhere(control: Control, longitude_deg: float, latitude_deg: float) -> None:
+def refuse_elsewhere(control: Control, longitude_deg: float, latitude_deg: float, radius_m: float = 0.0) -> None:
     """Refuse ground control that is far from the photographs, and suggest the systems in which it would not be.
 
     Args:
         control: the ground control.
         longitude_deg, latitude_deg: median position of the photographs; the longitude may be beyond 180.
+        radius_m: how far the photographs reach from there.
 
     Raises:
-        SurveyError: the median control point is `MAX_DISTANCE_M` or more away.
+        SurveyError: the median control point is `MAX_DISTANCE_M` or more away from all photographs.
     """
     points = np.array(list(control.points.values()), dtype=np.float64)
     x, y = np.median(points[:, 0]), np.median(points[:, 1])
     longitude_deg = (longitude_deg + 180) % 360 - 180
     site = longitude_deg, latitude_deg
     away = _distance_m(parse_crs(control.crs), x, y, site)
-    if away < MAX_DISTANCE_M:
+    if away < MAX_DISTANCE_M + radius_m:
         return
     found = _fitting(control.crs, x, y, site)
     advice = f"they would fit in {' or '.join(found)}" if found else "no system that is used at this site fits them"

@@ -105,6 +105,13 @@ class PhotographMetadata:
         return max(up_m, plan_m if math.isfinite(plan_m) else 0.0)
 
     @property
+    def lacks_hemisphere(self) -> bool:
+        """Whether EXIF has a latitude or a longitude, and does not say on which side of the Earth."""
+        gps = self.exif.gps
+        tags = ExifTags.GPS.GPSLatitudeRef, ExifTags.GPS.GPSLongitudeRef
+        return any(gps.get(tag + 1) is not None and not _hemisphere(gps, tag) for tag in tags)
+
+    @property
     def _degrees_of_exif(self) -> tuple[float, float]:
         return _degrees(self.exif.gps, 1, "S"), _degrees(self.exif.gps, 3, "W")
 
@@ -214,13 +221,22 @@ def _name(tag: str) -> str:
 
 
 def _degrees(gps: Mapping[int, object], reference_tag: int, negative: str) -> float:
-    """A latitude or longitude of EXIF's GPS block; the tag of the value follows that of its reference (N, S, E, W)."""
+    """A latitude or longitude of EXIF's GPS block; the tag of the value follows that of its reference (N, S, E, W).
+
+    NaN without a reference: the value has no sign, and might be on the other side of the Earth.
+    """
     value = gps.get(reference_tag + 1)
     parts = value if isinstance(value, tuple) else (value,)
     degrees = sum(as_number(part) / 60**power for power, part in enumerate(parts[:3]))
+    letter = _hemisphere(gps, reference_tag)
+    return math.nan if not letter else -degrees if letter == negative else degrees
+
+
+def _hemisphere(gps: Mapping[int, object], reference_tag: int) -> str:
+    """N, S, E or W; empty where EXIF does not say."""
     reference = gps.get(reference_tag, "")
-    reference = reference.decode("ascii", "replace") if isinstance(reference, bytes) else str(reference)
-    return -degrees if reference.strip("\0 ").upper().startswith(negative) else degrees
+    text = reference.decode("ascii", "replace") if isinstance(reference, bytes) else str(reference)
+    return text.strip("\0 ").upper()[:1]
 
 
 def _exif_height_m(metadata: PhotographMetadata) -> float:

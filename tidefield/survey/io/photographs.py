@@ -108,7 +108,19 @@ def read_survey(
         names = [one.photograph.name for one in known if block in one.metadata.damaged]
         if names:
             remarks.append(f"The {block} metadata of {list_names(names)} is damaged and was not read.")
-    kept, about_lenses = _drop_without_lens(_with_positions(known))
+    placed = _with_positions(known)
+    nowhere = [
+        photograph.name
+        for one, photograph in zip(known, placed, strict=True)
+        if photograph.position is None and one.metadata.lacks_hemisphere
+    ]
+    if nowhere:
+        remarks.append(
+            f"The EXIF positions of {list_names(nowhere)} are not used, because they do not say on which side of the "
+            "equator or of Greenwich they are: write GPSLatitudeRef and GPSLongitudeRef, too (exiftool "
+            "-GPSLatitudeRef=S -GPSLongitudeRef=W)."
+        )
+    kept, about_lenses = _drop_without_lens(placed)
     located, about_positions = locate_photographs(folder, kept, gps)
     found = None if control or not find_control else find_file(folder, CONTROL_FILES)
     survey = Survey(folder, tuple(sorted(located, key=lambda photograph: photograph.name)), None)

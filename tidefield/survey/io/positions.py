@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Transformer
+from pyproj.transformer import TransformerGroup
 
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import (
@@ -49,11 +51,13 @@ _COLUMNS = {
     "longitude": ("longitude", "lon", "lng", "long", "x", "gpslongitude", "longitudedeg"),
     "height": ("height", "altitude", "alt", "elevation", "ele", "z", "h", "gpsheight", "gpsaltitude", "gpsalt"),
     "horizontal": (
-        *("accuracyhorizontal", "horizontalaccuracy", "horzaccuracy", "hacc"),
+        *("accuracyhorizontal", "horizontalaccuracy", "horzaccuracy", "accuracyhorz", "hacc"),
+        *("lateralrms", "horizontalrms"),
         *("accuracyxy", "xyaccuracy", "sigmaxy", "stdxy"),
     ),
     "vertical": (
-        *("accuracyvertical", "verticalaccuracy", "vertaccuracy", "vacc"),
+        *("accuracyvertical", "verticalaccuracy", "vertaccuracy", "accuracyvert", "vacc"),
+        *("elevationrms", "verticalrms"),
         *("accuracyz", "zaccuracy", "sigmaz", "stdz"),
     ),
     "yaw": ("yaw",),
@@ -77,6 +81,7 @@ _BESIDE = {
     **dict.fromkeys(("latitude", "longitude", *_ANGLES), _OF_DEGREES),
     **dict.fromkeys(_LENGTHS, _OF_LENGTHS),
 }
+_OF_ACCURACIES = ("accuracy", "rms", "std", "stdev", "stde", "stdn", "stdu", "sigma", "sd", "error", "precision")
 _MAX_TITLE = 100  # longer is no title; a search for units in megabytes of brackets would take hours
 _REQUIRED = ("name", "latitude", "longitude")
 _EXPECTED_TABLE = (
@@ -93,6 +98,8 @@ _FAR_TIMES_MEDIAN = 20.0
 _MAX_OUTLIERS = 0.1
 
 
+_CENTIMETRES = 0.1
+"""Metres. Conversions between systems of one plate are as accurate as this at best."""
 _Row: TypeAlias = tuple[str, str, list[float]]
 """A photograph, the place in the file for messages, and the numbers of `_GEO`, NaN where unknown."""
 
@@ -141,6 +148,11 @@ def locate_photographs(
                 located[index] = replace(photograph, position=position, gimbal_deg=gimbal)
         located, impossible_in_file = _drop_impossible(located)
         remarks += [*about_file, *impossible_in_file]
+    elif unused := find_file(folder, GPS_FILES):
+        remarks.append(
+            f"{unused.name} is not used, because all photographs have positions in their EXIF: if its positions are "
+            f"better, such as those of PPK, name it: --gps {unused.name}."
+        )
     located, outliers = _drop_outliers(located)
     remarks += outliers
     without = [photograph.name for photograph in located if photograph.position is None]
@@ -236,6 +248,7 @@ def _read_table(
     system = system or usual
     remarks = [f"{path.name}: positions are in {system.name}, as its first line has it."] if other else []
     titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
+    hemispheres = _hemispheres(titles)
     above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
     zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), _datum(system)]
     height_unit_m = 1.0 if {*above} & {*_UNITS_M} else metres_per_height(system)
@@ -259,6 +272,9 @@ def _read_table(
             if not number:
                 raise SurveyError(f"{where} has {cells[key][:40]!r}: expected a number; correct it")
             numbers[key] = number[0] * unit_m
+        for key, index in hemispheres.items():
+            if index < len(row) and row[index].strip()[:1].upper() in ("S", "W"):
+                numbers[key] = -abs(numbers[key])
         degrees = numbers["latitude"], numbers["longitude"]
         if not all(map(math.isfinite, degrees)):
             continue
@@ -270,8 +286,16 @@ def _read_table(
         values[2] *= height_unit_m
         read.append((name, where, values))
     found = _records(path, read, system, zeros[0])
-    unread = {*range(len(titles))} - {index for index, _ in columns.values()}
+    remarks += _conversion_remarks(path, system) if other else []
+    unread = {*range(len(titles))} - {index for index, _ in columns.values()} - {*hemispheres.values()}
     numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
+    accuracies = [title for title in numeric if {*_words(title.casefold())} & {*_OF_ACCURACIES}]
+    if accuracies and not {"horizontal", "vertical"} <= {*columns}:
+        remarks.append(
+            f"{path.name}: {list_names(accuracies)} are not read. Where they are standard deviations, call them "
+            '"accuracy horizontal (m)" and "accuracy vertical (m)": positions of a differential receiver are used as '
+            "such only with these."
+        )
     if "height" in columns or not numeric:
         return found, remarks
     return found, [
@@ -279,6 +303,15 @@ def _read_table(
         f"{path.name} has no column of heights that is understood; its columns {list_names(numeric)} are not read. If "
         'one of them is the height, call it "height (m)".',
     ]
+
+
+def _hemispheres(titles: Sequence[str]) -> dict[str, int]:
+    """Columns of the letters N, S, E and W, as exiftool calls those of EXIF: GPSLatitudeRef and GPSLongitudeRef."""
+    plain = ["".join(filter(str.isalnum, title.casefold())) for title in titles]
+    pairs = (
+        (key, k) for key in ("latitude", "longitude") for k, title in enumerate(plain) if title.endswith(f"{key}ref")
+    )
+    return dict(pairs)
 
 
 def _is_numeric(rows: Sequence[Sequence[str]], index: int) -> bool:
@@ -319,7 +352,26 @@ def _read_geo(path: Path, names: PhotographNames) -> tuple[dict[str, GpsRecord],
         read.append((name, where, values))
     found = _records(path, read, system, _datum(system))
     has_heights = any(math.isfinite(record.position.height_m) for record in found.values())
-    return found, unit_remarks(path, system) if has_heights else []
+    remarks = unit_remarks(path, system) if has_heights else []
+    return found, [*remarks, *(_conversion_remarks(path, system) if found else [])]
+
+
+def _conversion_remarks(path: Path, system: CRS) -> list[str]:
+    """Say so where PROJ lacks the grid of the best conversion to WGS 84: what it does instead is metres off."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # which is what the remark says
+        group = TransformerGroup(horizontal(system), WGS84, always_xy=True)
+    if group.best_available or not group.transformers or not group.unavailable_operations:
+        return []
+    best, used = group.unavailable_operations[0], group.transformers[0]
+    grids = [grid.short_name or grid.full_name for grid in best.grids if not grid.available]
+    if not grids or not used.accuracy > max(_CENTIMETRES, best.accuracy):
+        return []
+    return [
+        f"{path.name}: positions in {system.name} are converted to WGS 84 to {used.accuracy:g} m only, because PROJ "
+        f"lacks {list_names(grids)}: install it (`projsync --file {grids[0]}`, or PROJ_NETWORK=ON), or give longitude "
+        "and latitude in WGS 84."
+    ]
 
 
 def _datum(system: CRS) -> VerticalDatum:
@@ -335,6 +387,8 @@ def _records(path: Path, read: Sequence[_Row], system: CRS, datum: VerticalDatum
     given: dict[str, list[float]] = {}
     found: dict[str, GpsRecord] = {}
     for (name, where, values), (longitude, latitude) in zip(read, degrees.tolist(), strict=True):
+        if abs(longitude) > 180:
+            longitude = (longitude + 180) % 360 - 180
         if not math.isfinite(latitude):
             raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {system.srs!r}; correct either")
         if not np.array_equal(given.setdefault(name, values), values, equal_nan=True):
@@ -346,6 +400,12 @@ def _records(path: Path, read: Sequence[_Row], system: CRS, datum: VerticalDatum
         position = Position(latitude, longitude, height, *_positive(across, up), datum, path.name)
         found[name] = GpsRecord(position, gimbal)
     return found
+
+
+def radius_m(degrees: Float64[np.ndarray, "N 2"], middle: tuple[float, float]) -> float:
+    """Distance from a place within which nine tenths of positions (longitude, latitude) are; others may be wrong."""
+    apart_m = np.hypot(*((degrees - middle) * metres_per_degree(middle[1])).T)
+    return float(np.nanquantile(apart_m, 0.9))
 
 
 def _positive(horizontal_m: float, vertical_m: float) -> tuple[float, float]:

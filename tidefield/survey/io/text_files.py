@@ -45,9 +45,12 @@ class PhotographNames:
         """
         wanted = normalise_name(text.strip().strip('"').replace("\\", "/").removeprefix("./"))
         path = PurePosixPath(wanted)
-        # A path of another machine still ends in the file name; a list of raw files still names their JPEGs.
+        # A path of another machine still ends in the folder, if there are several, and the file name; a list of raw
+        # files still names their JPEGs.
         stem = path.stem if _SUFFIX.fullmatch(path.suffix) else path.name
-        keys = ("path", wanted), ("name", path.name), ("bare path", wanted), ("stem", path.name), ("stem", stem)
+        tails = ["/".join(path.parts[k:]) for k in range(len(path.parts) - 1)]
+        places = [(kind, tail) for kind in ("path", "bare path") for tail in (wanted, *tails)]
+        keys = *places, ("name", path.name), ("stem", path.name), ("stem", stem)
         names = next((self._names[key] for key in keys if key in self._names), [])
         if len(names) > 1:
             raise SurveyError(

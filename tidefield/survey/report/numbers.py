@@ -216,7 +216,10 @@ def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
     assert frame is not None, "a model without a georeference has no map"
 
     def degrees(xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        return frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
+        found = frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
+        # Outlines over the date line would reach around the Earth; beyond 180 degrees they stay together.
+        found[:, 0] += 360 * np.rint((frame.longitude_deg - found[:, 0]) / 360)
+        return found
 
     return {
         "type": "FeatureCollection",

@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import quote, unquote
 
 import cv2
@@ -31,6 +31,8 @@ Keypoints = Float32[np.ndarray, "K 4"]
 Descriptors = UInt8[np.ndarray, "K 128"]
 
 DEFAULT_FOCAL = 1.2
+_SAME_FOCAL = 0.02
+"""Share by which priors of one lens differ at most: a digital zoom changes them by more."""
 """Focal length in widths of the photograph where no prior exists: COLMAP's default. A fisheye's is that of 180 degrees
 along the diagonal."""
 LensKind = Literal["pinhole", "fisheye"]
@@ -110,10 +112,25 @@ def is_database(path: Path) -> bool:
 
 
 def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
-    """Number the lenses: photographs of one camera, size and focal length share a number."""
-    kinds = [(p.camera, p.serial, p.width, p.height, None if np.isnan(p.focal_mm) else p.focal_mm) for p in photographs]
-    numbers = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
-    return [numbers[kind] for kind in kinds]
+    """Number the lenses: photographs of one camera, size, orientation and focal length share a number.
+
+    Sensors that were turned have their principal point on another side; a photograph that the drone undistorted has
+    another lens than its others; and a digital zoom changes the focal length in pixels alone.
+    """
+    focal_px: list[float] = []
+    numbers: dict[Any, list[int]] = {}
+    found = []
+    for p in photographs:
+        focal_mm, distortion = None if np.isnan(p.focal_mm) else p.focal_mm, p.lens and p.lens.distortion
+        kind = p.camera, p.serial, p.width, p.height, p.orientation, focal_mm, distortion
+        own = p.lens.focal_px if p.lens else 0.0
+        same = (k for k in numbers.get(kind, []) if abs(own - focal_px[k]) <= _SAME_FOCAL * own)
+        number = next(same, len(focal_px))
+        if number == len(focal_px):
+            focal_px.append(own)
+            numbers.setdefault(kind, []).append(number)
+        found.append(number)
+    return found
 
 
 def initial_camera(photograph: Photograph, kind: LensKind = "pinhole") -> pycolmap.Camera:
