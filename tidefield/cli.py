@@ -143,6 +143,8 @@ def _run(words: list[str]) -> None:
         return
     _require_command(words)
     words, copies = _with_copies(words)
+    if os.environ.get("NO_COLOR"):
+        tyro._experimental_options["ansi_codes"] = False
     options = tyro.extras.subcommand_cli_from_dict(
         {name: options for name, (_, options, _) in COMMANDS.items()},
         prog="tidefield",

@@ -132,12 +132,15 @@ def test_the_view_of_a_training_photograph_is_made_from_the_others_unless_asked(
     assert np.square(made - truth).mean() > 2 * np.square(with_itself - truth).mean()
 
 
-def test_resume_goes_on_from_the_last_step(scene: Path, run: Path) -> None:
+def test_resume_goes_on_from_the_last_step(scene: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from tidefield.model.network import make_network
     from tidefield.train.checkpoint import load_network, read_run
 
     call("train", scene, run, "--steps", 5, "--resume", "-q")
     assert load_network(run, make_network(read_run(run).config.network)).step == 5
+    capsys.readouterr()
+    call("train", scene, run, "--resume")
+    assert "the budget was used before" in capsys.readouterr().out
 
 
 def test_a_run_is_not_overwritten_unasked(scene: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,6 +190,12 @@ def test_users_mistakes_are_one_clear_message(
         ("render", run, tmp_path / "a.png", "--camera", "a"),
     ):
         assert "--weights belongs to --zero-shot" in fails(capsys, *words, *weights)
+        assert "--preset belongs to --zero-shot" in fails(capsys, *words, "--preset", "paper")
+    for given in (("--path", "orbit"), ("--frames", 240)):
+        said = fails(capsys, "render", run, tmp_path / "a.png", "--camera", "a", *given)
+        assert f"{given[0]} belongs to a video" in said
+    said = fails(capsys, "train", scene, run, "--steps", 5, "--resume", "--overwrite")
+    assert "--resume continues the run that --overwrite replaces" in said
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
     for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):
@@ -393,6 +402,28 @@ def test_a_place_that_the_system_refuses_is_one_clear_message(
         assert re.search(reason, fails(capsys, "import", scene, tmp_path / place))
         assert fails(capsys, "train", tmp_path / place, tmp_path / "new", "--steps", 1)
         assert fails(capsys, "evaluate", tmp_path / place)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a terminal to write to")
+@pytest.mark.parametrize("given", ["", "1"])
+def test_help_has_no_colours_where_none_are_wanted(given: str) -> None:
+    import pty
+
+    own, terminal = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "NO_COLOR": given}
+    words = [sys.executable, "-m", "tidefield.cli", "cache", "--help"]
+    child = subprocess.Popen(words, env=environment, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    found = b""
+    try:
+        while some := os.read(own, 65536):
+            found += some
+    except OSError:  # Linux ends what is read from a terminal that is closed like this
+        pass
+    os.close(own)
+    assert child.wait() == 0
+    assert b"--clear" in found
+    assert (b"\x1b[" in found) == (given == "")
 
 
 def test_help_does_not_import_torch() -> None:

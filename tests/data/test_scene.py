@@ -45,6 +45,7 @@ def test_a_name_of_several_photographs_is_an_error_unless_it_is_the_whole_name_o
     scene = replace(named(), names=names)
     assert scene.index("DJI_0002.JPG") == 3
     assert scene.index("101MEDIA/DJI_0001.JPG") == 1
+    assert scene.index("101MEDIA/DJI_0002") == 2
     with pytest.raises(SceneError, match=r"names 2 photographs in wall \(100MEDIA/DJI_0001\.JPG, 101MEDIA/DJI_0001"):
         scene.index("DJI_0001")
 

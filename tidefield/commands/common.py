@@ -71,21 +71,26 @@ class ZeroShot:
 
     zero_shot: bool = False
     """Use a scene with trained weights, without training on it."""
-    preset: Preset = "swift"
-    """The network."""
+    preset: Preset | None = None
+    """The network; swift if not given."""
     weights: Path | None = None
     """Its weights, of `tidefield pretrain`; the installed ones if not given."""
+
+    @property
+    def network(self) -> Preset:
+        return self.preset or "swift"
 
     def checked(self) -> ZeroShot:
         """These options.
 
         Raises:
-            RunError: weights are given that nothing would use.
+            RunError: a network or weights are given that nothing would use.
         """
-        if self.weights is not None and not self.zero_shot:
+        given = next((name for name in ("preset", "weights") if getattr(self, name) is not None), None)
+        if given is not None and not self.zero_shot:
             raise RunError(
-                "--weights belongs to --zero-shot: runs have their own, and other methods none; add --zero-shot, or "
-                "leave --weights out"
+                f"--{given} belongs to --zero-shot: runs have their own, and other methods none; add --zero-shot, or "
+                f"leave --{given} out"
             )
         return self
 
@@ -123,8 +128,8 @@ def open_zero_shot(
     from tidefield.methods import zero_shot
     from tidefield.train.checkpoint import given_or_shipped
 
-    config = PRESETS[zero.preset]
-    render, digest = zero_shot(config, given_or_shipped(zero.weights, zero.preset), scene, device, sampling)
+    config = PRESETS[zero.network]
+    render, digest = zero_shot(config, given_or_shipped(zero.weights, zero.network), scene, device, sampling)
     return render, {**config_to_json(config), "weights": digest, "sampling": asdict(sampling)}
 
 
@@ -143,7 +148,7 @@ def open_source(
     Without `hold_out` all photographs are sources, as for products.
 
     Raises:
-        RunError: weights are given, but not for a scene without training.
+        RunError: a network or weights are given, but not for a scene without training.
     """
     if zero.checked().zero_shot:
         scene = load(source, None, allow_missing, console, hold_out)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from tidefield.data.scene import Scene
     from tidefield.geometry.cameras import Cameras
 
+FRAMES = 240
+"""Of a video for which no number is given."""
 FRAMES_AT_ONCE = 8
 """Frames of a task on a cluster: frames that follow each other read the same encoded photographs."""
 
@@ -39,9 +41,9 @@ class Render:
     """A trained run, or with --zero-shot a scene."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """The file to write; .mp4 for a video, .png with --camera."""
-    path: str = "orbit"
-    """orbit, cameras (a flight past the photographs), strip (straight down) or a camera path of nerfstudio's viewer
-    (JSON)."""
+    path: str | None = None
+    """orbit (also if not given), cameras (a flight past the photographs), strip (straight down) or a camera path of
+    nerfstudio's viewer (JSON)."""
     camera: str | None = None
     """Name of a photograph whose camera is rendered instead of a path."""
     with_itself: bool = False
@@ -49,8 +51,8 @@ class Render:
     without, its view is made from the others, as that of a held-out photograph."""
     zero: OmitArgPrefixes[ZeroShot] = ZeroShot()
     footprint: OmitArgPrefixes[Footprint] = Footprint()
-    frames: int = 240
-    """Frames of the video, 24 a second; a JSON has its own."""
+    frames: int | None = None
+    """Frames of the video, 24 a second; 240 if not given. A JSON has its own."""
     width: int | None = None
     """Width of the picture in pixels; that of the JSON or of the run's photographs if not given."""
     height: int | None = None
@@ -77,6 +79,9 @@ def render(options: Render, console: Console) -> None:
         raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
     if options.with_itself and camera is None:
         raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
+    of_paths = next((name for name in ("path", "frames") if getattr(options, name) is not None), None)
+    if of_paths is not None and camera is not None:
+        raise RunError(f"--{of_paths} belongs to a video: --camera NAME is one view; leave one of them out")
     if options.cluster is not None and camera is not None:
         raise RunError("--cluster shares the frames of a path among machines: --camera NAME is one view; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
@@ -95,7 +100,8 @@ def render(options: Render, console: Console) -> None:
         from tidefield.render.camera_paths import make_trajectory
         from tidefield.render.video import write_video
 
-        trajectory = make_trajectory(options.path, scene, frames=options.frames, width=width, height=height)
+        path, count = options.path or "orbit", FRAMES if options.frames is None else options.frames
+        trajectory = make_trajectory(path, scene, frames=count, width=width, height=height)
         cameras = _resized(trajectory.cameras, options.width, options.height)
 
         with ExitStack() as stack:
@@ -109,7 +115,7 @@ def render(options: Render, console: Console) -> None:
                 frames,
                 out,
                 trajectory.frames_per_second,
-                title=title(scene, Path(options.path).name),
+                title=title(scene, Path(path).name),
                 overwrite=overwrite,
                 progress=lambda done: bar(done, len(cameras)),
             )

@@ -90,6 +90,8 @@ def train(options: Train, console: Console, again: str = AGAIN) -> None:
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
     folder = options.run
+    if options.resume and options.overwrite:
+        raise RunError("--resume continues the run that --overwrite replaces: expected one of them; leave one out")
     if os.path.isfile(folder):
         raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     with only_writer(folder):
@@ -173,6 +175,8 @@ def _train(options: Train, console: Console, again: str) -> None:
                 page = stack.enter_context(TrainingPage(trainer, folder.resolve().name, "127.0.0.1", options.port))
                 console.print(f"{page.page.address} shows it", highlight=False, soft_wrap=True)
                 callback = _both(callback, page)
+            if used >= 1:
+                console.print("the budget was used before: --minutes or --steps give a larger one", highlight=False)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
     report_end(progress, stopped, folder, console, again)
 

@@ -60,7 +60,7 @@ def view(options: View, console: Console) -> None:
     require_port(options.host, options.port)
     if not options.sources:
         raise RunError("nothing to look at was named: expected a run, a scene with --zero-shot, or maps; name one")
-    if not options.zero.zero_shot and _are_maps(options.sources):
+    if not options.zero.checked().zero_shot and _are_maps(options.sources):
         _view_maps(options, console)
         return
     from tidefield.viewer.frames import SAMPLING

@@ -273,14 +273,15 @@ _TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", *_OF
 
 
 def find_name(name: str, names: Sequence[str], where: str) -> int:
-    """Find a photograph by its path in the scene, its file name, or its path without the folder and the suffix.
+    """Find a photograph by its path in the scene, its file name, or either without the suffix.
 
     Raises:
         SceneError: none of the names matches, or several match in part and none as a whole.
     """
     if name in names:
         return names.index(name)
-    found = [i for i, own in enumerate(names) if name in (PurePath(own).stem, PurePath(own).name)]
+    paths = map(PurePath, names)
+    found = [i for i, p in enumerate(paths) if name in (p.name, p.stem, p.with_suffix("").as_posix())]
     if len(found) > 1:
         matching = list_names([names[i] for i in found])
         raise SceneError(
