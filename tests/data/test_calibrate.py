@@ -55,6 +55,25 @@ def test_lenses_without_a_residual_get_none(noise_px: float):
     assert same is points
 
 
+@pytest.mark.parametrize("seed", [3, 68, 97])
+def test_noise_of_points_that_are_seen_twice_is_no_residual(seed: int):
+    scene, random = survey(), torch.Generator().manual_seed(seed)
+    points = scene.points
+    assert points is not None
+    train = torch.randperm(39, generator=random)[:12]
+    mine = torch.nonzero(torch.isin(points.camera_index.long(), train))[:, 0]
+    mine = mine[torch.randperm(len(mine), generator=random)]
+    twice = torch.stack([torch.cumsum(points.point_index[mine] == k, 0) for k in range(len(points.xyz_world))])
+    mine = mine[twice[points.point_index[mine].long(), torch.arange(len(mine))] <= 2]
+    mine = mine[torch.bincount(points.point_index[mine].long())[points.point_index[mine].long()] == 2]
+    camera, point = points.camera_index[mine], points.point_index[mine]
+    uv = scene.cameras.project(points.xyz_world)[0][camera.long(), point.long()]
+    uv = uv + 0.3 * torch.randn(len(mine), 2, generator=random)
+    own = replace(points, camera_index=camera, point_index=point, uv_px=uv)
+    found, _ = calibrate_lenses(scene.cameras, own, ["wide"] * 39, tuple(sorted(train.tolist())))
+    assert found is scene.cameras
+
+
 def test_held_out_photographs_change_nothing():
     cameras, points = observed(TRUE, 0.1)
     pose, uv = cameras.T_world_camera.clone(), points.uv_px.clone()

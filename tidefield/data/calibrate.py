@@ -5,8 +5,8 @@ lens, where r is a quadratic polynomial with values in the plane. It is fitted t
 whose positions are as unknown as r, so both are estimated together: in every step the points are eliminated from the
 linearised problem.
 
-Nothing is changed unless photographs that took no part in the fit agree better with it, and held-out photographs have
-no part at all.
+Nothing is changed unless photographs and points that took no part in the fit agree better with it, and held-out
+photographs have no part at all.
 
 Alphabet: O observations, P points, K coefficients.
 """
@@ -30,9 +30,9 @@ FEWEST_PHOTOGRAPHS, FEWEST_OBSERVATIONS = 8, 400
 MOST_OBSERVATIONS = 60_000
 """Used of one lens, those of some points only: more take time and determine twelve numbers no better."""
 FOLDS = 4
-"""Parts of the photographs, each left out of the fit once."""
+"""Parts of the photographs, and of the points, each left out of the fit once."""
 LEAST_GAIN = 0.01
-"""By which the cost of the left-out photographs has to fall in every fold: noise does that in none of them."""
+"""By which the cost of what is left out has to fall in every fold: noise does that in none of them."""
 LEAST_RESIDUAL = 5e-5
 """Root-mean-square of r below which it is left out: 0.02 px of a photograph of 400 px, which no picture shows."""
 SHRINK = 0.03
@@ -150,19 +150,21 @@ def _fit(
         # The median length of a Gaussian error is 1.18 standard deviations; the floor keeps exact fits finite.
         scale = CAUCHY * float(np.median(size)) / 1.1774 + 1e-9
         weight = 1 / (1 + (size / scale) ** 2)
-    part = np.unique(errors.photograph, return_inverse=True)[1] % FOLDS
     costs = []
-    for fold in range(FOLDS):
-        kept, left = part != fold, part == fold
-        found = _solve(slopes[kept], design[kept], values[kept], weight[kept])
-        costs.append([_cost(values[left] - slopes[left] @ x, scale) for x in (0 * found, found)])
+    # Left-out photographs, whose poses have errors; and left-out points: what a point's two observations are off from
+    # each other is the same in both, so that a photograph that is left out knows the noise of those that are not.
+    for whole in (errors.photograph, errors.point):
+        part = np.unique(whole, return_inverse=True)[1] % FOLDS
+        for fold in range(FOLDS):
+            kept, left = part != fold, part == fold
+            found = _solve(slopes[kept], design[kept], values[kept], weight[kept])
+            costs.append([_cost(values[left] - slopes[left] @ x, scale) for x in (0 * found, found)])
     before, after = np.array(costs).T
     size = float(np.sqrt(((design @ coefficients) ** 2).sum(1).mean()))
     helps = bool((after < (1 - LEAST_GAIN) * before).all()) and size > LEAST_RESIDUAL
     focal = float(cameras.focal_px[mine].mean())
     _log.debug(
-        "the lens of %d photographs has a residual of %.3f px, with which left-out photographs' errors cost %.1f%% "
-        "less: %s",
+        "the lens of %d photographs has a residual of %.3f px, with which left-out errors cost %.1f%% less: %s",
         int(mine.sum()),
         focal * size,
         100 * (1 - after.sum() / before.sum()),
