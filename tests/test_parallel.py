@@ -49,6 +49,39 @@ def test_tasks_run_in_the_modes_of_their_caller(mode) -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
+def test_a_thread_that_starts_while_others_work_has_all_cores() -> None:
+    both, found = threading.Barrier(2), []
+
+    def meet() -> int:
+        both.wait(timeout=10)  # broken if one after the other
+        return torch.get_num_threads()
+
+    def start() -> None:
+        other = threading.Thread(target=lambda: found.extend(in_parallel([meet, meet], CPU)))
+        other.start()
+        other.join()
+
+    in_parallel([start, lambda: None], CPU)
+    assert found == [1, 1]
+    fresh = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    fresh.start()
+    fresh.join()
+    assert found[-1] == torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_tasks_of_a_task_run_on_its_core() -> None:
+    def names() -> str:
+        return threading.current_thread().name
+
+    def both() -> tuple[str, list[str]]:
+        return names(), in_parallel([names, names], CPU)
+
+    for own, others in in_parallel([both, both], CPU):
+        assert others == [own, own]
+
+
+@pytest.mark.usefixtures("two_threads")
 def test_what_tasks_on_a_gpu_ask_for_in_turn_is_read_at_the_same_time() -> None:
     both, reads = threading.Barrier(2), []
 

@@ -20,6 +20,7 @@ T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 Part = Callable[[], tuple[Tensor, ...]]
 _SEQUENTIAL = ContextVar("sequential", default=False)
+_WORKER = threading.local()
 _CHECK: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None)
 
 
@@ -34,16 +35,47 @@ def in_parallel(tasks: list[Callable[[], T]], device: torch.device | str) -> lis
     check = _CHECK.get()
     if check is not None:
         tasks = [partial(_checked, check, task) for task in tasks]
-    if torch.device(device).type != "cpu" or _SEQUENTIAL.get():
+    if torch.device(device).type != "cpu" or _SEQUENTIAL.get() or hasattr(_WORKER, "has_one_core"):
         return [task() for task in tasks]
-    cores = torch.get_num_threads()
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
-    try:
-        # A thread's own number of cores; it becomes the default of threads yet to come, too, hence the last line.
-        with ThreadPoolExecutor(cores, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(lambda task: _in_modes(task, inference, gradients), tasks))
-    finally:
-        torch.set_num_threads(cores)
+    with (
+        _CORES.shared() as cores,
+        ThreadPoolExecutor(cores, initializer=_take_one_core) as pool,
+    ):
+        return list(pool.map(lambda task: _in_modes(task, inference, gradients), tasks))
+
+
+def _take_one_core() -> None:
+    _WORKER.has_one_core = True
+    torch.set_num_threads(1)
+
+
+class _Cores:
+    """How many cores PyTorch has, while pools whose threads have one each work.
+
+    A thread's own number becomes the default of threads yet to come, too: what starts meanwhile would have one core.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._pools, self._count = threading.Lock(), 0, 1
+
+    @contextmanager
+    def shared(self) -> Iterator[int]:
+        """Yield the number, and make it the default again."""
+        with self._lock:
+            if self._pools == 0:
+                self._count = torch.get_num_threads()
+            self._pools += 1
+            count = self._count
+        try:
+            yield count
+        finally:
+            with self._lock:
+                self._pools -= 1
+                torch.set_num_threads(count)
+
+
+_CORES = _Cores()
 
 
 def _in_modes(task: Callable[[], T], inference: bool, gradients: bool) -> T:
