@@ -1,9 +1,11 @@
 """Tidefield inside nerfstudio: what its commands make of a scene, in nerfstudio's own environment."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from foreign_environment import run
@@ -15,6 +17,7 @@ from tidefield.data.georeference import Georeference, Residuals
 from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.posed import every_eighth
 from tidefield.data.scene import Scene
+from tidefield.data.triangulate import triangulate_again
 from tidefield.evaluation.evaluate import evaluate
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
@@ -92,12 +95,22 @@ def test_the_run_holds_the_way_back_to_the_reference_system(trained: tuple[Path,
 def test_the_data_parser_has_the_rays_of_the_lenses(tmp_path: Path, wide: bool):
     truth = survey(*[FISHEYE] * wide, offset=UTM)
     write_colmap(tmp_path / "scene", truth)
+    model = pycolmap.Reconstruction(tmp_path / "scene" / "sparse" / "0")
+    for point in model.points3D.values():
+        point.xyz = point.xyz + 0.3
+    model.write_binary(tmp_path / "scene" / "sparse" / "0")
+    (tmp_path / "scene" / "masks").mkdir()
+    mask = tmp_path / "scene" / "masks" / f"{sorted(truth.names)[1]}.png"
+    Image.new("L", (truth.lenses[1].width, truth.lenses[1].height), 0).save(mask)
     run("rays", tmp_path / "scene", tmp_path / "rays.json")
     posed, train = read_posed(tmp_path / "scene", False), every_eighth(9)[0]
     middle, pixel = posed.T_world_camera[:, :, 3].mean(axis=0), np.array([[50.0, 10.0]])
     found = json.loads((tmp_path / "rays.json").read_text())
     for values, scale in ((found["metres"], 1.0), (found["scaled"], found["scaled"]["scale"])):
         assert values["files"] == [str(posed.paths[i]) for i in train]
+        assert values["masks"][0] == str(mask)
+        others = [np.asarray(Image.open(path)) for path in values["masks"][1:]]
+        assert [other.min() for other in others] == [255] * (len(train) - 1), "nothing of the others is masked"
         for index, origin, direction in zip(train, values["origins"], values["directions"], strict=True):
             pose = posed.T_world_camera[index]
             np.testing.assert_allclose(origin, scale * (pose[:, 3] - middle), atol=1e-5)
@@ -105,6 +118,13 @@ def test_the_data_parser_has_the_rays_of_the_lenses(tmp_path: Path, wide: bool):
             ray = pose[:, :3] @ np.array([*xy, 1.0])
             np.testing.assert_allclose(direction, ray / np.linalg.norm(ray), atol=2e-4)
         assert posed.points is not None
-        np.testing.assert_allclose(values["points"], scale * (posed.points.xyz_world - middle), atol=1e-4)
+        pose = posed.T_world_camera.copy()
+        pose[:, :, 3] -= middle
+        own = replace(posed.points, xyz_world=posed.points.xyz_world - middle)
+        expected = triangulate_again(own, pose, posed.lenses, train)
+        np.testing.assert_allclose(values["points"], scale * expected.xyz_world, atol=1e-4)
+        assert np.abs(expected.xyz_world - own.xyz_world).min() > 0.2, (
+            "where held-out photographs put them is forgotten"
+        )
     reach = np.abs(posed.T_world_camera[:, :, 3] - middle).max()
     assert found["scaled"]["scale"] == pytest.approx(1 / reach), "positions reach to 1"

@@ -7,8 +7,9 @@ coordinate reference system is kept with the run, in `dataparser_transforms.json
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from PIL import Image
 
+from tidefield.data.cache import cache_folder
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import own_lens, read_posed
-from tidefield.files import write_json
+from tidefield.data.triangulate import triangulate_again
+from tidefield.files import completed_file, write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 
@@ -62,7 +66,10 @@ class SceneParserConfig(DataParserConfig):
 
 
 class SceneParser(DataParser):
-    """Reads poses, lenses, masks, the split and the sparse points of a scene; photographs are left where they are."""
+    """Reads poses, lenses, masks, the split and the sparse points of a scene; photographs are left where they are.
+
+    Points are placed by the training photographs alone, as for our own methods.
+    """
 
     config: SceneParserConfig
 
@@ -72,18 +79,21 @@ class SceneParser(DataParser):
         train, test = posed.train_and_test
         chosen = train if split == "train" else test
         pose, origin = posed.centred
-        radius = float(np.abs(pose[:, :, 3]).max())
+        points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
+        if points is not None and len(points.uv_px):
+            points = triangulate_again(points, pose, posed.lenses, train)
+        radius = float(np.abs(pose[:, :, 3]).max()) or 1.0
         scale = 1 / radius if self.config.auto_scale_poses else 1.0
         pose[:, :, 3] *= scale
         lenses = [own_lens(posed.paths[i], posed.lenses[i])[0] for i in chosen]
-        masks = [posed.masks[i] for i in chosen] if posed.masks else []
+        masks = posed.masks and [posed.masks[i] for i in chosen]
         reach = radius * scale
         georeference = read_georeference(root)
         frame = None if georeference is None else georeference.frame
         metadata: dict[str, Any] = {"root": root}
-        if posed.points is not None:
-            xyz, rgb = posed.points.xyz_world, posed.points.rgb
-            metadata["points3D_xyz"] = torch.from_numpy((xyz - origin) * scale).float()
+        if points is not None:
+            xyz, rgb = points.xyz_world, points.rgb
+            metadata["points3D_xyz"] = torch.from_numpy(xyz * scale).float()
             metadata["points3D_rgb"] = torch.from_numpy(np.full(xyz.shape, 128, np.uint8) if rgb is None else rgb)
         return SceneOutputs(
             image_filenames=[posed.paths[i] for i in chosen],
@@ -91,12 +101,25 @@ class SceneParser(DataParser):
             alpha_color=torch.tensor(posed.background_rgb or (1.0, 1.0, 1.0)),
             scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3])),
             # nerfstudio reads masks of all photographs or of none.
-            mask_filenames=[mask for mask in masks if mask is not None] if all(masks) and masks else None,
+            mask_filenames=[mask or _white(lens) for mask, lens in zip(masks, lenses, strict=True)]
+            if masks and any(masks)
+            else None,
             metadata=metadata,
             dataparser_transform=torch.from_numpy(np.concatenate([np.eye(3), -origin[:, None]], axis=1)).float(),
             dataparser_scale=scale,
             georeference=None if frame is None else frame.to_json(),
         )
+
+
+def _white(lens: LensModel) -> Path:
+    """A mask of nothing, of a photograph's size."""
+    folder = cache_folder() or Path(tempfile.gettempdir())
+    path = folder / f"white_{lens.width}x{lens.height}.png"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with completed_file(path, overwrite=True) as partial:
+            Image.new("L", (lens.width, lens.height), 255).save(partial, "PNG")
+    return path
 
 
 def to_nerfstudio(
