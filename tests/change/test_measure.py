@@ -108,8 +108,10 @@ def test_where_nothing_changed_nothing_is_outlined_and_the_net_contains_zero(tmp
 def test_volumes_of_polygons_are_given_one_by_one(tmp_path: Path):
     earlier, later, truth = pair(tmp_path, 4, 0.2)
     pit = Region("pit", shapely.Point(WEST + 30, NORTH - 30).buffer(14))
-    found = measured(earlier, later, regions=lambda grid: [pit])
-    ((region, net, cut, fill, compared),) = found.per_region
+    level = Region("level", shapely.Point(WEST + 100, NORTH - 90).buffer(5))
+    found = measured(earlier, later, regions=lambda grid: [pit, level])
+    (region, net, cut, fill, compared), nothing = found.per_region
+    assert (nothing.cut.value_m3, np.signbit(nothing.cut.value_m3)) == (0, False)
     assert region.name == "pit"
     assert compared == 1
     assert net.value_m3 == pytest.approx(truth[:100, :110].sum() * AREA, rel=0.05)

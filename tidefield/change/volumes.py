@@ -169,7 +169,7 @@ class ErrorModel:
             total += float(dz[rows].sum(where=inside, dtype=np.float64))
         own = region_error(self.sigma, region, self.variogram, self.grid.cell_m)
         return Volume(
-            scale * total * area,
+            scale * total * area + 0.0,  # no minus before a cut of nothing
             own.random * area,
             own.correlated * area,
             self.systematic_of_sum(region) * area,
