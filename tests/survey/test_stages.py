@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ class Pipeline:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.ran = folder, []
+        self.before: Callable[[str], None] = lambda name: None
 
     def run(self, source: str = "photographs", redo: str | None = None, **options: int) -> list[str]:
         self.ran = []
@@ -25,6 +27,7 @@ class Pipeline:
             output = self.folder / f"{name}.txt"
 
             def job(resume: bool, name: str = name, output: Path = output) -> Facts:
+                self.before(name)
                 self.ran.append(name)
                 output.write_text(name)
                 return {"name": name, "resumed": resume}
@@ -224,3 +227,18 @@ def test_an_unwritable_folder_is_an_error(tmp_path: Path, monkeypatch: pytest.Mo
 
     with pytest.raises(RunError, match=r"scene cannot be written \(No space left on device\)"):
         stages.run("one", 0, [], fills_the_disk)
+
+
+@pytest.mark.parametrize("last", ["two", "three"])
+def test_a_repetition_that_was_interrupted_goes_on_with_the_same_command(pipeline: Pipeline, last: str):
+    def interrupt(name: str) -> None:
+        if name == last:
+            raise KeyboardInterrupt
+
+    pipeline.before = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run(redo="one")
+    pipeline.before = lambda name: None
+    assert pipeline.run(redo="one") == (["two", "three"] if last == "two" else ["three"])
+    assert pipeline.run(redo="one") == ["one", "two", "three"], "the next one is another"
+    assert pipeline.run() == []

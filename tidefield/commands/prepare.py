@@ -58,8 +58,7 @@ class Prepare:
     reconstructed in blocks that share photographs, by either."""
     downscale: Downscale = ()
     redo: str | None = None
-    """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them. To
-    continue a repetition that was interrupted, leave it out."""
+    """Name of a stage to repeat, with all that follow: quality, features, ..., images, as the messages name them."""
     device: Annotated[str, arg(help="auto, cpu or cuda: where features are found and matched.")] = "auto"
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 

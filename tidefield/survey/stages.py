@@ -64,6 +64,9 @@ class Stages:
             _refuse_links(self._scene)
             folder.mkdir(parents=True, exist_ok=True)
             self._records = self._read() if self._file.exists() else {}
+        if all(record["done"] for record in self._records.values()):
+            for record in self._records.values():
+                record.pop("redone", None)
         self._key, self._redo, self._is_redoing = _digest(source), redo, False
         self.seconds: dict[str, float] = {}
 
@@ -88,8 +91,9 @@ class Stages:
             The result, of this run or of an earlier one.
         """
         self._key = _digest([self._key, name, options])
-        self._is_redoing = self._is_redoing or name == self._redo
         record = self._records.get(name, {})
+        # A repetition that was interrupted goes on.
+        self._is_redoing = self._is_redoing or (name == self._redo and not record.get("redone"))
         is_same = record.get("key") == self._key and not self._is_redoing
         with writing_to(self._scene):
             is_complete = is_same and record["done"] and all(path.exists() for path in outputs)
@@ -108,6 +112,8 @@ class Stages:
         stale = set(record.get("files", ())) - set(files)
         earlier = record["seconds"] if is_same else 0.0
         record = {"key": self._key, "done": False, "seconds": earlier, "files": [*files, *sorted(stale)]}
+        if name == self._redo:
+            record["redone"] = True
         self._records[name] = record
         # Their files may be changed from now on, even if this run ends before they are repeated.
         for later in self._records.keys() - {name, *self.seconds}:
