@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
-from pyproj.exceptions import CRSError, ProjError
+from pyproj.exceptions import CRSError
 
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, Grid, is_local, same_system, unstated_unit
+from tidefield.change.surfaces import ChangeError, Grid, is_local, system_of_ground, unstated_unit
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
     FOOT_M,
@@ -24,7 +24,7 @@ from tidefield.geometry.geodesy import (
     has_unstated_unit,
     horizontal,
     metres_per_height,
-    metric_system,
+    same_system,
     zero_of_heights,
 )
 from tidefield.maps.classes import NOISE, WATER
@@ -138,13 +138,8 @@ def read_cloud(path: Path) -> Cloud:
         own = crs is None and keys.get(_PROJECTED) == _USER_DEFINED
         remarks = (*((own_system,) if own else ()), *((converted,) if unit_m != 1 else ()))
         return Cloud(path, None, xyz, sigma, remarks=remarks)
-    try:
-        metric = metric_system(crs, *xyz[:, :2].mean(axis=0).tolist())
-    except ProjError as error:
-        raise ChangeError(
-            f"{path} lies outside of {crs.name} ({error}): expected coordinates of its system; assign the right one "
-            f"({_ASSIGN})"
-        ) from error
+    east, north = xyz[:, :2].mean(axis=0).tolist()
+    metric = system_of_ground(crs, (east, north), path, _ASSIGN)
     unstated = has_unstated_unit(crs) and keys.get(_HEIGHT_UNIT) not in _UNITS_M
     remarks = (unstated_unit(path, crs, _ASSIGN),) if unstated else ()
     own = crs if metres_per_height(crs) == 1 else horizontal(crs)

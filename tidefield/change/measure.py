@@ -85,6 +85,10 @@ class InPolygon(NamedTuple):
     fill: Volume
     compared: float
 
+    @property
+    def volumes(self) -> dict[str, Volume]:
+        return {"net": self.net, "cut": self.cut, "fill": self.fill}
+
 
 @dataclass(frozen=True)
 class Change:
@@ -330,7 +334,7 @@ def _settle(
         for rows in grid.strips():
             inside = ground[rows]
             residual[rows][inside] = (dz[rows] - bare.plane(grid, rows))[inside]
-        left = fit(residual, ground, grid, "vertical", rounding)[0]
+        left = fit(residual, ground, grid, "vertical", rounding)[0] if model == "none" else 0.0
         after = statistics(_sampled(residual, ground))
         if own is not None:
             residual /= own

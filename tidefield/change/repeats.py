@@ -11,6 +11,7 @@ from tidefield.change.surfaces import Surface
 _SIDE = 3
 """Cells on each side of a block that is the same in both surveys."""
 _LEAST_SHARE = 0.01
+"""Of cells and of steps: fewer say nothing."""
 _SEVERAL_STEPS = 0.2
 """Share of two and three steps among differences of up to three, at which noise is larger than the rounding."""
 _ROUNDED = 0.99

@@ -24,7 +24,6 @@ from tidefield.change.write import write_csv
 from tidefield.files import write_json, write_text
 from tidefield.pages import template_environment
 
-VOLUMES = ("net", "cut", "fill")
 _MOST_PLOTS = 12
 _SAME_GROUND = 0.99
 """Areas of comparisons that are alike to this share are taken to be of the same ground."""
@@ -54,12 +53,12 @@ class Entry:
 
 def entries_of(change: Change, since: Since, start: int, end: int) -> list[Entry]:
     """The volumes of one comparison."""
-    found = [("all", (change.net, change.cut, change.fill), None)]
-    found += [(one.region.name, (one.net, one.cut, one.fill), one.compared) for one in change.per_region]
+    found = [("all", {"net": change.net, "cut": change.cut, "fill": change.fill}, None)]
+    found += [(one.region.name, one.volumes, one.compared) for one in change.per_region]
     return [
         Entry(since, start, end, region, what, volume, compared)
         for region, volumes, compared in found
-        for what, volume in zip(VOLUMES, volumes, strict=True)
+        for what, volume in volumes.items()
     ]
 
 
@@ -103,12 +102,13 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
     rows = series_rows(entries, names)
     write_csv(folder / "series.csv", rows)
     regions = list(dict.fromkeys(entry.region for entry in entries))
+    uneven = {region: areas for region in regions if (areas := areas_m2(entries, region))}
     numbers = {
         "command": command,
         "surveys": list(names),
         "volumes": rows,
         "closure": {region: closure(entries, region) for region in regions},
-        "different_ground_m2": {region: areas for region in regions if (areas := areas_m2(entries, region))},
+        "different_ground_m2": uneven,
     }
     write_json(folder / "series.json", numbers)
     environment = template_environment("tidefield.change")
@@ -116,9 +116,7 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
     shown = regions[:_MOST_PLOTS]
     html = environment.get_template("series.html").render(
         names=names,
-        regions=[
-            (name, draw_series(entries, names, name), _table(entries, name), areas_m2(entries, name)) for name in shown
-        ],
+        regions=[(name, draw_series(entries, names, name), _table(entries, name), uneven.get(name)) for name in shown],
         more=len(regions) - len(shown),
         steps=[(k, names[k - 1], names[k]) for k in range(1, len(names))],
         closure=closure(entries, "all"),

@@ -25,6 +25,7 @@ from tidefield.geometry.geodesy import (
     horizontal,
     metres_per_height,
     metric_system,
+    same_system,
     zero_of_heights,
 )
 
@@ -413,11 +414,6 @@ def is_local(crs: CRS) -> bool:
     return crs.type_name == "Engineering CRS"
 
 
-def same_system(one: CRS, other: CRS) -> bool:
-    """Whether two systems have the same eastings and northings."""
-    return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
-
-
 def other_zeros(earlier: Surface, later: Surface) -> str | None:
     """Name the zeros of two surfaces' heights, by their systems or else in words, if they state different ones."""
     by_system = earlier.zero, later.zero
@@ -486,12 +482,25 @@ def _metric(surface: Surface) -> CRS | None:
     """The horizontal system of a grid of true metres at a surface's middle; None where the surface has no system."""
     if surface.crs is None:
         return None
+    middle = _at(surface.transform, surface.columns / 2, surface.rows / 2)
+    return system_of_ground(surface.crs, middle, surface.path, "gdal_edit.py -a_srs")
+
+
+def system_of_ground(crs: CRS, place: tuple[float, float], path: Path, tool: str) -> CRS:
+    """The system of `metric_system` at a place.
+
+    Args:
+        path, tool: of what has that system, and what assigns another one, for the message.
+
+    Raises:
+        ChangeError: the place is outside of the system.
+    """
     try:
-        return metric_system(surface.crs, *_at(surface.transform, surface.columns / 2, surface.rows / 2))
+        return metric_system(crs, *place)
     except ProjError as error:
         raise ChangeError(
-            f"{surface.path} lies outside of {surface.crs.name} ({error}): expected coordinates of its system; assign "
-            "the right one with gdal_edit.py -a_srs"
+            f"{path} lies outside of {crs.name} ({error}): expected coordinates of its system; assign the right one "
+            f"({tool})"
         ) from error
 
 

@@ -159,8 +159,8 @@ def volume_rows(change: Change) -> list[dict[str, Any]]:
         ("all", "fill", change.fill, None),
         ("all", "net outside of the outlines", change.outside, None),
     ]
-    for region, net, cut, fill, compared in change.per_region:
-        named += [(region.name, what, one, compared) for what, one in (("net", net), ("cut", cut), ("fill", fill))]
+    for one in change.per_region:
+        named += [(one.region.name, what, volume, one.compared) for what, volume in one.volumes.items()]
     return [
         {"region": region, "volume": what, **volume.to_json(), "compared": compared}
         for region, what, volume, compared in named
@@ -251,11 +251,11 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
             [one.region.geometry for one in change.per_region],
             [
                 {
-                    "name": region.name,
-                    "compared": compared,
+                    "name": one.region.name,
+                    "compared": one.compared,
                     **{
                         f"{what}_{key}": value
-                        for what, volume in (("net", net), ("cut", cut), ("fill", fill))
+                        for what, volume in one.volumes.items()
                         for key, value in (
                             ("m3", volume.value_m3),
                             ("low_m3", volume.interval_m3[0]),
@@ -263,7 +263,7 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
                         )
                     },
                 }
-                for region, net, cut, fill, compared in change.per_region
+                for one in change.per_region
             ],
         )
     )
@@ -358,13 +358,11 @@ def summary(change: Change, command: str) -> dict[str, Any]:
         },
         "regions": [
             {
-                "name": region.name,
-                "net": net.to_json(),
-                "cut": cut.to_json(),
-                "fill": fill.to_json(),
-                "compared": compared,
+                "name": one.region.name,
+                **{what: volume.to_json() for what, volume in one.volumes.items()},
+                "compared": one.compared,
             }
-            for region, net, cut, fill, compared in change.per_region
+            for one in change.per_region
         ],
         "remarks": change.remarks,
     }

@@ -78,7 +78,7 @@ class LocalFrame:
         elif system.is_projected and in_metres(system):
             with suppress(ProjError):  # below, the origin is refused
                 metric = metric_system(system, origin[0], origin[1])
-                products = system if metric.equals(horizontal(system), ignore_axis_order=True) else metric
+                products = system if same_system(metric, system) else metric
         name = _name(products)
         heights = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
         frame = cls(0.0, 0.0, 0.0, name, heights)
@@ -311,6 +311,11 @@ def metric_system(crs: CRS, x: float, y: float) -> CRS:
 def in_metres(crs: CRS) -> bool:
     """Return whether the first axis of a system counts metres."""
     return abs(crs.axis_info[0].unit_conversion_factor - 1) < 1e-9
+
+
+def same_system(one: CRS, other: CRS) -> bool:
+    """Return whether two systems have the same eastings and northings."""
+    return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
 
 
 def horizontal(crs: CRS) -> CRS:

@@ -146,10 +146,7 @@ def map_frame(scene: Scene, georeference: Georeference | None, heights: str | No
 
 def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS | None:
     """The vertical system that is stated or given, or that has the datum's name; None where there is none."""
-    names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
-    # Scenes have heights in metres, whatever system their control was in.
-    datum = _IN_FEET.sub("", datum) if stated is None else datum
-    known = CRS.from_epsg(int(names[datum])) if stated is None and datum in names else stated
+    known = _named(datum) if stated is None else stated
     if given is not None:
         try:
             crs = CRS.from_user_input(given)
@@ -173,6 +170,14 @@ def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS |
             )
         return crs
     return known
+
+
+def _named(datum: str) -> CRS | None:
+    """EPSG's vertical system in metres of a name; scenes have heights in metres, whatever their control was in."""
+    names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
+    code = names.get(_IN_FEET.sub("", datum))
+    found = None if code is None else CRS.from_epsg(int(code))
+    return found if found is not None and in_metres(found) else None
 
 
 def _datum_name(vertical: CRS) -> str:

@@ -209,13 +209,12 @@ def prepare(
         )
         registered = set(models[0])
         placed = [photograph for photograph in good.photographs if photograph.name in registered]
-        has_masks = any(photograph.mask is not None or photograph.has_alpha for photograph in placed)
         correction = stages.run(
             "images",
             {"colour": colour},
             [
                 *(images / photograph.name for photograph in placed),
-                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if has_masks),
+                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if _have_masks(placed)),
                 *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
                 *([scene / HOLDOUT_FILE] if holdout else []),
             ],
@@ -388,7 +387,7 @@ def write_scene(
     cameras = [camera_of[photograph.name] for photograph in photographs]
     with ProgressBar(console, "Writing photographs") as bar:
         write_images(photographs, images, None, cameras, bar)
-    masks = any(photograph.mask is not None or photograph.has_alpha for photograph in photographs)
+    masks = _have_masks(photographs)
     if masks:
         write_masks(photographs, scene / "masks")
     correction = None
@@ -430,6 +429,11 @@ def _fingerprint(survey: Survey) -> list:
         position, lens = repr(photograph.position), repr(photograph.lens)
         fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens])
     return fingerprint
+
+
+def _have_masks(photographs: Sequence[Photograph]) -> bool:
+    """Whether a photograph is masked or transparent, so that all get a mask in the scene."""
+    return any(photograph.mask is not None or photograph.has_alpha for photograph in photographs)
 
 
 def _masks_fingerprint(survey: Survey) -> list:

@@ -21,11 +21,11 @@ from PIL import Image
 
 from tidefield.change.errors import Variogram, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import Surface, date_in, is_local, open_surface, same_system
+from tidefield.change.surfaces import Surface, date_in, is_local, open_surface, system_of_ground
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
-from tidefield.geometry.geodesy import in_metres, metric_system
+from tidefield.geometry.geodesy import in_metres, same_system
 from tidefield.maps.grid import LOCAL_NAME
 from tidefield.maps.rasters import need
 
@@ -416,20 +416,13 @@ class Atlas:
 def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     """A sheet's system; a UTM zone where that is in degrees, or in metres that are shorter on the ground."""
     from pyproj import CRS
-    from pyproj.exceptions import ProjError
 
     own = CRS.from_wkt(crs.to_wkt())
     if is_local(own) or not (own.is_geographic or (own.is_projected and in_metres(own))):
         return crs
     with _opened(sheet.layers[0].source) as file:
         west, south, east, north = file.bounds
-    try:
-        metric = metric_system(own, (west + east) / 2, (south + north) / 2)
-    except ProjError as error:
-        raise RunError(
-            f"{sheet.folder} lies outside of {own.name} ({error}): expected coordinates of its system; assign the "
-            "right one (gdal_edit.py -a_srs)"
-        ) from error
+    metric = system_of_ground(own, ((west + east) / 2, (south + north) / 2), sheet.folder, "gdal_edit.py -a_srs")
     return crs if same_system(metric, own) else type(crs).from_wkt(metric.to_wkt())
 
 

@@ -31,10 +31,10 @@ Keypoints = Float32[np.ndarray, "K 4"]
 Descriptors = UInt8[np.ndarray, "K 128"]
 
 DEFAULT_FOCAL = 1.2
-_SAME_FOCAL = 0.02
-"""Share by which priors of one lens differ at most: a digital zoom changes them by more."""
 """Focal length in widths of the photograph where no prior exists: COLMAP's default. A fisheye's is that of 180 degrees
 along the diagonal."""
+_SAME_FOCAL = 0.02
+"""Share by which priors of one lens differ at most: a digital zoom changes them by more."""
 LensKind = Literal["pinhole", "fisheye"]
 """What the lens model of a survey starts from: COLMAP's OPENCV, or its OPENCV_FISHEYE."""
 
@@ -117,18 +117,16 @@ def lens_groups(photographs: Sequence[Photograph]) -> list[int]:
     Sensors that were turned have their principal point on another side; a photograph that the drone undistorted has
     another lens than its others; and a digital zoom changes the focal length in pixels alone.
     """
-    focal_px: list[float] = []
-    numbers: dict[Any, list[int]] = {}
+    lenses: list[tuple[Any, float]] = []
     found = []
     for p in photographs:
         focal_mm, distortion = None if np.isnan(p.focal_mm) else p.focal_mm, p.lens and p.lens.distortion
         kind = p.camera, p.serial, p.width, p.height, p.orientation, focal_mm, distortion
         own = p.lens.focal_px if p.lens else 0.0
-        same = (k for k in numbers.get(kind, []) if abs(own - focal_px[k]) <= _SAME_FOCAL * own)
-        number = next(same, len(focal_px))
-        if number == len(focal_px):
-            focal_px.append(own)
-            numbers.setdefault(kind, []).append(number)
+        alike = (k for k, (other, px) in enumerate(lenses) if other == kind and abs(own - px) <= _SAME_FOCAL * own)
+        number = next(alike, len(lenses))
+        if number == len(lenses):
+            lenses.append((kind, own))
         found.append(number)
     return found
 
