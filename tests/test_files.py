@@ -254,3 +254,13 @@ def test_what_a_killed_process_left_is_deleted_whatever_stage_it_was_in(tmp_path
         (tmp_path / name).touch()
     delete_partials(tmp_path / "dsm.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
+
+
+def test_what_a_killed_command_has_left_of_a_folder_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    (tmp_path / ".scene-0123abcd.partial").mkdir()
+    (tmp_path / ".other-0123abcd.partial").mkdir()
+    with completed_folder(tmp_path / "scene"):
+        pass
+    (message,) = caplog.messages
+    assert ".scene-0123abcd.partial: left by a command that was killed" in message
+    assert (tmp_path / ".scene-0123abcd.partial").is_dir(), "another process may be writing to it"

@@ -19,7 +19,7 @@ from glob import escape
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from tidefield.errors import RunError
+from tidefield.errors import RunError, list_names
 
 if sys.platform == "win32":
     import msvcrt
@@ -271,6 +271,8 @@ def completed_folder(path: Path) -> Iterator[Path]:
         RunError: `path` is there already, or the folder that it would be in cannot be written to.
     """
     refuse_existing(path, replaceable=False)
+    if left := sorted(path.parent.glob(f".{escape(path.name)}-????????.partial")):
+        log.warning(f"{list_names(list(map(str, left)))}: left by a command that was killed, unless one still runs")
     partial = path.with_name(f".{path.name}-{secrets.token_hex(4)}.partial")
     try:
         with writing_to(path):

@@ -153,6 +153,26 @@ def test_points_without_names_are_those_of_their_positions(scene: Scene, frame: 
     ]
 
 
+def test_a_name_may_have_spaces(scene: Scene, frame: MapFrame, tmp_path: Path):
+    (tmp_path / "check.txt").write_text("EPSG:27700\n1 2 3 GCP 1\n4 5 6\tGCP 2\n")
+    assert [p.name for p in read_check_points(tmp_path / "check.txt", scene, frame)] == ["GCP 1", "GCP 2"]
+
+
+@pytest.mark.parametrize(("crs", "refused"), [("EPSG:27700+5701", True), ("EPSG:27700", False), ("EPSG:4979", False)])
+def test_heights_over_a_geoid_do_not_check_a_map_over_the_ellipsoid(
+    scene: Scene, tmp_path: Path, crs: str, refused: bool
+):
+    local = LocalFrame.at("EPSG:27700", (351200.0, 512900.0, 260.0), "the WGS 84 ellipsoid")
+    wkt = parse_crs(local.crs).to_wkt()
+    frame = replace(map_frame(scene, None), frame=local, heights=local.vertical_datum, wkt=wkt)
+    (tmp_path / "check.txt").write_text(f"{crs}\n1 2 3 peg\n")
+    if refused:
+        with pytest.raises(RunError, match="those of the map over the WGS 84 ellipsoid: expected one zero"):
+            read_check_points(tmp_path / "check.txt", scene, frame)
+    else:
+        assert len(read_check_points(tmp_path / "check.txt", scene, frame)) == 1
+
+
 def test_a_point_at_two_positions_is_refused(scene: Scene, frame: MapFrame, tmp_path: Path):
     (tmp_path / "check.txt").write_text("EPSG:27700\n1 2 3 peg\n1 2 4 peg\n")
     with pytest.raises(RunError, match="expected one position per point"):
@@ -191,11 +211,24 @@ def test_each_point_checks_once_and_those_that_were_fitted_to_do_not(
     own = replace(scene, root=tmp_path)
     write_check_points(control(scene), tmp_path)
     (tmp_path / "again.txt").write_text((tmp_path / CHECK_FILE).read_text() + "351201 512902 260.3 G3\n")
-    assert [p.name for p in all_check_points(own, frame, None, ())] == ["CHK1", "chk 2"]
-    assert [p.name for p in all_check_points(own, frame, tmp_path / "again.txt", ())] == ["CHK1", "chk 2", "G3"]
-    assert [p.name for p in all_check_points(own, frame, tmp_path / "again.txt", ("G3",))] == ["CHK1", "chk 2"]
+
+    def found(given: Path | None, *fitted: str, at: tuple[float, ...] | None = None) -> list[str]:
+        world = np.empty((0, 3)) if at is None else FRAME.from_crs(np.array([at]))
+        residuals, none = Residuals(fitted, np.zeros((len(fitted), 3))), Residuals()
+        itself = Similarity(1.0, np.eye(3), np.zeros(3))
+        located = Georeference(FRAME, "ground control", itself, none, residuals, none, (), (), world)
+        located.write(tmp_path)
+        return [point.name for point in all_check_points(own, frame, given, read_georeference(tmp_path))]
+
+    again = tmp_path / "again.txt"
+    assert found(None) == ["CHK1", "chk 2"]
+    assert found(again) == ["CHK1", "chk 2", "G3"]
+    assert found(again, "G3") == ["CHK1", "chk 2"]
     assert "the scene was fitted to G3" in caplog.text
-    assert all_check_points(own, map_frame(scene, None), None, ()) == []
+    # A peg is known by its place, too: names are not the same in all lists.
+    assert found(again, "point 1", at=(351201.004, 512902.0, 260.31)) == ["CHK1", "chk 2"]
+    assert found(again, "point 1", at=(351201.04, 512902.0, 260.3)) == ["CHK1", "chk 2", "G3"]
+    assert all_check_points(own, map_frame(scene, None), None, None) == []
     assert "is not georeferenced" in caplog.text
 
 

@@ -180,6 +180,20 @@ def refusal(crs: str, x: float, y: float, here: tuple[float, float] = HERE) -> s
     return str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("here", "mistake"),
+    [
+        ((-HERE[0], HERE[1]), "the sign of their longitudes were the other"),
+        ((HERE[0], -HERE[1]), "the sign of their latitudes were the other"),
+        ((HERE[1], HERE[0]), "their latitudes and longitudes were exchanged"),
+    ],
+)
+def test_photographs_with_mirrored_positions_are_at_fault_and_not_the_control(here, mistake):
+    message = refusal("EPSG:27700", 351139.0, 512875.0, here)
+    assert f"the photographs would be there if {mistake}; correct their positions" in message
+    assert "correct the control file" not in message
+
+
 def test_control_of_the_same_site_is_accepted():
     refuse_elsewhere(Control("EPSG:27700", {"G1": (351139.0, 512875.0, 264.0)}, ()), *HERE)
 

@@ -24,6 +24,7 @@ from located_surveys import (
     with_control,
 )
 
+from tidefield.data.georeference import Georeference
 from tidefield.errors import SurveyError
 from tidefield.survey.georeference import bundle_adjustment
 from tidefield.survey.georeference.georeference import georeference
@@ -457,3 +458,42 @@ def test_positions_of_ordinary_receivers_correct_the_distortion_that_bows_a_larg
     off = np.array([centres[p.name] for p in flight.survey.photographs]) - flight.centres_world
     assert np.std(off[:, 2]) < 0.2
     assert bowed.cameras[1].params == pytest.approx([FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], abs=1e-3)
+
+
+def off_truth(flight: Flight, survey: Survey) -> tuple[np.ndarray, Georeference]:
+    """How far cameras are from where they were, after georeferencing."""
+    model, found = located(flight, survey)
+    assert found.frame is not None
+    centres, truth = camera_centres(model), found.frame.from_crs(FRAME.to_crs(flight.centres_world))
+    return np.array([centres[name_of(i)] for i in range(len(truth))]) - truth, found
+
+
+def test_control_in_one_corner_does_not_turn_what_differential_positions_have_placed():
+    flight = fly(lines=4, each=20, position_m=0.015)
+    corner = np.array([[-140.0, -30], [-121, -28], [-139, -11], [-122, -9]])
+    control, generator = with_control(flight, corner).control, np.random.default_rng(3)
+    assert control is not None
+    noisy = {name: tuple(np.array(xyz) + 0.02 * generator.normal(size=3)) for name, xyz in control.points.items()}
+    survey = replace(flight.survey, control=replace(control, points=noisy))
+    off, found = off_truth(flight, survey)
+    assert np.abs(off[:, 2]).max() > 0.3, "control alone turns the survey"
+    off, found = off_truth(flight, differential(survey))
+    assert np.abs(off[:, :2]).max() < 0.03
+    assert np.abs(off[:, 2]).max() < 0.06
+    assert found.source == "ground control"
+    assert "keeps the shape that the positions gave it" in found.notes[-1]
+    assert found.check.names == ("G1", "G2", "G3", "G4")
+    assert found.check.rms_m > found.control.rms_m
+    assert len(found.control_world) == 4
+
+
+def test_a_wrong_point_neither_moves_nor_reshapes_what_differential_positions_have_placed():
+    flight = fly(lines=4, each=7, position_m=0.015)
+    control = with_control(flight, CONTROL[:4]).control
+    assert control is not None
+    x, y, z = control.points["G2"]
+    survey = replace(flight.survey, control=replace(control, points={**control.points, "G2": (x + 1.0, y, z)}))
+    off, found = off_truth(flight, differential(survey))
+    assert any(item.name.startswith("G2") for item in found.left_out)
+    assert np.abs(off).max() < 0.1
+    assert np.abs(off.mean(0)).max() < 0.05

@@ -26,6 +26,7 @@ from scenes_on_disk import (
     write_transforms,
 )
 
+from tidefield.change.views import Site
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.posed import Observations
@@ -244,6 +245,29 @@ def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
     assert not (tmp_path / "a" / "georeference.json").exists()
 
 
+def test_a_project_lies_where_the_scene_that_is_imported_of_it_does(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    (tmp_path / "project" / "reference_lla.json").write_text('{"latitude": 4.5, "longitude": -3.0, "altitude": 2.0}')
+    import_project(tmp_path / "project", tmp_path / "imported")
+    project, imported = (
+        Site.of(load_scene(tmp_path / name, cache=tmp_path / "cache"), lambda *_: None).frame
+        for name in ("project", "imported")
+    )
+    assert "UTM zone 30N" in project.wkt
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 6.0]])
+    np.testing.assert_allclose(project.to_map(points), imported.to_map(points), rtol=0, atol=1e-6)
+
+
+def test_a_scene_that_prepare_has_not_finished_is_not_imported(tmp_path: Path) -> None:
+    write_project(tmp_path / "project")
+    import_project(tmp_path / "project", tmp_path / "a")
+    (tmp_path / "a" / "prepare").mkdir()
+    (tmp_path / "a" / "prepare" / "stages.json").write_text('{"images": {"done": false}}')
+    with pytest.raises(SceneError, match="is not prepared to its end"):
+        import_project(tmp_path / "a", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
 @pytest.mark.parametrize("undistort", [False, True])
 def test_check_points_are_imported_with_their_marks_in_the_written_photographs(tmp_path: Path, undistort: bool) -> None:
     write_project(tmp_path / "project", "radial")
@@ -383,6 +407,20 @@ def test_masks_are_imported_in_the_places_where_colmap_and_nerfstudio_look(tmp_p
         assert torch.equal(ours.photographs.used(i), theirs.photographs.used(i))
         assert torch.equal(by_path.photographs.used(i), theirs.photographs.used(i))
     assert not theirs.photographs.used(theirs.index(truth.names[0])).all()
+
+
+def test_masks_are_reduced_with_their_photographs(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "theirs", truth := survey(BARREL))
+    used = np.full((48, 64), 255, dtype=np.uint8)
+    used[:, :21] = 0
+    (tmp_path / "theirs" / "masks" / "strip_0").mkdir(parents=True)
+    Image.fromarray(used).save(tmp_path / "theirs" / "masks" / f"{truth.names[0]}.png")
+    import_project(tmp_path / "theirs", tmp_path / "ours", downscale=(2,))
+    for k, name in enumerate(truth.names):
+        with Image.open(tmp_path / "ours" / "masks_2" / f"{name}.png") as mask:
+            assert mask.size == (32, 24)
+            row = np.where((k == 0) & (np.arange(32) < 11), 0, 255)
+            np.testing.assert_array_equal(np.array(mask), np.tile(row, (24, 1)))
 
 
 def test_a_fisheye_stays_one_for_colmap_and_nerfstudio(tmp_path: Path) -> None:

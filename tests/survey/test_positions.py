@@ -477,7 +477,7 @@ def test_positions_that_proj_converts_to_metres_only_are_remarked(tmp_path, monk
             ),
         )
 
-    monkeypatch.setattr("tidefield.survey.io.positions.TransformerGroup", lambda *_, **__: Group())
+    monkeypatch.setattr("tidefield.geometry.geodesy.TransformerGroup", lambda *_, **__: Group())
     text = "EPSG:27700\nDJI_0001.JPG 351139.7 512875.7 264.3\n"
     _, remarks = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
     assert any("converted to WGS 84 to 2 m only, because PROJ lacks grid.tif: install it" in r for r in remarks)

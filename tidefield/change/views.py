@@ -19,7 +19,7 @@ from tidefield.change.kinds import GAINED, HIGHER, LOST, LOWER, UNKNOWN, View, c
 from tidefield.change.light import light_gains, with_light
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import ChangeError, Grid
-from tidefield.data.georeference import read_georeference
+from tidefield.data.georeference import find_georeference
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.geometry.geodesy import LocalFrame
@@ -43,7 +43,7 @@ class Site:
 
     @classmethod
     def of(cls, scene: Scene, render: Render) -> Site:
-        return cls(scene, render, map_frame(scene, read_georeference(scene.root)))
+        return cls(scene, render, map_frame(scene, find_georeference(scene.root, scene.reference)))
 
 
 def carried(

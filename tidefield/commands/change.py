@@ -34,7 +34,7 @@ class Change:
     """Measure what changed between two surveys: what was eroded, what grew, and how sure that is.
 
     OUT is a new folder: change.html (the report), change.tif (difference, its standard error, p-value and
-    systematic error), significant.tif, change.gpkg (outlines, stable ground), volumes.csv, outlines.csv and
+    systematic error), significant.tif, change.gpkg (outlines, stable ground and more), volumes.csv, outlines.csv and
     change.json. All volumes have 95% intervals from the random, the spatially correlated and the systematic part of the
     error, which are measured over stable ground. Where both surveys have orthophotos, plants gained and lost are
     reported, too (cover.tif, cover.csv); with --scenes the same places then and now are in views, as pictures, a page
@@ -260,7 +260,7 @@ def _say(found: Found, console: Console) -> None:
         console.print(
             f"{name}: {volume.value_m3:+,.1f} m3 (95%: {low:+,.1f} to {high:+,.1f}) on {volume.area_m2:,.0f} m2; "
             f"sigma: random {volume.random_m3:,.1f}, correlated {volume.correlated_m3:,.1f}, systematic "
-            f"{volume.systematic_m3:,.1f}",
+            f"{volume.systematic_m3:,.1f}, choice {volume.choice_m3:,.1f}",
             soft_wrap=True,
         )
     console.print(
@@ -317,7 +317,7 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
     from tidefield.addresses import pull
     from tidefield.change.views import require_both_placed
     from tidefield.config import Config, NerfConfig
-    from tidefield.data.georeference import read_georeference
+    from tidefield.data.georeference import find_georeference
     from tidefield.data.load import read_posed
     from tidefield.device import choose_device
     from tidefield.geometry.cameras import find_name
@@ -333,10 +333,10 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
         roots.append(path if run is None else run.scene)
     for root in roots:
         pull(root)
-    georeferences = [read_georeference(root) for root in roots]
+    posed = [read_posed(root, allow_missing=False) for root in roots]
+    georeferences = [find_georeference(root, each.reference) for root, each in zip(roots, posed, strict=True)]
     require_both_placed(*(None if known is None else known.frame for known in georeferences))
-    earlier, _ = (read_posed(root, allow_missing=False) for root in roots)
-    found = [find_name(name, earlier.names, str(roots[0])) for name in cameras]
+    found = [find_name(name, posed[0].names, str(roots[0])) for name in cameras]
     if len(set(found)) < len(found):
         raise RunError("--cameras names a photograph twice: expected each once; leave one out")
 

@@ -42,7 +42,8 @@ Downscale = Annotated[
     tuple[int, ...],
     arg(
         metavar="[N [N ...]]",
-        help="Also write the photographs at an Nth of their size, as images_N, which nerfstudio and gsplat open.",
+        help="Also write the photographs at an Nth of their size, as images_N (masks as masks_N), which nerfstudio and "
+        "gsplat open.",
     ),
 ]
 
@@ -79,6 +80,13 @@ class ZeroShot:
     @property
     def network(self) -> Preset:
         return self.preset or "swift"
+
+    @property
+    def words(self) -> list[str]:
+        """These options as words of a command line, without the folder of the weights."""
+        words = ["--zero-shot"] if self.zero_shot else []
+        words += [] if self.preset is None else ["--preset", self.preset]
+        return words + ([] if self.weights is None else ["--weights", self.weights.name])
 
     def checked(self) -> ZeroShot:
         """These options.

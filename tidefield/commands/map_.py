@@ -125,7 +125,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
     """What a map is made of, the method while the block lasts, and the record of its source."""
     from shapely import union_all
 
-    from tidefield.data.georeference import read_georeference
+    from tidefield.data.georeference import find_georeference
     from tidefield.data.load import at_width
     from tidefield.device import choose_device
     from tidefield.maps.area import bounds_of, read_shapes
@@ -139,7 +139,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
         render,
         record,
     ):
-        georeference = read_georeference(scene.root)
+        georeference = find_georeference(scene.root, scene.reference)
         frame = map_frame(scene, georeference, options.heights)
         area, interval = None, options.contours and options.contours * frame.metre_up
         if options.area is not None:
@@ -148,8 +148,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, bounds_of(area))
         lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
-        control = () if georeference is None else georeference.control.names
-        points = all_check_points(full, frame, options.check, control)
+        points = all_check_points(full, frame, options.check, georeference)
         job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)
         yield job, render, {"scene": scene.root.resolve().name, "method": record}
 

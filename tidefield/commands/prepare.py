@@ -73,7 +73,7 @@ def prepare(options: Prepare, console: Console) -> None:
     if options.control is not None and options.no_control:
         raise RunError("both --control and --no-control are given: expected one of them; leave one out")
     set_up_pycolmap(options.verbosity.verbose)
-    features = FeatureOptions(options.feature_width, options.features)
+    features, device = FeatureOptions(options.feature_width, options.features), choose_device(options.device)
     survey = read_survey(
         options.photographs,
         options.gps,
@@ -87,7 +87,7 @@ def prepare(options: Prepare, console: Console) -> None:
         survey,
         options.scene,
         features,
-        choose_device(options.device),
+        device,
         console,
         lens=options.lens,
         keep_all=options.keep_all,

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from tidefield.data.readers.files import number, numbers, parsing, read_json
+from tidefield.data.readers.posed import Reference
 from tidefield.files import completed_file
-from tidefield.geometry.geodesy import LocalFrame
+from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.similarity import Similarity
 
 FILE_NAME = "georeference.json"
@@ -109,6 +110,7 @@ class Georeference:
         check: of the control points, each after an adjustment without it. This is the accuracy to rely on.
         left_out: rejected observations.
         notes: further sentences for the surveyor.
+        control_world: surveyed coordinates of all control points that the scene was fitted to.
     """
 
     frame: LocalFrame | None
@@ -119,6 +121,7 @@ class Georeference:
     check: Residuals
     left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...]
+    control_world: Float64[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def gps_used(self) -> Residuals:
@@ -148,6 +151,7 @@ class Georeference:
             "residuals": {kind: residuals.to_json() for kind, residuals in kinds.items()},
             "left_out": [asdict(item) for item in self.left_out],
             "notes": list(self.notes),
+            "control_world": self.control_world.tolist(),
         }
         with completed_file(folder / FILE_NAME, overwrite=True) as partial:
             partial.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -173,6 +177,31 @@ def read_georeference(folder: Path) -> Georeference | None:
         return _from_json(values, path)
 
 
+def find_georeference(folder: Path, reference: Reference | None) -> Georeference | None:
+    """Where a scene is: by its `georeference.json`, else by another program's project; None where neither says.
+
+    Args:
+        folder: of the scene.
+        reference: the origin that the project states, in metres east, north and up of which its poses are.
+
+    Raises:
+        SceneError: `georeference.json` is damaged, or of a later version.
+    """
+    located = read_georeference(folder)
+    if located is not None or reference is None:
+        return located
+    return Georeference(
+        frame=LocalFrame.at(WGS84, (reference.longitude_deg, reference.latitude_deg, reference.height_m)),
+        source="project",
+        world_from_model=Similarity(1.0, np.eye(3), np.zeros(3)),
+        gps=Residuals(),
+        control=Residuals(),
+        check=Residuals(),
+        left_out=(),
+        notes=("The origin is that of another program's project; its accuracy is unknown.",),
+    )
+
+
 def _from_json(values: dict[str, Any], path: Path) -> Georeference:
     if values["source"] not in get_args(Source):
         raise ValueError(f"its source is {values['source']!r}")
@@ -191,6 +220,9 @@ def _from_json(values: dict[str, Any], path: Path) -> Georeference:
         world_from_model=world_from_model,
         left_out=tuple(LeftOut(item["kind"], str(item["name"]), str(item["reason"])) for item in values["left_out"]),
         notes=tuple(str(note) for note in values["notes"]),
+        control_world=np.array(
+            [numbers({"point": point}, "point", path, (3,)) for point in values.get("control_world", [])]
+        ).reshape(-1, 3),
         **residuals,
     )
 

@@ -130,9 +130,7 @@ def load_scene(
     """
     root = Path(root)
     require_width(width)
-    if not unfinished:
-        _require_finished(root)
-    posed = read_posed(root, allow_missing)
+    posed = read_posed(root, allow_missing, unfinished)
     files = []
     masks = posed.masks or (None,) * len(posed.names)
     for path, lens, mask in zip(posed.paths, posed.lenses, masks, strict=True):
@@ -170,6 +168,7 @@ def load_scene(
         origin_world=torch.from_numpy(origin),
         background_rgb=posed.background_rgb or (_WHITE if transparent else None),
         hull=hull,
+        reference=posed.reference,
     )
 
 
@@ -312,17 +311,21 @@ def require_width(width: int | None) -> None:
         raise SceneError(f"the width is {width} pixels: expected at least {_SMALLEST_WIDTH}; choose a larger --width")
 
 
-def read_posed(root: Path, allow_missing: bool) -> PosedPhotographs:
+def read_posed(root: Path, allow_missing: bool, unfinished: bool = False) -> PosedPhotographs:
     """Read the poses and lenses of a folder's photographs, sorted by their names, without decoding them.
 
     Args:
         root: a folder in one of `LAYOUTS`; a COLMAP model is preferred where there are several, with the split of a
             transforms.json next to it.
         allow_missing: leave out photographs whose files are missing, instead of raising an error.
+        unfinished: read a scene that `tidefield prepare` has not finished.
 
     Raises:
-        SceneError: the folder is not a scene, is damaged, names a photograph twice, or has fewer than three.
+        SceneError: the folder is not a scene, is damaged, has not been prepared to its end, names a photograph twice,
+            or has fewer than three.
     """
+    if not unfinished:
+        _require_finished(root)
     with reading(root):
         posed = _read(root, allow_missing)
         _refuse_repeated(posed, root)
@@ -413,10 +416,11 @@ def is_scene(root: Path) -> bool:
 
 def _refuse_repeated(posed: PosedPhotographs, root: Path) -> None:
     """Refuse a photograph with two poses, of which one could be held out and the other be trained on."""
-    names: dict[tuple[int, int], str] = {}
+    names: dict[tuple[int, int] | Path, str] = {}
     for path, name in zip(posed.paths, posed.names, strict=True):
         status = path.stat()
-        file = status.st_dev, status.st_ino  # the same for all names and links of a file
+        # The number is the same for all names and links of a file, but 0 where a file system has none.
+        file = (status.st_dev, status.st_ino) if status.st_ino else path.resolve()
         if file in names:
             raise SceneError(
                 f"{root} has two poses for one photograph ({names[file]} and {name}): expected each photograph once; "

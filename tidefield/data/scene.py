@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tidefield.data.hull import Hull
 from tidefield.data.images import Photographs
+from tidefield.data.readers.posed import Reference
 from tidefield.geometry.cameras import Cameras, describe_sizes, find_name
 
 
@@ -69,6 +70,7 @@ class Scene:
         origin_world: what was subtracted, once and in float64, from the coordinates on disk.
         background_rgb: the background colour of photographs with alpha; None for real photographs.
         hull: the visual hull of the object; None without alpha.
+        reference: the geographic origin of another program's project, where it states one.
     """
 
     root: Path
@@ -81,6 +83,7 @@ class Scene:
     origin_world: Float[Tensor, "3"]
     background_rgb: tuple[float, float, float] | None = None
     hull: Hull | None = None
+    reference: Reference | None = None
 
     def __post_init__(self) -> None:
         if self.cameras.names != self.names:

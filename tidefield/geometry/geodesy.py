@@ -15,6 +15,7 @@ Longitude, easting and x come before latitude, northing and y, whatever a system
 
 from __future__ import annotations
 
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -27,11 +28,16 @@ from pyproj.crs import ProjectedCRS
 from pyproj.crs.coordinate_operation import UTMConversion
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
+
+from tidefield.errors import list_names
 
 WGS84 = "EPSG:4326"
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius, for distances on a sphere that may be wrong by half a per cent."""
 FOOT_M, US_SURVEY_FOOT_M = 0.3048, 1200 / 3937
+_CENTIMETRES = 0.1
+"""Metres. Conversions between systems of one plate are as accurate as this at best."""
 _TRUE_AREA = 0.01
 """By how much areas on a map may differ from those on the ground; lengths in one direction may by twice as much."""
 _NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")
@@ -316,6 +322,27 @@ def in_metres(crs: CRS) -> bool:
 def same_system(one: CRS, other: CRS) -> bool:
     """Return whether two systems have the same eastings and northings."""
     return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
+
+
+def lost_in_conversion(crs: CRS, target: CRS) -> str | None:
+    """What a conversion of plane coordinates lacks where PROJ has not the grid of the best one, which is metres then.
+
+    Returns:
+        The end of a sentence about what is converted; None if nothing is lost.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # which is what the sentence says
+        group = TransformerGroup(horizontal(crs), horizontal(target), always_xy=True)
+    if group.best_available or not group.transformers or not group.unavailable_operations:
+        return None
+    best, used = group.unavailable_operations[0], group.transformers[0]
+    grids = [grid.short_name or grid.full_name for grid in best.grids if not grid.available]
+    if not grids or not used.accuracy > max(_CENTIMETRES, best.accuracy):
+        return None
+    return (
+        f"in {horizontal(crs).name} are converted to {horizontal(target).name} to {used.accuracy:g} m only, because "
+        f"PROJ lacks {list_names(grids)}: install it (`projsync --file {grids[0]}`, or PROJ_NETWORK=ON)"
+    )
 
 
 def horizontal(crs: CRS) -> CRS:

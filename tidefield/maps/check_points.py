@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from tidefield.data.georeference import Georeference
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SurveyError, list_names
 from tidefield.geometry.geodesy import parse_crs, zero_of_heights
@@ -29,6 +30,9 @@ log = logging.getLogger(__name__)
 
 ENOUGH = 30
 """Fewest check points for a statement of accuracy (ASPRS, Positional Accuracy Standards, edition 2, 2023)."""
+_ELLIPSOID = "ellipsoid"
+_SAME_PEG_M = 0.02
+"""Two points are not surveyed nearer to each other, and one that is rounded or converted is not farther off."""
 _SAME = 0.001
 """Metres between positions of one point in two files, at most."""
 _EXPECTED = "expected `x y z name` or `x y z px py image [name]`"
@@ -71,11 +75,14 @@ class Checked:
         return np.append((self.found - self.point.surveyed)[:2], self.height - self.point.surveyed[2])
 
 
-def all_check_points(scene: Scene, frame: MapFrame, given: Path | None, control: Sequence[str]) -> list[CheckPoint]:
+def all_check_points(
+    scene: Scene, frame: MapFrame, given: Path | None, georeference: Georeference | None
+) -> list[CheckPoint]:
     """Read the check points of the scene's own file and of the one that is given, each of them once.
 
     Args:
-        control: names of the points that the scene was fitted to, which check nothing.
+        georeference: of the scene, which knows the points that it was fitted to: these check nothing, whatever they are
+            called.
 
     Raises:
         RunError: as `read_check_points`.
@@ -88,10 +95,13 @@ def all_check_points(scene: Scene, frame: MapFrame, given: Path | None, control:
         )
     elif own.is_file():
         found = read_check_points(own, scene, frame)
-    fitted = []
+    fitted, names = [], () if georeference is None else georeference.control.names
+    pegs = np.empty((0, 3)) if georeference is None else georeference.control_world
+    on_map = frame.to_map(pegs - frame.origin_world)[:, :2]
     for point in [] if given is None else read_check_points(given, scene, frame):
         same = (np.abs(point.surveyed - other.surveyed).max() < _SAME * frame.metre for other in found)
-        if point.name in control:
+        away = np.linalg.norm(on_map - point.surveyed[:2], axis=1)
+        if point.name in names or (away < _SAME_PEG_M * frame.metre).any():
             fitted.append(point.name)
         elif not any(same):
             found.append(point)
@@ -123,7 +133,7 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
             if len(numbers) < 3 or not all(map(math.isfinite, numbers)) or len(cells) < 4:
                 raise SurveyError(f"{where} is {line[:80]!r}: {_EXPECTED}; correct it")
             pixel = leading_numbers(cells[3:5])
-            place, photograph, words = tuple(numbers), None, cells[-1:]
+            place, photograph, words = tuple(numbers), None, [" ".join(cells[3:])]
             if len(pixel) == 2 and len(cells) > 5:
                 rest = line.split(maxsplit=5)[5]
                 photograph, words = names.split(rest)
@@ -159,6 +169,8 @@ def _require_one_zero(path: Path, crs: str, frame: MapFrame) -> None:
     zero, own = zero_of_heights(parse_crs(crs)), zero_of_heights(parse_crs(frame.wkt))
     if zero is None:
         return
+    if own is None and _ELLIPSOID in frame.heights:
+        own = zero if _ELLIPSOID in zero else frame.heights  # of whichever name
     if own is None:
         log.warning(
             f"heights in {path.name} are over {zero}, those of the map: {frame.heights}; the mean error has both"

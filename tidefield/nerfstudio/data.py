@@ -24,7 +24,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from PIL import Image
 
 from tidefield.data.cache import cache_folder
-from tidefield.data.georeference import read_georeference
+from tidefield.data.georeference import find_georeference
 from tidefield.data.load import own_lens, read_posed
 from tidefield.data.triangulate import triangulate_again
 from tidefield.files import completed_file, write_json
@@ -41,9 +41,11 @@ class SceneOutputs(DataparserOutputs):
 
     Attributes:
         georeference: frame of the scene's coordinates as they are on disk (`LocalFrame.to_json`); None if unknown.
+        origin: what was subtracted from these, of which `dataparser_transform` has single precision only.
     """
 
     georeference: dict[str, Any] | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def save_dataparser_transform(self, path: Path) -> None:
         """Write `transform` and `scale`, as nerfstudio does, and the `georeference`.
@@ -52,7 +54,8 @@ class SceneOutputs(DataparserOutputs):
         """
         super().save_dataparser_transform(path)
         values = json.loads(path.read_text(encoding="utf-8"))
-        write_json(path, {**values, "georeference": self.georeference})
+        transform = np.column_stack([np.eye(3), -np.array(self.origin)]).tolist()
+        write_json(path, {**values, "transform": transform, "georeference": self.georeference})
 
 
 @dataclass
@@ -88,7 +91,7 @@ class SceneParser(DataParser):
         lenses = [own_lens(posed.paths[i], posed.lenses[i])[0] for i in chosen]
         masks = posed.masks and [posed.masks[i] for i in chosen]
         reach = radius * scale
-        georeference = read_georeference(root)
+        georeference = find_georeference(root, posed.reference)
         frame = None if georeference is None else georeference.frame
         metadata: dict[str, Any] = {"root": root}
         if points is not None:
@@ -108,6 +111,7 @@ class SceneParser(DataParser):
             dataparser_transform=torch.from_numpy(np.concatenate([np.eye(3), -origin[:, None]], axis=1)).float(),
             dataparser_scale=scale,
             georeference=None if frame is None else frame.to_json(),
+            origin=tuple(origin.tolist()),
         )
 
 

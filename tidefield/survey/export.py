@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
 from tidefield.data.exif import EXIF_DAMAGE, read_exif
-from tidefield.data.pictures import MODES, decode, write_mask
+from tidefield.data.pictures import MODES, decode, read_mask, write_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import every_eighth
 from tidefield.data.readers.transforms import write_transforms_file
@@ -191,10 +191,11 @@ def reduced_folders(factors: Sequence[int]) -> list[str]:
 
 
 def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[int], progress: Progress) -> None:
-    """Write images_N beside images: the photographs at an Nth of their size, under their names.
+    """Write images_N beside images: the photographs at an Nth of their size, under their names; masks_N beside masks.
 
-    Each pixel is the mean of N x N. Columns and rows that are left over at the right and at the bottom are dropped: the
-    size is rounded down, as nerfstudio and gsplat do with their cameras, and the calibration is exactly an Nth.
+    Each pixel is the mean of N x N, which in a mask are all used. Columns and rows that are left over at the right and
+    at the bottom are dropped: the size is rounded down, as nerfstudio and gsplat do with their cameras, and the
+    calibration is exactly an Nth.
     """
     folders = reduced_folders(factors)
 
@@ -211,6 +212,10 @@ def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[in
             whole = pixels[: height * factor, : width * factor]
             reduced = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
             write_image(reduced, scene / folder / name, original)
+            if (mask := scene / "masks" / f"{name}.png").is_file():
+                used = read_mask(mask, (pixels.shape[1], pixels.shape[0]), original)
+                blocks = used[: height * factor, : width * factor].reshape(height, factor, width, factor)
+                write_mask(scene / f"masks_{factor}" / f"{name}.png", np.asarray(blocks.all(axis=(1, 3))))
 
     with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(write, names), start=1):

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Int64
 
-from tidefield.data.georeference import Georeference, Residuals, read_georeference
+from tidefield.data.georeference import Georeference, find_georeference
 from tidefield.data.holdout import read_holdout
 from tidefield.data.images import Progress
 from tidefield.data.load import own_lens, read_posed
@@ -27,9 +27,7 @@ from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.triangulate import find_points
 from tidefield.errors import RunError
 from tidefield.files import completed_folder, refuse_existing, write_text
-from tidefield.geometry.geodesy import WGS84, LocalFrame
 from tidefield.geometry.lenses import LensModel, colmap_parameters, rectify
-from tidefield.geometry.similarity import Similarity
 from tidefield.machine import cores
 from tidefield.survey.export import (
     reduced_folders,
@@ -92,20 +90,8 @@ def import_project(
     each = zip(posed.paths, posed.lenses, original.lenses, strict=True)
     with quiet_pillow():
         refuse_unwritable(path for path, lens, own in each if downscale or lens != own)
-    located = read_georeference(source)
+    located = find_georeference(source, posed.reference)
     has_checks = located is not None and (source / CHECK_FILE).is_file()
-    if located is None and posed.reference is not None:
-        place = posed.reference
-        located = Georeference(
-            frame=LocalFrame.at(WGS84, (place.longitude_deg, place.latitude_deg, place.height_m)),
-            source="project",
-            world_from_model=Similarity(1.0, np.eye(3), np.zeros(3)),  # it is in metres east, north and up already
-            gps=Residuals(),
-            control=Residuals(),
-            check=Residuals(),
-            left_out=(),
-            notes=("The origin is the imported project's; its accuracy is unknown.",),
-        )
     holdout = read_holdout(source, posed.names, allow_missing)
     if posed.near_far is not None:
         _log.warning(f"{source} states near and far bounds: the imported scene estimates its own instead")
@@ -130,10 +116,10 @@ def import_project(
         with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
             for done, _ in enumerate(pool.map(write, range(count)), start=1):
                 show(done, count)
-        if downscale:
-            write_reduced_images(folder, posed.names, downscale, partial(show, before=count))
         if posed.masks:
             _write_masks(posed, original.lenses, folder / "masks")
+        if downscale:
+            write_reduced_images(folder, posed.names, downscale, partial(show, before=count))
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))

@@ -230,6 +230,8 @@ def prepare(
 
         if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
             files = [scene / folder / name for folder in reduced for name in models[0]]
+            if _have_masks(placed):
+                files += [scene / f"masks_{factor}" / f"{name}.png" for factor in downscale for name in models[0]]
             stages.run("downscale", {"factors": list(downscale)}, files, reduce)
         return Prepared(
             survey=survey,

@@ -149,8 +149,8 @@ class Stages:
                 raise ValueError("no table of stages")
         except (ValueError, RecursionError) as error:
             raise RunError(
-                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._folder} to "
-                "start again"
+                f"{self._file} is damaged ({error}): expected what an earlier run wrote; remove {self._scene}, or "
+                "name a new folder, to start again"
             ) from error
         damaged = [name for name, record in records.items() if not _is_record(record)]
         if damaged:
@@ -172,7 +172,7 @@ class Stages:
 def _refuse_links(scene: Path) -> None:
     """Raise a RunError if one of the folders that are written to is a link or contains one."""
     real = os.path.realpath(scene)
-    for folder in (*(scene / name for name in _OWN_FOLDERS), *scene.glob("images_*")):
+    for folder in (*(scene / name for name in _OWN_FOLDERS), *scene.glob("images_*"), *scene.glob("masks_*")):
         for path in (folder, *folder.rglob("*")):
             if os.path.realpath(path) != os.path.join(real, path.relative_to(scene)):
                 raise RunError(

@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from tidefield.errors import list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
@@ -75,13 +75,12 @@ def adjust_to_positions(
     Returns:
         Notes on the adjustment; none if the model was not adjusted.
     """
-    stated_m = positions.stated_m[:, [0, 0, 1]]
-    good = np.flatnonzero(fit.used & (stated_m < DIFFERENTIAL_M).all(axis=1))
+    good, stated_m = differential(model, positions, fit), positions.stated_m[:, [0, 0, 1]]
+    if not len(good):
+        return ()
     given = {fit.names[i]: fit.given_world[i] for i in good}
     sigma_m = {fit.names[i]: stated_m[i] for i in good}
     names = sorted(given)
-    if len(names) < max(FEWEST_DIFFERENTIAL, model.num_reg_images() / 2):
-        return ()
     priors = _priors(model, given, sigma_m)
     before = _residual_m(model, given, names)
     light = thinned(model)
@@ -116,6 +115,14 @@ def adjust_to_positions(
     if rejected:
         notes.append(f"The positions of {list_names(rejected)} are worse than they state, and were not used for this.")
     return tuple(notes)
+
+
+def differential(
+    model: pycolmap.Reconstruction, positions: GivenPositions, fit: PositionFit
+) -> Int64[np.ndarray, " K"]:
+    """Indices of the positions of differential receivers that fit a model; none where they are too few to shape it."""
+    good = np.flatnonzero(fit.used & (positions.stated_m < DIFFERENTIAL_M).all(axis=1))
+    return good if len(good) >= max(FEWEST_DIFFERENTIAL, model.num_reg_images() / 2) else good[:0]
 
 
 def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
-from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions, hold_to_positions
+from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions, differential, hold_to_positions
 from tidefield.survey.georeference.gps_alignment import (
     GivenPositions,
     camera_centres,
@@ -30,7 +30,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
     """Transform a model of any frame into the world, in place, and adjust it to positions and ground control.
 
     Positions of differential receivers remove the bend of the model. With three control points or more the model is
-    adjusted to these, and cross-validated.
+    adjusted to these, and cross-validated, unless it keeps the shape that differential positions gave it.
 
     Args:
         model: its images' names are the photographs' names.
@@ -57,23 +57,26 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         frame = LocalFrame.at(control.crs, (x, y, height))
 
     world_from_model, notes = Similarity(1.0, np.eye(3), np.zeros(3)), positions.notes
-    fit = fit_positions(model, photographs, positions, frame)
+    fit, shape = fit_positions(model, photographs, positions, frame), tuple[str, ...]()
     if fit is not None:
         _transform(model, fit.world_from_model)
-        adjusted = adjust_to_positions(model, positions, fit, progress) or hold_to_positions(model, fit)
+        shape = adjust_to_positions(model, positions, fit, progress) or hold_to_positions(model, fit)
         again = fit_positions(model, photographs, positions, frame)
         assert again is not None, "the model has just been aligned with them"
         _transform(model, again.world_from_model)
-        world_from_model, notes = again.world_from_model @ fit.world_from_model, (*notes, *again.notes, *adjusted)
+        world_from_model, notes = again.world_from_model @ fit.world_from_model, (*notes, *again.notes)
         fit = fit_positions(model, photographs, positions, frame)
     gross_errors = fit.left_out if fit else ()
 
     if control is not None:
         marks, unplaced = locate_marks(model, control, survey.photographs, frame)
-        last, agree = fit_control(model, marks, find_down(model, photographs), fit)
+        # Positions that found nothing to correct have confirmed the shape.
+        shaped = fit is not None and len(differential(model, positions, fit)) > 0
+        last, agree = fit_control(model, marks, find_down(model, photographs), fit, shaped)
         _transform(model, last)
-        residuals, check, rejected, remarks = adjust_to_control(model, marks, agree, progress)
-        left_out, notes = (*gross_errors, *unplaced, *rejected), (*notes, *remarks)
+        found = adjust_to_control(model, marks, agree, progress, fit if shaped else None)
+        residuals, check, left_out = found.residuals, found.check, (*gross_errors, *unplaced, *found.rejected)
+        last, notes, used = found.moved @ last, (*notes, *shape, *found.notes), found.used_world
     elif fit is None:
         return _level_only(model, photographs, positions)
     else:
@@ -81,7 +84,8 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         last = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground]))
         frame = replace(frame, height_m=float(ground))
         _transform(model, last)
-        residuals, check, left_out = Residuals(), Residuals(), gross_errors
+        residuals, check, left_out, notes = Residuals(), Residuals(), gross_errors, (*notes, *shape)
+        used = np.empty((0, 3))
     return Georeference(
         frame=frame,
         source="GPS" if control is None else "ground control",
@@ -91,6 +95,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         check=check,
         left_out=left_out,
         notes=notes,
+        control_world=used,
     )
 
 

@@ -4,6 +4,9 @@ A model that is only aligned with its control points keeps the bend of its own m
 matches, fixed control points remove the bend, and determine lens parameters that flat ground does not: a longer lens is
 equivalent to a higher flight, unless points lie at two heights or a bend shows the difference. Every point is left out
 in turn to check the rest; marks and points that disagree with the others are rejected.
+
+A model that positions of differential receivers have shaped keeps that shape where control says no better: a few
+points in one corner would turn and bend all the rest.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from tidefield.survey.georeference.bundle_adjustment import (
     solve,
     thinned,
 )
-from tidefield.survey.georeference.gps_alignment import Down, PositionFit, metres
+from tidefield.survey.georeference.gps_alignment import Down, PositionFit, camera_centres, metres, rms_m
 from tidefield.survey.survey import Control, Photograph, Progress
 
 GROSS_ERROR = 0.02
@@ -48,10 +51,39 @@ _WRONG_POINTS = 3
 """No more points than this are rejected by cross-validation."""
 _WORTH_FREEING = 0.9
 """The lens is adjusted if the errors of the points left out fall below this share."""
+_WORTH_RESHAPING = 0.5
+"""A model that positions have shaped is adjusted to control if the errors of the points left out fall below this
+share, ..."""
+_FARTHER = 2.0
+"""... or below that of a lens, while the cameras' distances from their positions grow by no more than this factor."""
 _ROUNDS = 4
 _FOLDS = 12
 _FOLDS_OF_LARGE = 4
 _LARGE = 300  # photographs
+
+
+_UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What an adjustment to ground control has found.
+
+    Attributes:
+        residuals: of the control points.
+        check: those of each without it.
+        rejected: marks and points.
+        notes: as whole sentences.
+        used_world: surveyed coordinates of the points that were used.
+        moved: what was done to the model as a whole.
+    """
+
+    residuals: Residuals
+    check: Residuals
+    rejected: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
+    used_world: Float64[np.ndarray, "N 3"]
+    moved: Similarity = _UNMOVED
 
 
 @dataclass(frozen=True)
@@ -202,7 +234,7 @@ def triangulate_points(
 
 
 def fit_control(
-    model: pycolmap.Reconstruction, marks: Marks, down: Down, positions: PositionFit | None
+    model: pycolmap.Reconstruction, marks: Marks, down: Down, positions: PositionFit | None, shaped: bool = False
 ) -> tuple[Similarity, Bool[np.ndarray, " M"]]:
     """Estimate the similarity from a model to its control points.
 
@@ -212,6 +244,7 @@ def fit_control(
     Args:
         positions: the model aligned with its cameras' positions. They determine what control points do not that are
             too few or on one line.
+        shaped: whether the model was adjusted to the positions, which then count beside any control.
 
     Returns:
         The similarity, and which marks agree with it.
@@ -241,7 +274,7 @@ def fit_control(
         )
     source, target = _pairs(model, marks.where(agree))
     sigma = np.full_like(target, _CONTROL_M)
-    if not _are_collinear(target):
+    if not (shaped and positions is not None) and not _are_collinear(target):
         similarity = refine_similarity(similarity, source, target, sigma).similarity
     elif positions is not None:
         similarity = _with_positions(similarity, source, target, positions)
@@ -275,7 +308,7 @@ def _with_positions(
     if len(source) == 0:
         return start
     prior, used = positions.world_from_model, positions.used
-    shift = (target - prior(source)).mean(0)
+    shift = np.median(target - prior(source), axis=0)  # one point in three may be wrong
     return refine_similarity(
         replace(prior, translation=prior.translation + shift),
         np.concatenate([source, positions.centres_model[used]]),
@@ -291,8 +324,12 @@ def _share(model: pycolmap.Reconstruction, marks: Marks, similarity: Similarity)
 
 
 def adjust_to_control(
-    model: pycolmap.Reconstruction, marks: Marks, agree: Bool[np.ndarray, " M"], progress: Progress
-) -> tuple[Residuals, Residuals, tuple[LeftOut, ...], tuple[str, ...]]:
+    model: pycolmap.Reconstruction,
+    marks: Marks,
+    agree: Bool[np.ndarray, " M"],
+    progress: Progress,
+    shaped_by: PositionFit | None = None,
+) -> Adjusted:
     """Adjust a model that is aligned with its control points, in place.
 
     The lens is adjusted too if this reduces the errors of the points that are left out in turn. Marks are added when
@@ -300,18 +337,25 @@ def adjust_to_control(
 
     Args:
         agree: the marks to start with.
-
-    Returns:
-        The residuals of the control points, those of each after an adjustment without it, the rejected marks and
-        points, and notes.
+        shaped_by: the positions that the model was adjusted to, as they are in the world; None if it was to none.
     """
     if _are_collinear(marks.where(agree).points.values()):
         note = (
             "Fewer than three control points can be used, or they lie on one line: the photographs were aligned with "
             "them without adjustment, and cannot be checked."
         )
-        return _control_residuals(model, marks.where(agree)), Residuals(), _rejected(model, marks, agree), (note,)
+        found = _control_residuals(model, marks.where(agree))
+        used = np.array(list(marks.where(agree).points.values()), dtype=np.float64).reshape(-1, 3)
+        return Adjusted(found, Residuals(), _rejected(model, marks, agree), (note,), used)
     refused: set[str] = set()
+    floor_m = _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model)
+    while shaped_by is not None and len(refused) < _WRONG_POINTS:  # which an adjustment would bend the model to
+        shown = _control_residuals(model, marks.where(agree))
+        apart = shown.error_m - np.median(shown.error_m, axis=0)
+        if (wrong := _worst(Residuals(shown.names, apart), floor_m)) is None:
+            break
+        refused.add(wrong)
+        agree = agree & ~marks.of(wrong)
     sound = reliable(model)
     while True:
         agree = _consistent(sound, marks, agree, False, refused)
@@ -319,7 +363,7 @@ def adjust_to_control(
         free = _cross_validate(sound, marks.where(agree), True, lambda done, whole: progress(done + whole, 2 * whole))
         free_lens = free.rms_m < _WORTH_FREEING * fixed.rms_m
         check = free if free_lens else fixed
-        wrong = _worst(check, _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model))
+        wrong = _worst(check, floor_m)
         if wrong is None or len(refused) == _WRONG_POINTS:
             break
         refused.add(wrong)
@@ -328,6 +372,26 @@ def adjust_to_control(
     if (final != agree).any():
         agree, check = final, _cross_validate(sound, marks.where(final), free_lens, progress)
     adjusted = _adjusted(sound, marks.where(agree), free_lens)
+    surveyed = np.array(list(marks.where(agree).points.values()), dtype=np.float64).reshape(-1, 3)
+    if shaped_by is not None:
+        error = _control_residuals(model, marks.where(agree)).error_m
+        shift = -error.mean(0) if len(error) else np.zeros(3)  # what is rejected now has moved the model, too
+        shifted = pycolmap.Reconstruction(model)
+        shifted.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), shift))
+        found = _control_residuals(shifted, marks.where(agree))
+        by_shift = _without_own_shift(found)
+        now, then = (_from_positions_m(one, shaped_by) for one in (shifted, adjusted))
+        better = _share_of(check, by_shift)
+        if not (better < _WORTH_RESHAPING or (better < _WORTH_FREEING and then <= _FARTHER * now)):
+            model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), shift))
+            note = (
+                "Ground control has moved the model, which keeps the shape that the positions gave it: adjusted to "
+                f"the control alone, its cameras would be {metres(then)} from their positions, beside a common shift, "
+                f"instead of {metres(now)}."
+            )
+            notes = (note, *_unchecked(marks.where(agree), by_shift, "one photograph shows it"))
+            moved = replace(_UNMOVED, translation=shift)
+            return Adjusted(found, by_shift, _rejected(model, marks, agree), notes, surveyed, moved)
     notes = []
     if free_lens:
         changes = [
@@ -338,12 +402,41 @@ def adjust_to_control(
             f"Ground control corrected the lens (focal length {list_names(changes)}, principal point and distortion): "
             "this reduces the errors of points that are left out in turn."
         )
-    unchecked = sorted(marks.where(agree).points.keys() - set(check.names))
-    if unchecked:
-        why = "one photograph shows it, or too few points would be left"
-        notes.append(f"Used, but not checked: {list_names(unchecked)}; {why}.")
+    notes += _unchecked(marks.where(agree), check, "one photograph shows it, or too few points would be left")
     carry_over(adjusted, model)
-    return _control_residuals(adjusted, marks.where(agree)), check, _rejected(adjusted, marks, agree), tuple(notes)
+    found = _control_residuals(adjusted, marks.where(agree))
+    return Adjusted(found, check, _rejected(adjusted, marks, agree), tuple(notes), surveyed)
+
+
+def _unchecked(used: Marks, check: Residuals, why: str) -> list[str]:
+    """A note on points that were used and not checked, if there are any."""
+    names = sorted(used.points.keys() - set(check.names))
+    return [f"Used, but not checked: {list_names(names)}; {why}."] if names else []
+
+
+def _share_of(check: Residuals, other: Residuals) -> float:
+    """Errors of points as a share of their errors in another check; NaN without a point in both."""
+    both = [name for name in check.names if name in other.names]
+    if not both:
+        return np.nan
+    one, two = (rms_m(found.error_m[[found.names.index(name) for name in both]]) for found in (check, other))
+    return one / max(two, 1e-9)
+
+
+def _without_own_shift(residuals: Residuals) -> Residuals:
+    """Errors of points of a model that the others have shifted."""
+    error, count = residuals.error_m, len(residuals.names)
+    if count < 2:
+        return Residuals()
+    return Residuals(residuals.names, error + (error - error.mean(0)) / (count - 1))
+
+
+def _from_positions_m(model: pycolmap.Reconstruction, positions: PositionFit) -> float:
+    """Root mean square distance of cameras from their positions, but for a common shift, as that of another datum."""
+    centres = camera_centres(model)
+    away = np.array([centres[name] for name in positions.names]) - positions.given_world
+    away = away[positions.used]
+    return rms_m(away - np.median(away, axis=0))
 
 
 def _adjusted(model: pycolmap.Reconstruction, marks: Marks, free_lens: bool) -> pycolmap.Reconstruction:

@@ -169,14 +169,35 @@ def refuse_elsewhere(control: Control, longitude_deg: float, latitude_deg: float
     away = _distance_m(parse_crs(control.crs), x, y, site)
     if away < MAX_DISTANCE_M + radius_m:
         return
-    found = _fitting(control.crs, x, y, site)
-    advice = f"they would fit in {' or '.join(found)}" if found else "no system that is used at this site fits them"
     where = f"{away / 1000:,.0f} km from" if np.isfinite(away) else "nowhere near"
+    correct = "correct the control file"
+    if found := _fitting(control.crs, x, y, site):
+        advice = f"they would fit in {' or '.join(found)}"
+    elif mistake := _mirrored(control.crs, x, y, site, radius_m):
+        advice = f"the photographs would be there if {mistake}"
+        correct = "correct their positions, for example in a file for --gps"
+    else:
+        advice = "no system that is used at this site fits them"
     raise SurveyError(
         f"the {len(points)} points of ground control, about ({x:.1f}, {y:.1f}) in {parse_crs(control.crs).name}, lie "
         f"{where} the photographs (longitude {longitude_deg:.5f}, latitude {latitude_deg:.5f}): expected the same "
-        f"site; {advice}; correct the control file"
+        f"site; {advice}; {correct}"
     )
+
+
+def _mirrored(crs: str, x: float, y: float, site: tuple[float, float], radius_m: float) -> str | None:
+    """The mistake in the photographs' positions without which they would be where the coordinates are."""
+    longitude, latitude = site
+    mistakes = {
+        "the sign of their longitudes were the other": (-longitude, latitude),
+        "the sign of their latitudes were the other": (longitude, -latitude),
+        "the signs of their longitudes and latitudes were the other": (-longitude, -latitude),
+    }
+    if abs(longitude) <= 90:
+        mistakes["their latitudes and longitudes were exchanged"] = (latitude, longitude)
+    away = {mistake: _distance_m(parse_crs(crs), x, y, place) for mistake, place in mistakes.items()}
+    nearest = min(away, key=lambda mistake: away[mistake])
+    return nearest if away[nearest] < MAX_DISTANCE_M + radius_m else None
 
 
 def _fitting(crs: str, x: float, y: float, site: tuple[float, float]) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,6 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float64
 from pyproj import CRS, Transformer
-from pyproj.transformer import TransformerGroup
 
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import (
@@ -24,6 +22,7 @@ from tidefield.geometry.geodesy import (
     US_SURVEY_FOOT_M,
     WGS84,
     horizontal,
+    lost_in_conversion,
     metres_per_degree,
     metres_per_height,
     parse_crs,
@@ -98,8 +97,6 @@ _FAR_TIMES_MEDIAN = 20.0
 _MAX_OUTLIERS = 0.1
 
 
-_CENTIMETRES = 0.1
-"""Metres. Conversions between systems of one plate are as accurate as this at best."""
 _Row: TypeAlias = tuple[str, str, list[float]]
 """A photograph, the place in the file for messages, and the numbers of `_GEO`, NaN where unknown."""
 
@@ -357,21 +354,8 @@ def _read_geo(path: Path, names: PhotographNames) -> tuple[dict[str, GpsRecord],
 
 
 def _conversion_remarks(path: Path, system: CRS) -> list[str]:
-    """Say so where PROJ lacks the grid of the best conversion to WGS 84: what it does instead is metres off."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # which is what the remark says
-        group = TransformerGroup(horizontal(system), WGS84, always_xy=True)
-    if group.best_available or not group.transformers or not group.unavailable_operations:
-        return []
-    best, used = group.unavailable_operations[0], group.transformers[0]
-    grids = [grid.short_name or grid.full_name for grid in best.grids if not grid.available]
-    if not grids or not used.accuracy > max(_CENTIMETRES, best.accuracy):
-        return []
-    return [
-        f"{path.name}: positions in {system.name} are converted to WGS 84 to {used.accuracy:g} m only, because PROJ "
-        f"lacks {list_names(grids)}: install it (`projsync --file {grids[0]}`, or PROJ_NETWORK=ON), or give longitude "
-        "and latitude in WGS 84."
-    ]
+    lost = lost_in_conversion(system, CRS(WGS84))
+    return [f"{path.name}: positions {lost}; or give longitude and latitude in WGS 84."] if lost else []
 
 
 def _datum(system: CRS) -> VerticalDatum:
