@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,14 @@ from surveys_of_two_dates import pair
 from tidefield import cli
 from tidefield.change.inputs import open_pair, open_survey
 from tidefield.change.measure import Options, measure
+from tidefield.change.page import limits
 from tidefield.change.surfaces import ChangeError
+from tidefield.change.water import measure_water
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.maps.classes import GROUND
+from tidefield.maps.classes import GROUND, WATER
 from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.grid import LOCAL_NAME, LOCAL_WKT, Grid, MapFrame
-from tidefield.maps.make import CLOUD, DSM, FILLED, ORTHOPHOTO, SIGMA
+from tidefield.maps.make import CLASSES, CLOUD, DSM, FILLED, ORTHOPHOTO, SIGMA
 from tidefield.maps.rasters import NODATA, Raster, raster_writer
 
 rasterio = pytest.importorskip("rasterio")
@@ -34,7 +37,13 @@ def frame(georeferenced: bool) -> MapFrame:
     return MapFrame(local, np.zeros(3), np.eye(3), wkt, wkt, local.vertical_datum)
 
 
-def write_map(folder: Path, heights: np.ndarray, georeferenced: bool, filled: np.ndarray | None = None) -> Path:
+def write_map(
+    folder: Path,
+    heights: np.ndarray,
+    georeferenced: bool,
+    filled: np.ndarray | None = None,
+    classes: np.ndarray | None = None,
+) -> Path:
     """The files of a map that change reads, as `tidefield.maps.make.join` writes them."""
     of = frame(georeferenced)
     west, north = (400_000.0, 5_700_000.0) if georeferenced else (-60.0, 50.0)
@@ -49,6 +58,8 @@ def write_map(folder: Path, heights: np.ndarray, georeferenced: bool, filled: np
     if filled is not None:
         raster = Raster(folder / FILLED, ("1 where the map is filled",), "uint8", 255.0, average=False)
         rasters.append((raster, [filled]))
+    if classes is not None:
+        rasters.append((Raster(folder / CLASSES, ("class",), "uint8", 0.0, average=False), [classes]))
     for raster, bands in rasters:
         raster.path.parent.mkdir(parents=True, exist_ok=True)
         with raster_writer(raster, grid) as writer:
@@ -84,6 +95,33 @@ def test_two_folders_of_maps_are_compared(tmp_path: Path):
     assert numbers["cells"] == truth.size - 400 - 400
     with rasterio.open(tmp_path / "out" / "change.tif") as file:
         assert np.isnan(file.read(1)[100:120, 100:120]).all()
+
+
+def test_the_tide_is_no_change_of_the_ground(tmp_path: Path):
+    low, high, slope = 2.0, 2.4, 0.02
+    maps, grounds = [], []
+    for name, heights, level in zip("ab", surfaces(tmp_path, 0.0), (low, high), strict=False):
+        away = 0.5 * np.maximum(0, np.arange(heights.shape[1], dtype=np.float32) - 60)
+        ground = heights - (slope + 0.004) * away  # on ground that rises by 0.004
+        wet = ground < level
+        classes = np.where(np.isfinite(heights), np.where(wet, np.uint8(WATER), np.uint8(GROUND)), 0)
+        maps.append(write_map(tmp_path / name, np.where(wet, level, ground).astype(np.float32), True, None, classes))
+        grounds.append(wet)
+    flooded = grounds[0] | grounds[1]
+    assert flooded.mean() > 0.2
+    one, two = (open_survey(path) for path in maps)
+    found = measure(one, two, Options(shift="none"))
+    assert not found.outlines.signs.tolist()
+    np.testing.assert_array_equal(np.isnan(found.dz), flooded | ~np.isfinite(surfaces(tmp_path, 0.0)[0]))
+    low_m3, high_m3 = found.net.interval_m3
+    assert low_m3 < 0 < high_m3
+    assert any("are water at one date or both" in remark for remark in found.remarks)
+    line = measure_water(found, (low, high), ()).waterline
+    assert line is not None
+    assert line.land_lost_m2 == pytest.approx(100 * (high - low) / slope, rel=0.1)
+    assert not any(word.startswith("Plants and water") for word in limits(found))
+    dry = measure(*(replace(survey, classes=None) for survey in (one, two)), Options(shift="none"))
+    assert dry.fill.value_m3 > 0.1 * flooded.sum() * 0.25
 
 
 def test_maps_in_a_known_system_bring_it_and_their_clouds(tmp_path: Path):

@@ -1,14 +1,16 @@
 """The horizontal shift between surveys, from pictures with other light."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from surveys_of_two_dates import noise, pair, write_surface
+from pyproj import CRS
+from surveys_of_two_dates import NORTH, WEST, noise, pair, write_surface
 
 from tidefield.change.measure import Options, measure
-from tidefield.change.shift import correlate
-from tidefield.change.surfaces import ChangeError, open_surface
+from tidefield.change.shift import correlate, find_shift
+from tidefield.change.surfaces import ChangeError, Grid, open_surface
 
 
 def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -40,6 +42,35 @@ def test_a_shift_is_found_to_a_tenth_of_a_pixel_under_another_light():
     assert found.north_m == pytest.approx(0.65, abs=0.025)
     assert found.error_m < 0.05
     assert abs(found.east_m + 0.40) < 3 * found.error_m + 0.01
+
+
+@pytest.mark.parametrize("apart_m", [1.0, 8.0])
+def test_surveys_that_are_metres_apart_are_brought_together(tmp_path: Path, apart_m: float):
+    rows, columns = np.indices((1000, 1100))
+    x, y = columns * 0.12, -rows * 0.12
+    for name, east in (("early", 0.0), ("late", apart_m)):
+        grey = (200 * ground(x - east, y).clip(0, 1)).astype(np.uint8)
+        write_surface(tmp_path / f"{name}.tif", np.stack([grey] * 3), cell=0.12)
+    grid = Grid(CRS("EPSG:32630").to_wkt(), WEST, NORTH, 0.5, 264, 240)
+    found = find_shift(tmp_path / "early.tif", tmp_path / "late.tif", grid)
+    assert (found.east_m, found.north_m) == (pytest.approx(-apart_m, abs=0.03), pytest.approx(0, abs=0.03))
+    assert found.pixel_m == pytest.approx(0.12)
+
+
+def test_the_error_of_a_shift_has_what_a_turned_survey_adds():
+    rows, columns = np.indices((400, 480))
+    x, y, errors = columns * 0.25, -rows * 0.25, []
+    rng = np.random.default_rng(5)
+    for turn in (0.0, 0.006):
+        one, other = (
+            200 * ground(x + at * (y + 50), y - at * (x - 60)).clip(0, 1) + rng.normal(0, 4, x.shape)
+            for at in (0.0, turn)
+        )
+        found = correlate(one.astype(np.float32), other.astype(np.float32), np.ones(x.shape, bool), 0.25)
+        assert found.known
+        errors.append(found.error_m)
+    true = 0.006 * 50 / math.sqrt(3)  # what a turn moves the windows by, one sigma, without their border
+    assert errors[0] < 0.05 < 0.5 * true < errors[1] < 1.2 * true
 
 
 def test_unrelated_pictures_do_not_tell_a_shift():

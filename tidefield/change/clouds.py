@@ -101,26 +101,28 @@ def read_cloud(path: Path) -> Cloud:
                 raise ChangeError(f"{path} has {header.point_count} points: {expected}, or a part of it")
             crs, keys = _system(header)
             extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
-            parts, sigmas = [], []
+            # As large as all points: parts that are joined would take as much again.
+            xyz, read = np.empty((header.point_count, 3)), 0
+            sigmas = None if extra is None else np.empty(header.point_count)
             for points in reader.chunk_iterator(_CHUNK):
                 kept = ~np.isin(np.asarray(points.classification), (*NOISE, WATER))
                 kept &= ~np.asarray(points.withheld, bool)
-                xyz = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
-                kept &= np.isfinite(xyz).all(axis=1)
-                parts.append(xyz[kept])
-                if extra is not None:
-                    sigmas.append(np.asarray(points[extra], np.float64)[kept])
+                part = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
+                kept &= np.isfinite(part).all(axis=1)
+                rows = slice(read, read + int(np.count_nonzero(kept)))
+                xyz[rows], read = part[kept], rows.stop
+                if sigmas is not None:
+                    sigmas[rows] = np.asarray(points[extra], np.float64)[kept]
     except ChangeError:
         raise
     except Exception as error:  # laspy and lazrs raise whatever a damaged file makes them
         raise ChangeError(f"{path} cannot be read as a point cloud ({error}): {expected}") from error
-    xyz = np.concatenate(parts)
+    xyz, sigma = xyz[:read], None if sigmas is None else sigmas[:read]
     if len(xyz) == 0:
         raise ChangeError(f"{path} has no points but noise, water and withheld ones: {expected}")
     if crs is not None and (crs.is_geographic or crs.is_geocentric):
         found = "in degrees" if crs.is_geographic else "geocentric, without heights"
         raise ChangeError(f"{path} is {found} ({crs.name}): expected a projected system in metres; convert it first")
-    sigma = np.concatenate(sigmas) if sigmas else None
     up = _UNITS_M.get(keys.get(_HEIGHT_UNIT, 0), 1.0 if crs is None else metres_per_height(crs))
     xyz[:, 2] *= up
     sigma = None if sigma is None else sigma * up
@@ -194,7 +196,8 @@ def default_cell(cloud: Cloud) -> float:
     area = float(np.prod(np.maximum(high - low, 1e-3)))
     side = math.sqrt(_POINTS_PER_CELL * area / len(cloud.xyz))
     for _ in range(2):  # where there are points at all
-        cells = np.unique(np.floor((cloud.xyz[:, :2] - low) / side).astype(np.int64) @ np.array([1, 1 << 31]))
+        column, row = (np.floor((cloud.xyz[:, k] - low[k]) / side).astype(np.int64) for k in (0, 1))
+        cells = np.unique(column + (row << 31))
         side = math.sqrt(_POINTS_PER_CELL * len(cells) * side**2 / len(cloud.xyz))
     digit = 10.0 ** math.floor(math.log10(side))
     return max(0.001, math.ceil(side / digit) * digit)

@@ -9,8 +9,8 @@ from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, 
 from tidefield.change.shift import is_picture
 from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, opened, require_one_zero
 
-FILLED = "filled.tif"
-"""Of `tidefield map --fill`, next to the surface."""
+FILLED, CLASSES = "filled.tif", "classes.tif"
+"""Of `tidefield map --fill`, and of every map, next to the surface."""
 _SURFACE, _TERRAIN = "dsm", "dtm"
 SURFACES = ("odm_dem/dsm.tif", "odm_dem/dtm.tif", "dsm.tif", "dtm.tif")
 ORTHOPHOTOS = ("odm_orthophoto/odm_orthophoto.tif", "orthophoto.tif", "ortho.tif")
@@ -41,7 +41,8 @@ def open_survey(path: Path, date: str | None = None, surfaces: tuple[str, ...] =
     if not path.is_dir():
         # Another surface in that folder is none of the map's.
         mapped = path.name in {Path(name).name for name in SURFACES}
-        return replace(open_surface(path, date), filled=first_of(path.parent, (FILLED,)) if mapped else None)
+        found = open_surface(path, date)
+        return _with_marks(found) if mapped else found
     surface = first_of(path, surfaces)
     if surface is None:
         raise ChangeError(
@@ -60,13 +61,18 @@ def open_survey(path: Path, date: str | None = None, surfaces: tuple[str, ...] =
                 )
                 picture = None
     return replace(
-        found,
-        filled=first_of(surface.parent, (FILLED,)),
+        _with_marks(found),
         orthophoto=picture,
         cloud=first_of(path, CLOUDS),
         source=name,
         remarks=[*found.remarks, *remarks],
     )
+
+
+def _with_marks(surface: Surface) -> Surface:
+    """A surface of a map with the rasters next to it that tell which cells are no measurements of the ground."""
+    folder = surface.path.parent
+    return replace(surface, filled=first_of(folder, (FILLED,)), classes=first_of(folder, (CLASSES,)))
 
 
 def is_cloud(path: Path) -> bool:

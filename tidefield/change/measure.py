@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32
+from pyproj import CRS
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from tidefield.change.choice import repeat_choice
@@ -35,6 +36,8 @@ from tidefield.change.shift import Shift, find_shift
 from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_zeros, warped
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.errors import list_names
+from tidefield.geometry.geodesy import lost_in_conversion
+from tidefield.maps.classes import WATER
 
 log = logging.getLogger(__name__)
 
@@ -90,12 +93,24 @@ class InPolygon(NamedTuple):
         return {"net": self.net, "cut": self.cut, "fill": self.fill}
 
 
+class OnWater(NamedTuple):
+    """Cells that the map of one survey or both says are water, whose heights are not those of the ground.
+
+    Attributes:
+        cells: of the grid.
+        dz: in these, row by row, as in `Change.dz`.
+    """
+
+    cells: Bool[np.ndarray, "rows columns"]
+    dz: Float32[np.ndarray, " N"]
+
+
 @dataclass(frozen=True)
 class Change:
     """What changed between two surveys.
 
     Attributes:
-        dz: later minus earlier height after co-registration, metres; NaN where one of them is unknown.
+        dz: later minus earlier height after co-registration, metres; NaN where one of them is unknown, or of water.
         errors: of dz.
         stable: cells that co-registration and errors were measured on; they may lie outside of what is compared.
         stable_dz: dz in these, or in every second, third, ... of them.
@@ -126,6 +141,16 @@ class Change:
     threshold_fill_m3: float
     detection_m: tuple[float, float, float]
     remarks: list[str] = field(default_factory=list)
+    water: OnWater | None = None
+
+    @property
+    def with_water(self) -> Float32[np.ndarray, "rows columns"]:
+        """dz of the water as well."""
+        if self.water is None:
+            return self.dz
+        dz = self.dz.copy()
+        dz[self.water.cells] = self.water.dz
+        return dz
 
 
 def read_difference(
@@ -190,6 +215,10 @@ def measure(
     options = options or Options()
     grid = common_grid([earlier, later], options.cell_m)
     remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks])]
+    target = None if grid.crs is None else CRS.from_wkt(grid.crs)
+    for surface in (earlier, later):
+        if surface.crs is not None and target is not None and (lost := lost_in_conversion(surface.crs, target)):
+            remarks.append(f"{surface.file}: coordinates {lost}; errors do not include that")
     if zeros := other_zeros(earlier, later):
         if options.register == "none":
             raise ChangeError(
@@ -203,6 +232,15 @@ def measure(
     dz, own = read_difference(earlier, later, grid, moved, tick=tick)
     if (earlier.sigma is None) != (later.sigma is None):
         remarks.append("only one survey has standard errors of its cells; they are not used")
+    wet = _water(earlier, later, grid, moved) & np.isfinite(dz)
+    on_water = dz[wet]
+    if len(on_water):
+        share = 100 * len(on_water) / np.count_nonzero(np.isfinite(dz))
+        dz[wet] = np.nan
+        remarks.append(
+            f"{share:.1f}% of the cells, {len(on_water) * grid.cell_area_m2:,.0f} m², are water at one date or both "
+            "by the classes of the maps: left out, since their heights are the water's and not the ground's"
+        )
     given = rasterised(stable(grid), grid) if stable is not None else None
     if given is not None:
         given &= np.isfinite(dz)
@@ -216,10 +254,11 @@ def measure(
         )
     if known < LEAST_STABLE:
         raise ChangeError(
-            f"{earlier.file} and {later.file} both have heights in {known} cells: expected at least "
-            f"{LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
+            f"{earlier.file} and {later.file} both have heights in {known} cells{' of ground' if len(on_water) else ''}"
+            f": expected at least {LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
         )
     unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)[0]
+    unmoved[wet] = np.nan
     steps = rounding_m(earlier), rounding_m(later)
     _leave_out_repeated(dz, unmoved, max(steps), given, remarks)
     del unmoved
@@ -236,12 +275,15 @@ def measure(
             slopes -= np.stack([_sampled(part, ground).mean() for part in slopes])[:, None, None]
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
+    if len(on_water):
+        on_water -= np.concatenate([registration.plane(grid, rows)[wet[rows]] for rows in grid.strips()])
     degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
     errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
     alarms = _false_alarms(dz, errors, ground)
     shown = _sampled(dz, ground)
     if area is not None:
         dz[~area] = np.nan
+        on_water[~area[wet]] = np.nan
     if not variogram.reached:
         remarks.append(
             "errors are correlated over longer distances than stable ground can show: intervals may be too narrow"
@@ -263,9 +305,22 @@ def measure(
         limited = " and --within reaches" if area is not None else ""
         remarks.append(
             f"polygon{'s'[: len(partial) > 1]} {list_names(partial)}: only this part is compared, where both surveys "
-            f"have heights{limited}, and its volumes are of that part"
+            f"have heights{' of ground' if len(on_water) else ''}{limited}, and its volumes are of that part"
         )
-    return found
+    return replace(found, water=OnWater(wet, on_water)) if len(on_water) else found
+
+
+def _water(
+    earlier: Surface, later: Surface, grid: Grid, shift_m: tuple[float, float]
+) -> Bool[np.ndarray, "rows columns"]:
+    """Cells that are water by the classes of either survey."""
+    wet = np.zeros(grid.shape, bool)
+    for surface, moved in ((earlier, (0.0, 0.0)), (later, shift_m)):
+        if surface.classes is not None:
+            with warped(surface.classes, surface.crs, grid, moved, nearest=True) as classes:
+                for rows in grid.strips():
+                    wet[rows] |= classes(rows.start, rows.stop)[0] == WATER
+    return wet
 
 
 def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remarks: list[str]) -> Shift | None:

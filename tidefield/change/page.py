@@ -74,7 +74,7 @@ def write_page(
         more=len(rows) - _SHOWN_OUTLINES,
         colours={"lower": LOWER, "higher": HIGHER},
         regions=change.per_region,
-        limits=limits(change, cover if water is None or water.waterline is None else None),
+        limits=limits(change, cover if change.water is None and (water is None or water.waterline is None) else None),
         cover=cover,
         views=[
             (view.name, jpeg(side_by_side(view, (earlier, later))), jpeg(difference(view)))
@@ -175,7 +175,8 @@ def limits(change: Change, cover: Cover | None = None) -> list[str]:
     """What the page does not tell; cover is that of a survey in which water was not left out."""
     found = [
         "Cut and fill are of the outlines. Narrow changes near the level of detection are in the net volume only.",
-        "Plants and water are part of the surfaces: where they changed, the change is not of the ground.",
+        f"{'Plants and water' if change.water is None else 'Plants'} are part of the surfaces: where they changed, the "
+        "change is not of the ground.",
     ]
     if cover is not None:
         green = "Green water with waves" if cover.leaves_out_films else "Shallow water, which is green,"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,9 @@ from pyproj.exceptions import ProjError
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.change.surfaces import ChangeError, Grid, is_local, require_rasterio
+from tidefield.geometry.geodesy import lost_in_conversion
+
+_log = logging.getLogger(__name__)
 
 _MOST_REGIONS = 10_000
 _LARGEST_FILE = 1 << 28
@@ -125,6 +129,8 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
             # A file without a place on Earth, which GeoPackages call undefined, is taken to lie as the surveys do.
             if not is_local(crs):
                 to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
+                if lost := lost_in_conversion(crs, CRS.from_wkt(grid.crs)):
+                    _log.warning(f"{path.name}: coordinates {lost}")
         except ProjError as error:
             raise ChangeError(
                 f"{path} cannot be converted to {CRS.from_wkt(grid.crs).name} ({error}): expected a system that fits "

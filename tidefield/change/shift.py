@@ -10,13 +10,13 @@ ground cannot tell, and nothing is moved.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from pyproj import CRS
 
 from tidefield.change.errors import nmad
@@ -24,7 +24,9 @@ from tidefield.change.surfaces import ChangeError, Grid, opened, warped
 
 _SIDE = 4096
 """Longest side of the pictures that are correlated."""
-_WINDOW = 128
+_COARSER = (1024, 256)
+"""Sides of those that tell, where these do not, how far apart windows are looked for: up to 9% of the ground."""
+_WINDOW, _COARSE_WINDOW = 128, 64
 _MOST_WINDOWS = 600
 _LEAST_CORRELATION = 0.35
 """Of two windows after the move."""
@@ -65,7 +67,7 @@ class Shift:
         if self.east_m is None or self.north_m is None:
             return (
                 f"the orthophotos do not tell the horizontal shift: {self.agreeing} of {self.windows} windows agree; "
-                "the surveys are compared where they lie"
+                "the surveys are compared where they lie, and no error has what a shift would do on slopes"
             )
         return (
             f"{self.agreeing} of {self.windows} windows of the orthophotos agree on a horizontal shift of "
@@ -127,11 +129,32 @@ def read_picture(
 
 
 def find_shift(earlier: Path, later: Path, grid: Grid) -> Shift:
-    """Correlate two orthophotos."""
-    small = picture_grid((earlier, later), grid)
-    pictures = [read_picture(path, small) for path in (earlier, later)]
-    greys = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture, _ in pictures]
-    return correlate(greys[0], greys[1], pictures[0][1] & pictures[1][1], small.cell_m)
+    """Correlate two orthophotos; where they are too far apart, smaller ones first."""
+    grids: dict[int, Grid] = {}
+    for side in (_SIDE, *_COARSER):
+        if (small := picture_grid((earlier, later), grid, float(side))) not in grids.values():
+            grids[side] = small
+
+    def shift(side: int, moved_m: tuple[float, float]) -> Shift:
+        small = grids[side]
+        pictures = [read_picture(path, small, move) for path, move in ((earlier, (0.0, 0.0)), (later, moved_m))]
+        greys = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture, _ in pictures]
+        window = _COARSE_WINDOW if side == _COARSER[-1] else _WINDOW
+        found = correlate(greys[0], greys[1], pictures[0][1] & pictures[1][1], small.cell_m, window)
+        if found.east_m is None or found.north_m is None:
+            return found
+        return replace(found, east_m=moved_m[0] + found.east_m, north_m=moved_m[1] + found.north_m)
+
+    as_they_lie = found = shift(_SIDE, (0.0, 0.0))
+    for coarse in list(grids)[1:]:
+        if found.known:
+            break
+        found = shift(coarse, (0.0, 0.0))
+        for side in [side for side in sorted(grids) if side > coarse]:
+            if found.east_m is None or found.north_m is None:
+                break
+            found = shift(side, (found.east_m, found.north_m))
+    return found if found.known else as_they_lie
 
 
 def correlate(
@@ -139,10 +162,15 @@ def correlate(
     later: Float32[np.ndarray, "rows columns"],
     known: np.ndarray,
     pixel_m: float,
+    window: int = _WINDOW,
 ) -> Shift:
-    """Correlate two grey pictures, row 0 in the north, window by window."""
+    """Correlate two grey pictures, row 0 in the north, window by window.
+
+    Args:
+        window: side of the windows, pixels.
+    """
     rows, columns = earlier.shape
-    size = min(_WINDOW, rows, columns)
+    size = min(window, rows, columns)
     step = max(size // 2, math.ceil(math.sqrt(rows * columns / _MOST_WINDOWS)))
     hann = cv2.createHanningWindow((size, size), cv2.CV_32F)
     found, windows = [], 0
@@ -155,25 +183,40 @@ def correlate(
             windows += 1
             move = _refined(_even(one), _even(other), hann)
             if move is not None:
-                found.append(move)
+                found.append((*move, r, c))
     nothing = Shift(None, None, math.nan, windows, 0, pixel_m)
     if len(found) < _LEAST_WINDOWS:
         return nothing
-    moves = np.array(found)
+    moves, places = np.split(np.array(found, dtype=np.float64), 2, axis=1)
     # The densest place: the window with which most others agree.
     near = (np.hypot(*(moves[:, None] - moves[None]).transpose(2, 0, 1)) <= 2 * _AGREE_PX).sum(axis=1)
     middle = moves[np.argmax(near)]
     agreeing = moves[np.hypot(*(moves - middle).T) <= 2 * _AGREE_PX]
     middle = np.median(agreeing, axis=0)
-    agreeing = moves[np.hypot(*(moves - middle).T) <= 2 * _AGREE_PX]
+    together = np.hypot(*(moves - middle).T) <= 2 * _AGREE_PX
+    agreeing, places = moves[together], places[together]
     if len(agreeing) < max(_LEAST_WINDOWS, _LEAST_AGREEING * windows):
         return Shift(None, None, math.nan, windows, len(agreeing), pixel_m)
     x, y = np.median(agreeing, axis=0)
     scatter = max(nmad(agreeing[:, 0]), nmad(agreeing[:, 1]), 0.02)
     # Windows overlap by half: four of them are one; a median needs pi / 2 as many values as a mean.
-    error = scatter * math.sqrt(math.pi / 2 * 4 / len(agreeing))
+    error = math.hypot(scatter * math.sqrt(math.pi / 2 * 4 / len(agreeing)), _trend(agreeing, places, scatter))
     # A picture whose content lies x to the right is moved to the left.
     return Shift(float(-x) * pixel_m, float(y) * pixel_m, error * pixel_m, windows, len(agreeing), pixel_m)
+
+
+def _trend(moves: Float64[np.ndarray, "N 2"], places: Float64[np.ndarray, "N 2"], scatter: float) -> float:
+    """How far moves differ from place to place, by one sigma and beyond chance: surveys may be turned, too, or larger.
+
+    Args:
+        places: row and column of each.
+        scatter: of the moves, one sigma.
+    """
+    terms = places - places.mean(axis=0)
+    about = moves - moves.mean(axis=0)
+    trend = terms @ np.linalg.lstsq(terms, about, rcond=None)[0]
+    chance = terms.shape[1] * scatter**2 * 4 / len(moves)
+    return math.sqrt(max(0.0, float((trend**2).mean(axis=0).max()) - chance))
 
 
 def _refined(one: np.ndarray, other: np.ndarray, hann: np.ndarray) -> tuple[float, float] | None:

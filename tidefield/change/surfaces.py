@@ -130,6 +130,7 @@ class Surface:
         scale, offset: heights are the file's values times scale plus offset.
         sigma: raster of their standard errors, if there is one.
         filled: raster that is 1 where heights were filled in, which are no measurements.
+        classes: raster of what the cells show, as LAS numbers it.
         orthophoto, cloud: of the same survey, if there are any.
         source: name of the cloud that the surface was made of, or of the folder.
         date: YYYY-MM-DD of the photographs, if the file or its name tells.
@@ -148,6 +149,7 @@ class Surface:
     offset: float = 0.0
     sigma: Path | None = None
     filled: Path | None = None
+    classes: Path | None = None
     orthophoto: Path | None = None
     cloud: Path | None = None
     source: str | None = None
@@ -210,11 +212,13 @@ def warped(
     nodata: float | None = None,
     unknown: tuple[float, ...] = (),
     bands: tuple[int, ...] = (1,),
+    nearest: bool = False,
 ) -> Iterator[Callable[[int, int], Float32[np.ndarray, "bands rows columns"]]]:
     """Read rows of any raster on a grid as float32, NaN where it has no value.
 
     Args:
         unknown: further values of the first band that are none; the other bands are not read then.
+        nearest: of classes, between which there is nothing.
 
     Raises:
         ChangeError: the file cannot be read to its end.
@@ -238,7 +242,7 @@ def warped(
         size = max(dataset.width, dataset.height)
         same = same and max(abs(own.a / moved.a - 1), abs(own.e / moved.e - 1)) * size < 0.01
         aligned = same and max(abs(o - round(o)) for o in offset) < 0.01
-        resampling = Resampling.nearest if aligned else Resampling.bilinear
+        resampling = Resampling.nearest if aligned or nearest else Resampling.bilinear
         alpha = MaskFlags.alpha in dataset.mask_flag_enums[0] and not unknown
         options: dict[str, Any] = {} if alpha else {"nodata": math.nan}
         if nodata is not None and not alpha and not unknown:

@@ -129,10 +129,11 @@ def _heights(change: Change) -> tuple[Float32[np.ndarray, "rows columns"], Float
     with change.earlier.on_grid(change.grid) as read:
         for rows in change.grid.strips():
             heights[rows] = read(rows.start, rows.stop)
-    known = np.isfinite(change.dz) & np.isfinite(heights)
+    dz = change.with_water
+    known = np.isfinite(dz) & np.isfinite(heights)
     weight = np.maximum(uniform_filter(known.astype(np.float32), _SMOOTH, mode="constant"), np.float32(1e-6))
     found = []
-    for values in (heights, heights + change.dz):
+    for values in (heights, heights + dz):
         mean = uniform_filter(np.where(known, values, np.float32(0)), _SMOOTH, mode="constant") / weight
         mean[~known] = np.nan
         found.append(mean)
@@ -146,10 +147,11 @@ def _level_error(change: Change, earlier: np.ndarray, later: np.ndarray, levels:
         reach = _BAND * change.errors.cell_sigma(rows)
         for heights, level in ((earlier, levels[0]), (later, levels[1])):
             near[rows] |= np.abs(heights[rows] - level) < reach
-    near &= np.isfinite(change.dz)
+    dz = change.with_water
+    near &= np.isfinite(dz)
     if not near.any():
         return 0.0
-    volume = change.errors.volume(change.dz, near)
+    volume = change.errors.volume(dz, near)
     return volume.factor / Z95 * volume.sigma_m3 / volume.area_m2
 
 
