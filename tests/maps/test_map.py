@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,23 @@ def test_a_map_that_was_killed_continues_and_is_the_same(scene: Path, out: Path,
     with rasterio.open(out / DSM) as one, rasterio.open(tmp_path / "map" / DSM) as other:
         np.testing.assert_array_equal(one.read(1), other.read(1))
     assert not (tmp_path / "map" / make.TILES).exists()
+
+
+def test_a_map_does_not_continue_with_other_photographs(scene: Path, tmp_path: Path):
+    copy = shutil.copytree(scene, tmp_path / "scene")
+
+    def killed(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make, "render_tile", killed)
+        for _ in range(2):  # what was not changed goes on
+            with pytest.raises(KeyboardInterrupt):
+                mapped(copy, tmp_path / "map", area=polygon(tmp_path))
+        photograph = min((copy / "images").iterdir())
+        photograph.write_bytes(photograph.read_bytes() + b"0")
+        with pytest.raises(RunError, match="another scene or with other options"):
+            mapped(copy, tmp_path / "map", area=polygon(tmp_path))
 
 
 def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path, tmp_path: Path):

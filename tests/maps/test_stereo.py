@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from tidefield.data.load import load_scene
-from tidefield.geometry.cameras import Cameras
+from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.maps import surface
 from tidefield.maps.grid import Grid, MapFrame, Tile, map_frame
 from tidefield.maps.orthophoto import prior_of
 from tidefield.maps.stereo import Pairs, Rectified, choose_pairs, fill_gaps
-from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, sparse_surface
+from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, match, sparse_surface
 from tidefield.synthetic import make_survey, write_survey
 
 pytest.importorskip("rasterio")
@@ -81,6 +81,29 @@ def test_heights_are_those_of_the_flat(scene):
     )
 
 
+def test_what_is_masked_in_all_photographs_is_seen_by_none_and_matched_with_nothing(scene):
+    loaded, _ = scene
+    masks = []
+    for camera in (loaded.cameras[i] for i in range(len(loaded.names))):
+        to = camera.directions_world(pixel_grid(camera.width, camera.height)[None])[0]
+        position = camera.position_world[0] + loaded.origin_world.float()
+        east, north = (position - to * (position[2] / to[:, 2])[:, None])[:, :2].T
+        masks.append(((east.abs() > 3) | (north.abs() > 3)).reshape(camera.height, camera.width))
+    masked = replace(loaded, photographs=replace(loaded.photographs, masks=tuple(masks)))
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    start, hole = sparse_surface(loaded, grid.coarser(COARSEST)), slice(24, 40)
+    for one in (loaded, masked):
+        grey, choice = GreyPhotographs(one), choose_views(tile, one, start)
+        pairs = Pairs(choice.pairs, choice.views, choice.indices, grey, 1, CELL, 64)
+        found = match(tile, start, one, grey, CELL)
+        assert found is not None
+        assert found.count[:10].min() >= 2
+        assert np.isfinite(pairs.heights(-1.0, 1.0)[:10]).mean() > 0.8
+        seen, paired = found.count[hole, hole], np.isfinite(pairs.heights(-1.0, 1.0)[hole, hole])
+        assert (seen.max(), bool(paired.any())) == ((0, False) if one is masked else (9, True))
+
+
 def test_photographs_and_pairs_are_the_same_where_the_plan_is_in_feet(scene):
     loaded, _ = scene
     world, chosen = loaded.origin_world.double().numpy(), []
@@ -110,9 +133,9 @@ def test_cells_are_projected_into_the_photographs_above_them_only(scene, monkeyp
     projected = []
 
     class Counted(View):
-        def __init__(self, camera: Cameras, tile: Tile) -> None:
+        def __init__(self, camera: Cameras, tile: Tile, used: np.ndarray | None = None) -> None:
             projected.append(camera)
-            super().__init__(camera, tile)
+            super().__init__(camera, tile, used)
 
     monkeypatch.setattr(surface, "View", Counted)
     assert choose_views(tile, moved, start).indices == before.indices[1::2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from tidefield.errors import RunError
 from tidefield.files import reading_from
-from tidefield.geometry.geodesy import WGS84
+from tidefield.geometry.geodesy import WGS84, lost_in_conversion
 from tidefield.maps.grid import Grid, MapFrame, Tile
 
 LARGEST = 1 << 25
+_log = logging.getLogger(__name__)
 
 
 def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tuple[BaseGeometry, dict[str, Any]]]:
@@ -63,7 +65,10 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
     shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
     if frame.frame is not None:
-        to_map = Transformer.from_crs(crs, CRS.from_wkt(frame.horizontal_wkt), always_xy=True)
+        target = CRS.from_wkt(frame.horizontal_wkt)
+        to_map = Transformer.from_crs(crs, target, always_xy=True)
+        if lost := lost_in_conversion(crs, target):
+            _log.warning(f"{path.name}: coordinates {lost}")
 
         def converted(xy: np.ndarray) -> np.ndarray:
             return np.column_stack(to_map.transform(*xy.T))

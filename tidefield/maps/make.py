@@ -75,7 +75,7 @@ STRIP_CELLS = 1_000_000
 GDAL_CACHE_BYTES = 128_000_000
 """Memory of GDAL for blocks, beside those of a row of them in each raster, which would be written again and again
 otherwise. By itself it takes a twentieth of the machine's."""
-VERSION = 5
+VERSION = 6
 """Of tiles; to be raised with what they hold."""
 
 
@@ -139,6 +139,9 @@ class Job:
         frame, origin = grid.frame.frame, self.scene.origin_world.double().numpy()
         about += [np.round(origin, 6).tolist(), grid.frame.heights, None if frame is None else frame.to_json()]
         about += [self.tile_side, self.scene.cameras.size_px.tolist()]
+        # Of photographs, or masks, that were changed; copies of a scene have other dates and the same sizes.
+        files = [(file.path, file.mask) for file in self.scene.photographs.files]
+        about += [[path and path.stat().st_size for path in paths] for paths in files]
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 

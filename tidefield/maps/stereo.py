@@ -132,7 +132,7 @@ class Rectified:
         moved = view.displacement(x, y)
         if moved is not None:
             x, y = x + moved[0], y + moved[1]
-        inside = (q[2] > 0) & (x > 1) & (y > 1) & (x < view.size[0] - 1) & (y < view.size[1] - 1)
+        inside = (q[2] > 0) & view.shows(x, y, 1.0)
         scale = picture.shape[1] / view.size[0], picture.shape[0] / view.size[1]
         shown = cv2.remap(
             picture, x * scale[0] - 0.5, y * scale[1] - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

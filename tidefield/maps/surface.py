@@ -221,9 +221,10 @@ class View:
     Args:
         camera: of the photograph.
         tile: the cells.
+        used: pixels of the photograph that are not masked; None where it has no mask.
     """
 
-    def __init__(self, camera: Cameras, tile: Tile) -> None:
+    def __init__(self, camera: Cameras, tile: Tile, used: Bool[np.ndarray, "h w"] | None = None) -> None:
         affine = tile.affine()
         # Exact positions in double precision: single precision would cost a hundredth of a pixel.
         pose = camera.T_world_camera[0].double().numpy()
@@ -235,6 +236,7 @@ class View:
         self.matrix = (k @ rotation @ there).astype(np.float64)
         self.size = camera.width, camera.height
         self.camera = camera
+        self.used = used
         self.position = positions_from(tile, camera)[0]
         """East, north and height above `Grid.height` of the photograph, from the middle of the tile."""
         self.up = tile.grid.frame.up
@@ -271,11 +273,17 @@ class View:
     def sees(
         self, u: np.ndarray, v: np.ndarray, z: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray
     ) -> np.ndarray:
-        """Whether cells lie in the photograph, seen at no more than `STEEPEST_DEG` from the vertical."""
-        width, tall = self.size
-        b = BORDER_PX
-        inside = (z > 0) & (u > b) & (v > b) & (u < width - b) & (v < tall - b)
+        """Whether cells lie in the photograph, not masked, at no more than `STEEPEST_DEG` from the vertical."""
+        inside = (z > 0) & self.shows(u, v, BORDER_PX)
         return inside & _above(self.position, east, north, height, self.up)
+
+    def shows(self, u: np.ndarray, v: np.ndarray, border_px: float) -> Bool[np.ndarray, "*shape"]:
+        """Whether pixels lie in the photograph, so far from its border, and are not masked."""
+        width, height = self.size
+        inside = (u > border_px) & (v > border_px) & (u < width - border_px) & (v < height - border_px)
+        if self.used is not None:
+            inside[inside] = self.used[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+        return inside
 
     def rank(self, u: np.ndarray, v: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """How well cells are seen, as a network's neighbours of a view straight down are ranked (`data.neighbours`)."""
@@ -317,7 +325,8 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
     up, positions = tile.grid.frame.up, positions_from(tile, scene.cameras)
     near = _above(positions.T[..., None, None], east, north, height, up).any((1, 2))
     for index in np.flatnonzero(near).tolist():
-        view = View(scene.cameras[index], tile)
+        (mask,) = scene.photographs.masks_of([index]) or (None,)
+        view = View(scene.cameras[index], tile, None if mask is None else mask.numpy())
         u, v, z = view.pixels(east, north, height)
         sees = view.sees(u, v, z, height, east, north)
         if sees.any():
