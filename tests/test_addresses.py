@@ -63,9 +63,15 @@ def test_words_with_addresses_become_paths_and_back(bucket: Path):
     assert address_of(bucket) is None
 
 
-@pytest.mark.parametrize("word", ["ray://10.0.0.1:10001", "a/b", "C:/scene", "--width", "nothing-known://a"])
+@pytest.mark.parametrize("word", ["ray://10.0.0.1:10001", "RAY://a:1", "a/b", "C:/scene", "D://scene", "--width"])
 def test_other_words_stay(bucket: Path, word: str):
     assert local_word(word) == (word, None)
+
+
+def test_an_unknown_protocol_is_refused_and_no_folder_here(bucket: Path):
+    with pytest.raises(RunError, match=r"azure://flats/map has the protocol azure, which is not known: .*abfs"):
+        local_word("azure://flats/map")
+    assert local_word("S3://flats/map") == local_word("s3://flats/map")
 
 
 @pytest.mark.parametrize(
@@ -118,6 +124,34 @@ def test_results_are_sent_and_deleted_at_their_address(bucket: Path):
     assert push(path) == 2
     assert files(bucket / "map") == {"map.json": "{1}"}
     assert pull(path) == 0
+
+
+def test_a_copy_that_was_cleared_away_deletes_nothing_at_its_address(bucket: Path):
+    write(bucket, **{"photos/a.jpg": "one", "photos/b.jpg": "two"})
+    path = copy(bucket, "photos")
+    pull(path)
+    (path / "a.jpg").unlink()
+    assert push(path) == 0
+    assert files(bucket / "photos") == {"a.jpg": "one", "b.jpg": "two"}
+    pull(path)
+    assert files(path) == files(bucket / "photos")
+
+
+def test_a_copy_that_is_open_elsewhere_stays_known(bucket: Path, monkeypatch: pytest.MonkeyPatch):
+    write(bucket, **{"run/a.txt": "one", "run/b.txt": "two"})
+    path = copy(bucket, "run")
+    pull(path)
+    unlink = Path.unlink
+
+    def held(own: Path, missing_ok: bool = False) -> None:
+        if own.name == "a.txt":
+            raise PermissionError(13, "in use")
+        unlink(own, missing_ok)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", held)
+        assert addresses.clear() == [len("two")]
+    assert addresses.kept() == ([path / "a.txt"], [])
 
 
 def test_a_single_file_has_an_address_too(bucket: Path):

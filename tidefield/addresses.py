@@ -16,6 +16,7 @@ import re
 import shutil
 import sqlite3
 import stat
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
@@ -36,7 +37,9 @@ Progress = Callable[[int, int], None]
 COPIES = "addresses"
 """The folder of the cache that holds the copies."""
 _RECORDS, _LOCKS = ".records.sqlite", ".locks"
-_WORD = re.compile(r"(--[a-z][a-z-]*=)?([a-z][a-z0-9+.-]*)://(.*)", re.DOTALL)
+_WORD = re.compile(r"(--[a-z][a-z-]*=)?([a-z][a-z0-9+.-]+)://(.*)", re.DOTALL | re.IGNORECASE)  # longer than a drive
+_CLUSTER = "ray"
+"""Protocol of a cluster's address, which is none of files."""
 _NO_NAMES = re.compile(r"|\.\.?|.*[\0\\\\].*" + (r'|.*[:*?"<>|].*' if os.name == "nt" else ""), re.DOTALL)
 """What no file or folder can be called, or leads out of its folder."""
 _AT_ONCE = 64
@@ -72,13 +75,16 @@ def local_word(word: str) -> tuple[str, Path | None]:
         RunError: the address cannot have a copy.
     """
     found = _WORD.fullmatch(word)
-    if found is None:
+    if found is None or found[2].lower() == _CLUSTER:
         return word, None
-    option, protocol, rest = found.groups()
+    option, protocol, rest = found[1], found[2].lower(), found[3]
     from fsspec import available_protocols
 
-    if protocol not in available_protocols():  # such as ray://, of a cluster
-        return word, None
+    if protocol not in available_protocols():
+        raise RunError(
+            f"{word} has the protocol {found[2]}, which is not known: expected one of fsspec's, such as s3, gs, abfs "
+            "(of Azure), sftp or hdfs; correct it"
+        )
     path = copy_of(f"{protocol}://{rest}")
     return f"{option or ''}{path}", path
 
@@ -203,6 +209,9 @@ def pull(path: Path, progress: Progress | None = None) -> int:
 def push(path: Path, progress: Progress | None = None) -> int:
     """Send what has changed in a copy to its address, and delete there what was deleted here.
 
+    Where nothing changed, nothing was deleted by a command, which would have written something, too: the copy was
+    cleared away, and what is at the address stays.
+
     Returns:
         Files that were sent or deleted.
 
@@ -213,11 +222,13 @@ def push(path: Path, progress: Progress | None = None) -> int:
     if address is None:
         return 0
     with _locked(address), _reaching(address), _records() as records:
-        known = records.under(address)
         here = {part: version for part in _own_files(path) if (version := _version_here(_file(path, part)))}
+        known = records.under(address)  # after the files: what `clear` takes away it has forgotten before
         changed = [part for part, version in here.items() if part not in known or known[part].here != version]
         deleted = [part for part in known if part not in here]
-        if not changed and not deleted:
+        if not changed:
+            for part in deleted:
+                records.forget(address, part)
             return 0
         system, root = _system(address)
         there = _listing(system, root, address)
@@ -278,9 +289,13 @@ def clear() -> list[int]:
             for path in sent:
                 name = address_of(path)
                 assert name is not None, "it is a copy"
+                record = records.under(name)[""]
                 records.forget(name, "")  # first: what is on record and not here would be deleted there
-                path.unlink()
-    return sizes
+                try:
+                    path.unlink()
+                except PermissionError:  # on Windows, of a file that a program has open
+                    records.keep(name, "", record)
+    return [size for path, size in zip(sent, sizes, strict=True) if not path.exists()]
 
 
 def _root() -> Path | None:
@@ -393,7 +408,7 @@ def _fetch(
         system.get([file.name for file in there.values()], [str(partial) for partial in partials.values()])
     for part, file in there.items():
         if file.seconds is not None:  # the same on every machine: `prepare` knows unchanged photographs by it
-            os.utime(_file(path, part), (file.seconds, file.seconds))
+            os.utime(_file(path, part), (time.time(), file.seconds))
         here = _version_here(_file(path, part))
         assert here is not None, "it has just been copied"
         records.keep(address, part, _Record(file.version, here))
