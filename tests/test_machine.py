@@ -17,11 +17,30 @@ from tidefield.model.cache import LEAST_BYTES, MEMORY_SHARE, memory_for_features
 def test_memory_is_the_machine_s_or_its_container_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = tmp_path / "memory.max"
     monkeypatch.setattr(machine, "CONTAINER_LIMITS", (tmp_path / "none", limit))
+    monkeypatch.setattr(machine, "OWN_GROUPS", tmp_path / "cgroup")
     own = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     assert memory_bytes() == own
     for text, expected in (("max\n", own), (f"{own // 3}\n", own // 3), (f"{3 * own}\n", own)):
         limit.write_text(text)
         assert memory_bytes() == expected
+
+
+@pytest.mark.skipif(not hasattr(os, "sysconf"), reason="the system does not say")
+@pytest.mark.parametrize(
+    ("groups", "limit"),
+    [
+        ("0::/slurm/job_7/step_0\n", "slurm/job_7/memory.max"),
+        ("4:cpu,cpuacct:/a\n3:memory:/slurm/job_7\n0::/\n", "memory/slurm/job_7/memory.limit_in_bytes"),
+    ],
+)
+def test_memory_is_that_of_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: str, limit: str):
+    (tmp_path / "groups").write_text(groups)
+    files = tmp_path / "memory.max", tmp_path / "memory" / "memory.limit_in_bytes"
+    monkeypatch.setattr(machine, "CONTAINER_LIMITS", files)
+    monkeypatch.setattr(machine, "OWN_GROUPS", tmp_path / "groups")
+    (tmp_path / limit).parent.mkdir(parents=True)
+    (tmp_path / limit).write_text("1000000\n")
+    assert memory_bytes() == 1_000_000
 
 
 def test_features_have_a_share_of_the_memory_and_workers_of_one_core_a_part_of_it(monkeypatch: pytest.MonkeyPatch):

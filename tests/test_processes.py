@@ -157,3 +157,22 @@ def test_a_script_without_a_main_block_starts_workers(tmp_path: Path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr, done.returncode) == ("worked [1, 2]\n", "", 0)
+
+
+def test_a_pool_on_windows_has_no_more_processes_than_its_call_can_wait_for(monkeypatch: pytest.MonkeyPatch):
+    counts = []
+
+    class Pool:
+        def __init__(self, count: int, *_: object) -> None:
+            counts.append(count)
+
+        def shutdown(self, cancel_futures: bool) -> None:
+            pass
+
+    monkeypatch.setattr(processes, "_Pool", Pool)
+    for platform, count in (("win32", 128), ("win32", 4), ("linux", 128)):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "platform", platform)
+            with processes.worker_processes(count):
+                pass
+    assert counts == [61, 4, 128]

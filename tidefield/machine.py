@@ -10,6 +10,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -25,16 +26,33 @@ def cores() -> int:
 
 CONTAINER_LIMITS = tuple(Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory/memory.limit_in_bytes"))
 """Files of Linux's control groups, of both versions, with the limit of a container's memory."""
-UNKNOWN_MEMORY = 8_000_000_000
-"""Assumed where the system does not say: Python has no such call on Windows."""
+OWN_GROUPS = Path("/proc/self/cgroup")
+"""The control groups of this process, such as that of a job of Slurm: `number:controllers:path` in each line."""
 
 
 def memory_bytes() -> int:
-    """Memory that this process may use: the machine's, or the limit of its container."""
-    known = hasattr(os, "sysconf")
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if known else UNKNOWN_MEMORY
-    limits = [path.read_text().strip() for path in CONTAINER_LIMITS if path.exists()]
+    """Memory that this process may use: the machine's, or the limit of its container or job."""
+    if sys.platform == "win32":
+        status = (ctypes.c_ulonglong * 8)()  # MEMORYSTATUSEX: two numbers of 32 bits, and seven of 64
+        status[0] = ctypes.sizeof(status)
+        if ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)):
+            return int(status[1])
+        raise ctypes.WinError()
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limits = [path.read_text().strip() for path in (*CONTAINER_LIMITS, *_limits_of_groups()) if path.is_file()]
     return min([total, *(int(limit) for limit in limits if limit.isdigit())])
+
+
+def _limits_of_groups() -> Iterator[Path]:
+    """Files with the limits of this process's control groups, and of those that they are in."""
+    lines = OWN_GROUPS.read_text().splitlines() if OWN_GROUPS.is_file() else []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        of_root = CONTAINER_LIMITS[bool(controllers)]
+        for group in (Path(path), *Path(path).parents):
+            yield of_root.parent / group.relative_to("/") / of_root.name
 
 
 def tune_process() -> None:

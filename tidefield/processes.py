@@ -29,6 +29,8 @@ end_with_parent: Callable[[], object] | None = None
 whatever; on Linux only. Windows refuses any function."""
 if sys.platform == "linux":
     end_with_parent = partial(ctypes.CDLL(None).prctl, _SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+_MOST_ON_WINDOWS = 61
+"""Processes of a pool, which waits for them by a call of Windows that takes 63 handles."""
 Handler = Callable[[int, FrameType | None], object]
 
 
@@ -163,7 +165,8 @@ def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterato
     What they do and are given is of modules: they do not run the script that this process runs.
     They end with the block. After an error or a signal they do not finish what they are doing.
     """
-    pool = _Pool(count, _Context(), start_worker, initializers)
+    most = _MOST_ON_WINDOWS if sys.platform == "win32" else count
+    pool = _Pool(min(count, most), _Context(), start_worker, initializers)
     try:
         yield pool
     except BaseException:
