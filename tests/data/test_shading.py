@@ -9,9 +9,9 @@ import torch
 from captures import survey
 from torch import Tensor
 
-from tidefield.data.exposure import Seen, across_views
+from tidefield.data.exposure import Pairs, Seen, across_views
 from tidefield.data.scene import SparsePoints
-from tidefield.data.shading import directional_shading, estimate_shading
+from tidefield.data.shading import CORRELATION, _chain, directional_shading, estimate_shading
 from tidefield.geometry.cameras import Cameras, concatenate, pixel_grid
 
 COUNT, NOISE = 39, 0.01
@@ -189,3 +189,18 @@ def test_what_depends_on_the_direction_is_a_polynomial_over_each_frame():
     direction = directions(scene.cameras, points)
     assert np.ptp(direction @ by_direction) > 0.1
     np.testing.assert_allclose(found.numpy(), direction @ by_direction, atol=3e-3)
+
+
+def test_the_prior_of_consecutive_photographs_is_an_autoregression_of_unit_variance():
+    count = 6
+    pose = torch.eye(3, 4).repeat(count, 1, 1)
+    pose[4:, :, :2] *= -1  # the last two were flown the other way
+    two = torch.ones(count, 2)
+    cameras = Cameras(pose, two, two, torch.full((count, 2), 8), two, torch.ones(count, 3))
+    steps = np.arange(count - 1)
+    far = np.where(steps == 2, 1e9, 1.0)  # after a pause
+    inverse = _chain(cameras, Pairs(steps, steps + 1, far)).toarray()
+    covariance = np.linalg.inv(inverse)
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    group = np.array([0, 0, 0, 1, 2, 2])
+    np.testing.assert_allclose(covariance, np.where(group[:, None] == group, CORRELATION**apart, 0), atol=1e-12)

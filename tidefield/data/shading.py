@@ -342,6 +342,8 @@ def _chain(cameras: Cameras, sequence: Pairs) -> sparse.sparray:
     rows = np.tile(np.arange(len(a)), 2)
     ones = np.ones(len(a))
     difference = sparse.csr_array((np.r_[-ones, ones], (rows, np.r_[a, b])), shape=(len(a), len(cameras)))
-    own = (1 - CORRELATION) / (1 + CORRELATION)
-    link = CORRELATION / (1 - CORRELATION**2)
-    return own * sparse.eye_array(len(cameras)) + link * (difference.T @ difference)
+    left_over = 1 - CORRELATION**2
+    # Of one with k others beside it in the sequence: 1 / left_over at its ends, 1 for one that is alone.
+    links = np.bincount(np.r_[a, b], minlength=len(cameras))
+    own = np.where(links > 0, (1 + (links - 1) * CORRELATION**2) / left_over, 1.0) - links * CORRELATION / left_over
+    return sparse.diags_array(own) + CORRELATION / left_over * (difference.T @ difference)
