@@ -6,7 +6,7 @@ import pytest
 import textured_wall as wall
 import torch
 
-from tidefield.config import SWIFT
+from tidefield.config import PRESETS, SWIFT
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
 from tidefield.model import cache as feature_cache
 from tidefield.model.cache import (
@@ -90,6 +90,25 @@ def test_photographs_that_are_not_large_are_encoded_whole(network: Network, monk
     assert blocks == {(0, 0)}
     assert len(several) > 1
     torch.testing.assert_close(colour, in_blocks, atol=0.02, rtol=0)
+
+
+@pytest.mark.usefixtures("small_blocks")
+@torch.inference_mode()
+def test_networks_with_instance_norms_encode_whole_photographs_as_in_training():
+    torch.manual_seed(0)
+    paper, at = make_network(PRESETS["paper"].network).eval(), scene()
+    cache = FeatureCache(paper, at, CPU, cones=False)
+    view = at.cameras[1]
+    middle = view.position_world + 5 * view.directions_world(torch.tensor([[[20.0, 15.0]]]))[0]
+    views = cache.views(view, Neighbours(torch.full((1, 1), 1), torch.ones(1, 1, 4)), middle)
+    colours = at.photographs[1].permute(2, 0, 1)[None] / 255 / view.gain_at(torch.zeros(1, 1, 2))[0, 0, :, None, None]
+    whole = paper.encode(colours)
+    assert {block[2:] for block in cache._slots} == {(0, 0)}
+    for stride, maps in whole.features.items():
+        found = views.encoded.features[stride]
+        first = int(found.first[views.which[0, 0]])
+        rows = found.rows[first : first + len(maps.rows), : maps.channels]
+        torch.testing.assert_close(rows.float(), maps.rows.float(), atol=0.01, rtol=0.01)
 
 
 @pytest.mark.usefixtures("small_blocks")

@@ -31,6 +31,8 @@ from tidefield.recording import moved
 BLOCK_PX, WHOLE_PX = 512, 832
 """Side of the blocks that photographs are encoded in: bounds the encoder's memory, whatever the photographs' size. In a
 scene without a photograph larger than the second, whole ones are encoded: blocks would have up to twice the pixels."""
+MOST_NORMALISED_PX = 2048
+"""Side up to which photographs are encoded whole for networks with instance norms, whatever memory that takes."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
 MEMORY_SHARE, LEAST_BYTES = 0.09, 1_500_000_000
@@ -103,6 +105,8 @@ class FeatureCache:
             self._like = self._like.masked(patch[:, :1], torch.zeros(1, 2, device=device))
         size = scene.cameras.size_px[list(scene.train)]
         self._block_px = WHOLE_PX if size.max() <= WHOLE_PX else BLOCK_PX
+        if network.config.encoder.instance_norm:  # whose means are of all that is encoded at once, as in training
+            self._block_px = min(int(self.pyramid.cameras.size_px.max()), MOST_NORMALISED_PX)
         # Twice as many as the scene has at its own size: a moving camera reads some photographs at two.
         self._blocks = 2 * int(_block_counts(size, self._block_px).prod(-1).sum())
         self._make_slots(tuple(int(x) for x in size.clamp(max=self._block_px).amax(0)))
