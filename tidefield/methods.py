@@ -70,6 +70,10 @@ METHODS = {
 }
 
 
+UNTRAINED_DEVICE = "cpu"
+"""Where methods without training run."""
+
+
 def names(*kinds: Kind) -> tuple[str, ...]:
     """Names of the methods of some kinds, in the order of the table; of all kinds if none is given."""
     return tuple(name for name, method in METHODS.items() if not kinds or method.kind in kinds)

@@ -26,6 +26,7 @@ from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, make_curve
+from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.model.rendering import Rendering
 
@@ -96,13 +97,18 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
     run.mkdir()
     curve = make_curve(scene)
     budget = Budget(minutes=0.5)
-    done = driver.train("nerfacto", scene, run, budget, 0, CPU, curve, lambda step, seconds: steps.append(step))
+    (run / "data" / "masks").mkdir(parents=True)
+    (run / "data" / "masks" / "00000.png").touch()
+    seed = 20261130123000
+    done = driver.train("nerfacto", scene, run, budget, seed, CPU, curve, lambda step, seconds: steps.append(step))
     assert steps == [1, 2, 3, 3]
     assert (done.step, done.seconds) == (3, 30.0)
     ((seconds, psnr),) = json.loads((run / "curve.json").read_text())
     assert seconds == 20.0
     job = json.loads((run / "job.json").read_text())
     assert job["seconds"] == 30.0
+    assert 0 <= job["seed"] < 1 << 32
+    assert worker.read_job(run / "job.json", None, "cuda:1")["device"] == "cuda:1"
     assert job["curve_seconds"] == pytest.approx([30 * share for share in SHARES])
     assert len(job["curve_cameras"]) == len(curve.cameras)
     factor = torch.tensor(job["factor"])
@@ -120,6 +126,11 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert not (run / "rendering.npz").exists()
     assert driver.progress_of(run).step == 3
+    write_json(run / "job.json", {**job, "method": "splatfacto"})
+    with pytest.raises(RunError, match="splatfacto was asked for on cpu: expected CUDA"), driver.renderer(run, CPU):
+        pass
+    driver.delete_training(run)
+    assert not (run / "data" / "masks" / "00000.png").exists()
 
 
 def test_the_time_that_a_worker_renders_the_curve_in_is_not_that_of_training(

@@ -10,6 +10,7 @@ from scenes_on_disk import survey, write_colmap
 from tidefield.baselines import untrained
 from tidefield.baselines.untrained import nearest, plane_sweep, sparse_depth, sparse_depth_as_given
 from tidefield.data.load import load_scene
+from tidefield.geometry.cameras import Cameras
 
 
 def test_nearest_shows_the_next_photograph_on_the_surface():
@@ -116,6 +117,22 @@ def test_the_chunk_size_does_not_change_the_result(monkeypatch):
     whole = sparse_depth(scene)(scene.cameras[2])
     monkeypatch.setattr(untrained, "CHUNK", 5 * 100)
     torch.testing.assert_close(sparse_depth(scene)(scene.cameras[2]).colour, whole.colour)
+
+
+def test_nearest_never_projects_all_photographs_onto_all_pixels_at_once(monkeypatch):
+    scene = wall.scene(wall.cameras(6), test=(2,))
+    whole = nearest(scene)(scene.cameras[2])
+    monkeypatch.setattr(untrained, "CHUNK", 5 * 100)
+    project, most = Cameras.project, []
+
+    def counted(cameras: Cameras, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        most.append(len(cameras) * points.shape[-2])
+        return project(cameras, points)
+
+    monkeypatch.setattr(Cameras, "project", counted)
+    torch.testing.assert_close(nearest(scene)(scene.cameras[2]).colour, whole.colour)
+    pixels = 36 * 48
+    assert max(most) <= max(5 * 100, pixels)
 
 
 def test_unseen_ground_is_transparent_and_filled_from_next_to_it():

@@ -24,7 +24,7 @@ from tidefield.commands import demo
 from tidefield.commands.evaluate import Evaluate, evaluate
 from tidefield.commands.pretrain import PRETRAINING_FILE, Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
-from tidefield.commands.train import Train, _configuration, _require_its_options, train
+from tidefield.commands.train import USED_BEFORE, Train, _configuration, _require_its_options, train
 from tidefield.compare.run import read_evaluation
 from tidefield.config import PRESETS, Budget, Config
 from tidefield.errors import RunError, SceneError
@@ -32,8 +32,16 @@ from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import only_writer
 from tidefield.model.network import make_network
 from tidefield.processes import Ended
-from tidefield.train import checkpoint, pretrain, stream
-from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE, load_network, read_run, write_run, write_weights
+from tidefield.train import checkpoint, loop, pretrain, stream
+from tidefield.train.checkpoint import (
+    CHECKPOINT_FILE,
+    RUN_FILE,
+    load_network,
+    read_run,
+    read_weights_file,
+    write_run,
+    write_weights,
+)
 from tidefield.train.loop import SceneTrainer
 
 QUIET = Console(quiet=True)
@@ -259,6 +267,29 @@ def test_a_name_that_no_folder_can_have_is_one_clear_error(scene: Path, tmp_path
     assert os.listdir(tmp_path) == ["loop"]
 
 
+def test_methods_without_training_run_on_the_processor_alone(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"--device cuda is given with --method sparse-depth: .* on the processor"):
+        evaluate(Evaluate(scene, tmp_path / "out", method="sparse-depth", device="cuda"), QUIET)
+
+
+def test_curves_over_steps_of_programs_that_have_none_are_refused(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="--curve was given with --steps: nerfacto has curves over minutes only"):
+        start(scene, tmp_path / "run", method="nerfacto", curve=True)
+    assert not (tmp_path / "run" / "job.json").exists()
+
+
+def test_the_picture_of_a_training_is_a_small_one(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes: list[tuple[int, ...]] = []
+    monkeypatch.setattr(loop, "PICTURE_PX", 24)
+
+    def add_image(writer: object, tag: str, picture: Any, *_: object, **__: object) -> None:
+        shapes.append(picture.shape)
+
+    monkeypatch.setattr(loop.SummaryWriter, "add_image", add_image)
+    start(scene, tmp_path / "run")
+    assert shapes == [(18, 48, 3)]
+
+
 def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     start(scene, run)
@@ -301,8 +332,10 @@ def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
     for options in ({}, {"allow_missing": True}):
         with pytest.raises(RunError, match="or holds out others"):
             start(again, run, steps=4, resume=True, **options)
-    evaluate(Evaluate(run, device="cpu"), QUIET)
+    with pytest.raises(RunError, match=r"was trained when .* not held out: expected photographs that it did not learn"):
+        evaluate(Evaluate(run, device="cpu"), QUIET)
     assert [text for text in caplog.messages if "or holds out others" in text]
+    assert not (run / "evaluation.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -345,7 +378,7 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
         pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert not (tmp_path / "out").exists()
     (tmp_path / "out" / "scenes").mkdir(parents=True)
-    started = {"preset": "swift", "variant": None, "seed": 0, "real": []}
+    started, budget = {"preset": "swift", "variant": None, "seed": 0, "real": []}, {"minutes": None, "steps": 1}
     (tmp_path / "out" / PRETRAINING_FILE).write_text(json.dumps(started))
     (tmp_path / "out" / ".checkpoint-0123abcd.partial.safetensors").touch()
     with only_writer(tmp_path / "out"), pytest.raises(RunError, match="another process"):
@@ -353,12 +386,12 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
     assert {name for name in os.listdir(tmp_path / "out") if name.startswith(".")} == set()
     assert (tmp_path / "out" / CHECKPOINT_FILE).exists()
-    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
+    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == {**started, "budget": budget}
     (tmp_path / "out" / PRETRAINING_FILE).unlink()  # as of an earlier version
     with pytest.raises(RunError, match="does not fit"):
         pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, variant="with-ray-transformer"), QUIET)
     pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
-    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == started
+    assert json.loads((tmp_path / "out" / PRETRAINING_FILE).read_text()) == {**started, "budget": budget}
     with pytest.raises(SceneError, match="typo"):
         pretrain_command(Pretrain(tmp_path / "new", real=(tmp_path / "typo",), **options), QUIET)
     assert not (tmp_path / "new" / PRETRAINING_FILE).exists()
@@ -369,6 +402,36 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     ):
         with pytest.raises(RunError, match=f"was started with {was}: expected the same options"):
             pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, **others), QUIET)
+
+
+def test_a_pretraining_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = wall.scene(wall.cameras(5), (1, 3))
+    drawn = stream.Drawn(at, stream.DepthPriors(at), at.cameras)
+    monkeypatch.setattr(stream.Stream, "draw", lambda *_: drawn)
+    monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": at})
+    out, said = tmp_path / "out", io.StringIO()
+
+    def steps(console: Console = QUIET, **options: Any) -> int:
+        pretrain_command(Pretrain(out, device="cpu", **options), console)
+        return int(read_weights_file(out / "weights.safetensors")[0]["steps"])
+
+    step = SceneTrainer.step
+
+    def interrupted(trainer: SceneTrainer, budget: Budget) -> float:
+        assert budget == Budget(steps=3)
+        os.kill(os.getpid(), signal.SIGINT)
+        return step(trainer, budget)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneTrainer, "step", interrupted)
+        with pytest.raises(Ended):
+            steps(budget=Budget(steps=3))
+    assert steps(resume=True) == 3
+    assert steps(Console(file=said), resume=True) == 3
+    assert USED_BEFORE in said.getvalue()
+    assert steps(resume=True, budget=Budget(steps=4)) == 4
 
 
 def test_a_pretraining_does_not_continue_a_run_of_one_scene(scene: Path, tmp_path: Path) -> None:

@@ -177,6 +177,12 @@ def test_a_variant_of_a_variant_is_compared_with_that_one(flats: Scene):
     assert pointless.title.startswith("Of no-sparse-points: ")
 
 
+def test_a_variant_of_several_parts_is_measured_with_what_it_is_compared_with():
+    names = variants(("no-agreement+views-2", "views-2", "views-2"), "swift", 2)
+    one = ("tidefield", "no-agreement", "no-agreement+views-2", "views-2")
+    assert names == (*one, *(f"{name}-seed-1" for name in one))
+
+
 def test_a_variant_of_what_was_not_measured_has_no_difference(flats: Scene):
     (table,) = ablation_tables(results(flats, {"flats": {"no-agreement+views-2": 27.0}}))
     assert [row[:4] for row in table.rows] == [["no-agreement", "0", "-", "-"], ["no-agreement+views-2", "1", "-", "-"]]

@@ -44,6 +44,7 @@ from tidefield.compare.tables import (
     paper_table,
     quality_tables,
     trainings,
+    untrained_limits,
     widths,
     write_comparison,
 )
@@ -215,6 +216,22 @@ def test_columns_of_presets_say_what_they_began_with(disk: Path):
     assert column(None, None) == "The column `paper` began with random weights and was trained for 404 to 496 steps."
     assert column("f00d", "f00d", steps=(7, 7)).endswith("began with trained weights and was trained for 7 steps.")
     assert "random or trained weights" in column(None, "f00d")
+
+
+def test_tables_of_a_gpu_say_what_ran_on_the_processor_and_have_its_memory(disk: Path, tmp_path: Path):
+    run = Children(load_scene(disk, width=48))
+    compare({"a": disk}, ("tidefield", "nearest"), SETTINGS, tmp_path, run, quiet)
+    results = read_results(tmp_path, ["a"], ["tidefield", "nearest"])
+    assert untrained_limits(results, "cpu") == []
+    assert untrained_limits(replace(results, methods=("tidefield",)), "cuda") == []
+    (sentence,) = untrained_limits(results, "cuda")
+    assert sentence == "Without training, on the processor: nearest. Their times are not those of cuda."
+    assert "GPU memory, GB (evaluate)" not in cost_table(results).columns
+    one = results.by["a", "tidefield"]
+    on_gpu = replace(one, evaluation={**one.evaluation, "peak_cuda_memory_bytes": 2_500_000_000})
+    table = cost_table(replace(results, by={**results.by, ("a", "tidefield"): on_gpu}))
+    assert [row[-1] for row in table.rows] == ["2.50", "-"]
+    assert table.columns[-1] == "GPU memory, GB (evaluate)"
 
 
 def test_the_best_is_bold_and_means_need_every_scene(disk: Path, tmp_path: Path):

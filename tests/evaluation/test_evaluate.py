@@ -209,12 +209,22 @@ def test_an_evaluation_is_only_overwritten_on_request(scene, tmp_path):
 def test_weights_are_downloaded_when_an_evaluation_can_be_written_only(scene, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr("tidefield.evaluation.evaluate.download_lpips_weights", lambda: asked.append(True))
+    monkeypatch.setattr(module, "prepare_torchvision", lambda: None)
     evaluate(perfect, scene, tmp_path, configuration={}, console=quiet())
     with pytest.raises(RunError):
         evaluate(perfect, scene, tmp_path, configuration={}, console=quiet(), download_lpips=True)
     assert asked == []
     evaluate(perfect, scene, tmp_path, configuration={}, console=quiet(), overwrite=True, download_lpips=True)
     assert asked == [True]
+
+
+def test_weights_that_nothing_can_use_are_not_downloaded(scene, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "download_lpips_weights", lambda: asked.append(True))
+    monkeypatch.setattr(module, "prepare_torchvision", lambda: "torchvision is not installed")
+    with pytest.raises(RunError, match="--download-lpips was given, but torchvision is not installed"):
+        evaluate(perfect, scene, tmp_path, configuration={}, console=quiet(), download_lpips=True)
+    assert asked == []
 
 
 def test_a_rendering_that_is_not_finite_is_named(scene, tmp_path):

@@ -84,6 +84,18 @@ def test_a_missing_network_leaves_nulls_with_its_reason_and_all_other_metrics():
     assert {scores.reasons[name] for name in missing} == {"it is not here"}
 
 
+def test_images_that_are_too_large_for_the_memory_have_a_reason_and_all_other_metrics(monkeypatch):
+    def network(*_: object) -> list[float]:
+        raise MemoryError
+
+    image, truth = noise(1), noise(2)
+    monkeypatch.setattr(lpips, "memory_bytes", lambda: 2 * 1500 * 80 * 64 - 1)
+    assert lpips.too_large("lpips_alex", 80, 64) is None
+    scores = score(image, truth, torch.ones(64, 80, dtype=torch.bool), {"lpips_alex": "gone", "lpips_vgg": network})
+    assert scores.reasons["lpips_vgg"].startswith("LPIPS of 80 x 64 pixels takes 0.0 GB, more than half of this")
+    assert scores.values["psnr"] is not None
+
+
 def test_a_download_without_a_connection_says_what_to_do(checkpoints, monkeypatch):
     def fail(url: str, dst: str, hash_prefix: str) -> None:
         assert url == lpips.WEIGHTS_URL + "alexnet-owt-7be5be79.pth"

@@ -75,16 +75,18 @@ def nearest(scene: Scene, doubled: Scene | None = None) -> Render:
         indices = scene.sources(camera)
         sources = scene.cameras[list(indices)]
         depth = surface_depth(camera, scene.points, scene.cameras)
-        points_world = surface_points(camera, depth)
-        uv, z = sources.project(points_world)
-        seen = in_frame(sources, uv, z, scene.photographs.masks_of(indices))
+        points_world, masks_of = surface_points(camera, depth), scene.photographs.masks_of
+        overlap = torch.zeros(len(indices), dtype=torch.long)
+        for chunk in points_world.split(max(1, CHUNK // len(indices))):
+            overlap += in_frame(sources, *sources.project(chunk), masks_of(indices)).sum(1)
         distance = (sources.position_world - camera.position_world).norm(dim=-1)
-        overlap = seen.float().mean(1)
         best = int(distance.masked_fill(overlap < overlap.max() / 2, torch.inf).argmin())
+        uv, z = sources[best].project(points_world)
+        seen = in_frame(sources[best], uv, z, masks_of([indices[best]]))[0]
         colour = torch.zeros_like(points_world)
-        if seen[best].any():
-            colour[seen[best]] = read_photograph(scene, indices[best], uv[best, seen[best]], doubled)
-        return _filled(camera, colour, depth, seen[best])
+        if seen.any():
+            colour[seen] = read_photograph(scene, indices[best], uv[0, seen], doubled)
+        return _filled(camera, colour, depth, seen)
 
     return render
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,8 +20,8 @@ from tidefield.commands.common import (
     open_trained,
     open_zero_shot,
 )
-from tidefield.errors import RunError
-from tidefield.methods import untrained
+from tidefield.errors import RunError, list_names
+from tidefield.methods import UNTRAINED_DEVICE, untrained
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -79,8 +80,14 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
             )
         opened = open_trained(source, choose_device(options.device), options.allow_missing, console, sampling)
         with opened as (scene, render, record):
+            _refuse_learned(source, scene.held_out)
             truth = scene if options.width is None else at_width(scene, options.width)
             return evaluate_method(render, truth, out or source, configuration=record, **settings)
+    if method is not None and options.device not in ("auto", UNTRAINED_DEVICE):
+        raise RunError(
+            f"--device {options.device} is given with --method {method}: methods without training run on the "
+            "processor; leave it out"
+        )
     if out is None:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
     scene = load(source, options.opened_width or options.width, options.allow_missing, console)
@@ -92,3 +99,16 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
     truth = scene if options.opened_width is None or options.width is None else at_width(scene, options.width)
     return evaluate_method(render, truth, out, configuration=record, **settings)
+
+
+def _refuse_learned(folder: Path, held_out: Sequence[str]) -> None:
+    """Raises: RunError when a run may have learned from photographs that its scene holds out now."""
+    from tidefield.train.checkpoint import read_run
+
+    kept = read_run(folder).held_out
+    learned = [] if kept is None else [name for name in held_out if name not in kept]
+    if learned:
+        raise RunError(
+            f"{folder} was trained when {list_names(learned)} {'was' if len(learned) == 1 else 'were'} not held out: "
+            "expected photographs that it did not learn from; train it again (--overwrite)"
+        )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
-from tidefield.commands.train import report_end
+from tidefield.commands.train import USED_BEFORE, report_end
 from tidefield.config import PRESETS, Budget, Config, checked_seed, vary
 from tidefield.errors import RunError
 from tidefield.files import delete_partials, is_empty, only_writer, read_json, write_json
@@ -45,8 +45,8 @@ class Pretrain:
     """Of the weights, the scenes and their order."""
     device: Device = "auto"
     resume: bool = False
-    """Continue the training in the folder, with the options that it was started with; only the budget may be another,
-    and counts from its start."""
+    """Continue the training in the folder, with the options that it was started with, to the end of its budget or of a
+    new one, which counts from its start."""
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
@@ -63,6 +63,8 @@ def pretrain(options: Pretrain, console: Console) -> None:
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
     if options.resume:
         _require_same(folder, _record(options))
+        if options.budget == Budget():
+            budget = _budget_of(folder) or budget
     if occupied and not options.resume:
         raise RunError(f"{folder} is not empty: expected a new folder; choose another, or continue it with --resume")
     if not across.is_main_process():
@@ -93,7 +95,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         for scene in options.real:  # a name that is mistyped leaves the folder as it is
             read_posed(scene, allow_missing=False)
         if not options.resume:
-            write_json(folder / PRETRAINING_FILE, _record(options))
+            write_json(folder / PRETRAINING_FILE, {**_record(options), "budget": asdict(budget)})
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
         shown = next(iter(validation.scenes.values()))
@@ -101,7 +103,9 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         if options.resume:
             trainer.resume(folder)
             if trainer.is_main_process:  # an older one may lack it
-                write_json(folder / PRETRAINING_FILE, _record(options))
+                write_json(folder / PRETRAINING_FILE, {**_record(options), "budget": asdict(budget)})
+            if budget.share(trainer.progress.step, trainer.progress.seconds) >= 1:
+                console.print(USED_BEFORE, highlight=False)
         stopped = train(trainer, folder, budget, console, validation)
     if trainer.is_main_process:
         done = trainer.progress
@@ -122,6 +126,18 @@ def _record(options: Pretrain) -> dict[str, Any]:
     """What must not change while a training is continued: its weights tell what they learned from."""
     real = sorted(scene.resolve().name for scene in options.real)
     return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
+
+
+def _budget_of(folder: Path) -> Budget | None:
+    """The budget that a training was started or last continued with; None where an older one states none."""
+    found = read_json(folder / PRETRAINING_FILE)
+    stated = found.get("budget") if isinstance(found, dict) else None
+    if not isinstance(stated, dict):
+        return None
+    minutes, steps = stated.get("minutes"), stated.get("steps")
+    if not (isinstance(minutes, int | float | None) and isinstance(steps, int | None)):
+        raise RunError(f"{folder / PRETRAINING_FILE} has the budget {stated}: expected minutes or steps; give one")
+    return Budget(minutes=minutes, steps=steps).checked()
 
 
 def _require_same(folder: Path, record: dict[str, Any]) -> None:

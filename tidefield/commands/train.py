@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 AGAIN = "the same command with --resume"
+USED_BEFORE = "the budget was used before: --minutes or --steps give a larger one"
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,11 @@ def _train(options: Train, console: Console, again: str) -> None:
         raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
     if options.view and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
         raise RunError(f"{run.config.method} trains in a program of its own: --view shows our methods; leave it out")
+    if options.curve and budget.minutes is None and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+        raise RunError(
+            f"--curve was given with --steps: {run.config.method} has curves over minutes only; give --minutes, or "
+            "leave --curve out"
+        )
     curve = make_curve(scene) if options.curve else None
     start = f", starting from {weights}" if weights else ""
     log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
@@ -172,11 +178,11 @@ def _train(options: Train, console: Console, again: str) -> None:
             if options.view:
                 from tidefield.viewer.training import TrainingPage
 
-                page = stack.enter_context(TrainingPage(trainer, folder.resolve().name, "127.0.0.1", options.port))
+                page = stack.enter_context(TrainingPage(trainer, folder, "127.0.0.1", options.port))
                 console.print(f"{page.page.address} shows it", highlight=False, soft_wrap=True)
                 callback = _both(callback, page)
             if used >= 1:
-                console.print("the budget was used before: --minutes or --steps give a larger one", highlight=False)
+                console.print(USED_BEFORE, highlight=False)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
     report_end(progress, stopped, folder, console, again)
 

@@ -56,8 +56,14 @@ class Difference:
 
 
 def variants(chosen: Sequence[str], preset: str, seeds: int) -> tuple[str, ...]:
-    """The whole network and its variants, all that the preset has where none is chosen, once with each seed."""
-    names = (WHOLE, *(chosen or variants_of(PRESETS[preset])))
+    """The whole network and its variants, all that the preset has where none is chosen, once with each seed.
+
+    Variants of several parts come with those that they are compared with.
+    """
+    names = {WHOLE: None}
+    for name in chosen or variants_of(PRESETS[preset]):
+        parts = name.split("+")
+        names |= dict.fromkeys("+".join(parts[:count]) for count in range(1, len(parts) + 1))
     return tuple(of_seed(name, seed) for seed in range(seeds) for name in names)
 
 

@@ -30,7 +30,7 @@ from tidefield.config import PROTOCOL
 from tidefield.errors import RunError, SceneError
 from tidefield.files import completed_folder, only_writer, read_json, write_json
 from tidefield.machine import describe
-from tidefield.methods import METHODS
+from tidefield.methods import METHODS, UNTRAINED_DEVICE
 from tidefield.processes import Ended, end_with_parent
 
 WHOLE = "tidefield"
@@ -250,7 +250,9 @@ def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict
         source = ["--zero-shot", "--preset", str(preset)]
     else:
         source = ["--method", method]
-    if kind in ("zero-shot", "untrained"):
+    if kind == "untrained":
+        return {"evaluate": ["evaluate", str(scene), str(folder), *source, *width, "--device", UNTRAINED_DEVICE]}
+    if kind == "zero-shot":
         return {"evaluate": ["evaluate", str(scene), str(folder), *source, *width, *device]}
     if settings.minutes is not None:
         budget = ["--minutes", f"{settings.minutes:g}", "--curve"]

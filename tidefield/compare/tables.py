@@ -12,11 +12,12 @@ from typing import Any
 from tidefield.compare.results import Results, figures_of
 from tidefield.compare.run import Settings
 from tidefield.config import PRESETS
+from tidefield.data.load import DOUBLED_BYTES
 from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json, write_text
 from tidefield.machine import describe
-from tidefield.methods import METHODS
+from tidefield.methods import METHODS, UNTRAINED_DEVICE
 
 NOTHING, MEAN = "-", "mean"
 REGIONS = {
@@ -189,6 +190,8 @@ def paper_table(
 def cost_table(results: Results) -> Table:
     """Time, speed and memory of each method."""
     columns = ["scene, method", "training, min", "steps", "s per frame", "rays/s", "memory, GB (train, evaluate)"]
+    on_gpu = any(result.evaluation.get("peak_cuda_memory_bytes") for result in results.by.values())
+    columns += ["GPU memory, GB (evaluate)"] if on_gpu else []
     rows = []
     for scene, method in ((scene, method) for scene in results.scenes for method in results.methods):
         if (result := results.by.get((scene, method))) is None:
@@ -205,8 +208,19 @@ def cost_table(results: Results) -> Table:
                 ", ".join(shown(peak and peak / 1e9, "{:.2f}") for peak in peaks),
             ]
         )
+        if on_gpu:
+            peak = result.evaluation.get("peak_cuda_memory_bytes")
+            rows[-1].append(shown(peak and peak / 1e9, "{:.2f}"))
     title = "Time and memory (of an evaluation, the networks of LPIPS included where they were used)"
     return Table(title, columns, rows)
+
+
+def untrained_limits(results: Results, device: str) -> list[str]:
+    """What runs on the processor beside methods that run elsewhere."""
+    names = [method for method in results.methods if method in METHODS and METHODS[method].kind == "untrained"]
+    if not names or device == UNTRAINED_DEVICE:
+        return []
+    return [f"Without training, on the processor: {', '.join(names)}. Their times are not those of {device}."]
 
 
 def nerfacto_limits(results: Results) -> list[str]:
@@ -388,10 +402,12 @@ def write_tables(
         f"# {title}",
         "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
         f"and {budget} of training, one after another. Our presets and methods without training read what lies between "
-        "pixels from files of twice the width, where there are such.",
+        "pixels from files of twice the width, where there are such; methods without training and training itself do "
+        f"so where those of a scene take {DOUBLED_BYTES / 1e9:g} GB at most.",
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
         f"{settings.device}; photographs {widths(results)} px wide; Tidefield {made['version']}, torch "
         f"{machine['torch']}; {made['date']}.",
+        *untrained_limits(results, settings.device),
         *nerfacto_limits(results),
         *opensplat_limits(results),
         *remarks,

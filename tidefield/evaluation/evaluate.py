@@ -25,7 +25,7 @@ from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips
+from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips, prepare_torchvision
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
@@ -87,6 +87,8 @@ def evaluate(
     delete_partials(path, *(out / folder / file for folder in FOLDERS for file in files))
     photographs: dict[str, dict[str, Any]] = {}
     if download_lpips:
+        if unusable := prepare_torchvision():
+            raise RunError(f"--download-lpips was given, but {unusable}: expected what can use the weights; install it")
         download_lpips_weights()
     networks = load_lpips()
     with ProgressBar(console, "Evaluating") as bar:

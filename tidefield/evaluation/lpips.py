@@ -23,6 +23,7 @@ from torch import Tensor
 
 from tidefield.errors import RunError
 from tidefield.files import file_sha256
+from tidefield.machine import memory_bytes
 
 BACKBONES: dict[str, tuple[Literal["alex", "vgg"], str]] = {
     "lpips_alex": ("alex", "alexnet-owt-7be5be79.pth"),
@@ -31,6 +32,20 @@ BACKBONES: dict[str, tuple[Literal["alex", "vgg"], str]] = {
 """By metric: torchmetrics' name of the backbone, and its weights file, named with the start of its SHA-256."""
 WEIGHTS_URL = "https://download.pytorch.org/models/"
 SMALLEST_PX = 32  # AlexNet's poolings leave nothing of a smaller image
+PIXEL_BYTES = {"lpips_alex": 150, "lpips_vgg": 1500}
+"""Memory for each pixel: all layers' features of the truth, and those of the image as they are and of unit length."""
+_MEMORY_SHARE = 0.5
+
+
+def too_large(metric: str, width: int, height: int) -> str | None:
+    """The reason why LPIPS cannot be computed of images of a size in this machine's memory; None if it can."""
+    needed = PIXEL_BYTES[metric] * width * height
+    if needed <= _MEMORY_SHARE * memory_bytes():
+        return None
+    return (
+        f"LPIPS of {width} x {height} pixels takes {needed / 1e9:.1f} GB, more than half of this machine's memory; "
+        "evaluate at a smaller width"
+    )
 
 
 class Lpips:

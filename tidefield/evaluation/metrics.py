@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from tidefield.evaluation.lpips import BACKBONES, SMALLEST_PX, Lpips, prepare_torchvision
+from tidefield.evaluation.lpips import BACKBONES, SMALLEST_PX, Lpips, prepare_torchvision, too_large
 
 SUFFIXES = ("", "_seen", "_cc", "_seen_cc")
 """Over all pixels, over the doubly seen ones, and both after a colour fit to the same pixels."""
@@ -112,6 +112,8 @@ def _score_image(
         network = networks[metric]
         if min(image.shape[:2]) < SMALLEST_PX:
             network = f"LPIPS needs images of at least {SMALLEST_PX} pixels each way; evaluate at a larger width"
+        elif not isinstance(network, str):
+            network = too_large(metric, image.shape[1], image.shape[0]) or network
         if isinstance(network, str):
             for suffix in masks:
                 add_missing(metric, suffix, network)

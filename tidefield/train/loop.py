@@ -19,6 +19,7 @@ import torch
 from rich.console import Console
 from tensorboardX import SummaryWriter
 from torch import nn
+from torch.nn import functional as F
 
 from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
 from tidefield.data.areas import Area, cut, select
@@ -49,7 +50,7 @@ from tidefield.train.losses import BatchLoss, Inputs
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 60.0
-PICTURE_SECONDS = 300.0
+PICTURE_SECONDS, PICTURE_PX = 300.0, 400
 FINAL_RATE = 0.02
 """Learning rate at the end, as a share of its peak; it falls along half a cosine."""
 STEPS_EACH = 200
@@ -362,7 +363,7 @@ def train(
             if now - saved > SAVE_SECONDS:
                 trainer.save(folder)
                 saved = now
-            if now - pictured > PICTURE_SECONDS:
+            if now - pictured > PICTURE_SECONDS and stopped_by() is None:
                 _write_picture(trainer, writer)
                 pictured = time.monotonic()
         if trainer.is_main_process:
@@ -374,11 +375,16 @@ def train(
 
 
 def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:
-    """Write a held-out view, if there is one, as TensorBoard picture."""
+    """Write a held-out view, if there is one, as TensorBoard picture: a small one, as it takes time from nobody's
+    budget."""
     scene = trainer.scene
     index = (scene.test or scene.train)[0]
-    (rendering,) = trainer.views([scene.cameras[index]])
-    both = torch.cat([scene.photographs[index].float() / 255, rendering.colour], dim=1)
+    camera = scene.cameras[index]
+    share = min(1.0, PICTURE_PX / max(camera.width, camera.height))
+    width, height = (max(1, round(share * side)) for side in (camera.width, camera.height))
+    (rendering,) = trainer.views([camera.resized(width, height)])
+    truth = F.interpolate(scene.photographs[index].permute(2, 0, 1)[None].float() / 255, (height, width), mode="area")
+    both = torch.cat([truth[0].permute(1, 2, 0), rendering.colour], dim=1)
     writer.add_image("truth and rendering", both.numpy(), trainer.progress.step, dataformats="HWC")
 
 

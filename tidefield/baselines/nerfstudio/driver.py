@@ -74,6 +74,7 @@ def delete_training(folder: Path) -> None:
         f"{DATA}/transforms.json",
         f"{DATA}/*.ply",
         f"{DATA}/images/?????.png",
+        f"{DATA}/masks/?????.png",
     )
     found = (folder.glob(name) for name in (*names, f"{CURVE}/*.npz", "nerfstudio/*/run/**/*"))
     if (folder / JOB_FILE).exists():
@@ -111,7 +112,7 @@ def train(
         "method": method,
         "steps": budget.steps,
         "seconds": seconds,
-        "seed": seed,
+        "seed": seed % (1 << 32),  # more than this NumPy does not take
         "device": str(device),
         "curve_seconds": [share * seconds for share in SHARES] if curve and seconds else [],
         "curve_cameras": [camera_to_json(camera) for camera in curve.cameras] if curve else [],
@@ -136,7 +137,7 @@ def train(
 
 
 def require(method: NerfstudioMethod, device: torch.device) -> None:
-    """Raises: RunError when the method cannot be trained here."""
+    """Raises: RunError when the method does not run on a device, or nerfstudio is not installed."""
     if method == "splatfacto" and device.type != "cuda":
         raise RunError(
             f"splatfacto was asked for on {device}: expected CUDA, its only device; leave it out, or --device"
@@ -160,16 +161,18 @@ def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
 
     Args:
         folder: of the run.
-        device: which GPU to render on, where it was trained on one.
+        device: to render on.
 
     Raises:
-        RunError: nerfstudio is not installed, or fails.
+        RunError: nerfstudio is not installed, or fails, or the method does not run on the device.
     """
+    if read_job(folder / JOB_FILE, "a checkpoint").get("method") == "splatfacto":
+        require("splatfacto", device)
     colours = _read_job(folder)[1]
     with ExitStack() as stack:
         own = Path(stack.enter_context(TemporaryDirectory()))
         file = own / "rendering.npz"
-        worker = stack.enter_context(_worker(["render", folder / JOB_FILE, own], own / LOG_FILE, device))
+        worker = stack.enter_context(_worker(["render", folder / JOB_FILE, own, device], own / LOG_FILE, device))
         worker.answer()  # once it has loaded
 
         def render(camera: Cameras) -> Rendering:
@@ -218,7 +221,7 @@ class _Process:
 
 
 @contextmanager
-def _worker(words: Sequence[str | Path], log_file: Path, device: torch.device) -> Iterator[_Process]:
+def _worker(words: Sequence[str | Path | torch.device], log_file: Path, device: torch.device) -> Iterator[_Process]:
     command = [str(python()), str(WORKER), *map(str, words)]
     with log_file.open("a", encoding="utf-8") as said:
         process = subprocess.Popen(

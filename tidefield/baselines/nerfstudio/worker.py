@@ -60,15 +60,17 @@ class TimeIsUp(Exception):
     """The budget is used."""
 
 
-def read_job(file: Path, out: Path | None = None) -> dict[str, Any]:
+def read_job(file: Path, out: Path | None = None, device: str | None = None) -> dict[str, Any]:
     """Read a job, whose run may have been moved since it was written: it is the folder that the file is in now.
 
     Args:
         out: where nerfstudio writes to; the run's folder if not given.
+        device: to compute on; that of the job if not given.
     """
     run = file.parent.resolve()
-    places = {"run": str(run), "data": str(run / "data"), "out": str(out or run)}
-    return json.loads(file.read_text(encoding="utf-8")) | places
+    changed = {"run": str(run), "data": str(run / "data"), "out": str(out or run)}
+    changed |= {} if device is None else {"device": device}
+    return json.loads(file.read_text(encoding="utf-8")) | changed
 
 
 def answer(**values: Any) -> None:
@@ -281,7 +283,7 @@ def check(_: dict[str, Any]) -> None:
 
 def main() -> None:
     kind, *paths = sys.argv[1:]
-    job = read_job(*map(Path, paths)) if paths else {}
+    job = read_job(*map(Path, paths[:2]), *paths[2:]) if paths else {}
     load_only_weights()
     without_compiled_torchvision()
     import torchmetrics.image.lpip
