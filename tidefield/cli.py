@@ -72,13 +72,13 @@ _NO_MEMORY = re.compile("out of memory|(can't|cannot) allocate memory|not enough
 DESCRIPTION = """New views of tidal flats from drone photographs.
 
 The usual order of commands:
-  tidefield prepare PHOTOS SCENE    photographs become a scene (or: tidefield import PROJECT SCENE)
-  tidefield train SCENE RUN         learn the scene
-  tidefield evaluate RUN            measure quality on held-out photographs
-  tidefield render RUN OUT.mp4      views and videos; with --zero-shot from SCENE, without training
-  tidefield view RUN                look at it in a browser; with --zero-shot from SCENE
-  tidefield map RUN OUT             orthophoto, surface model and point cloud; with --zero-shot from SCENE
-  tidefield change FIRST LATER OUT  what changed between two surveys, with volumes and intervals
+  tidefield prepare PHOTOS SCENE      photographs become a scene (or: tidefield import PROJECT SCENE)
+  tidefield train SCENE RUN           learn the scene
+  tidefield evaluate RUN              measure quality on held-out photographs
+  tidefield render RUN OUT.mp4        views and videos; with --zero-shot from SCENE, without training
+  tidefield view RUN                  look at it in a browser; with --zero-shot from SCENE
+  tidefield map RUN OUT               orthophoto, surface model and point cloud; with --zero-shot from SCENE
+  tidefield change EARLIER LATER OUT  what changed between two surveys, with volumes and intervals
 
 tidefield demo trains, evaluates and renders on a built-in scene."""
 

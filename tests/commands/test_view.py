@@ -57,6 +57,15 @@ def test_a_scene_whose_photographs_went_is_one_clear_error(scene: Path):
     refused("9 of the 9 photographs .* are missing", scene, zero=ZeroShot(zero_shot=True))
 
 
+def test_options_of_scenes_are_refused_with_maps(tmp_path: Path):
+    pytest.importorskip("rasterio")
+    from map_folders import write_map
+
+    folder = write_map(tmp_path / "map", (1, 2, 3))
+    with pytest.raises(TidefieldError, match="--allow-missing was given with maps: it belongs to runs and scenes"):
+        view(View((folder,), port=0, no_browser=True, allow_missing=True), QUIET)
+
+
 def test_a_scene_among_maps_and_nothing_at_all_are_one_clear_error(scene: Path, tmp_path: Path):
     pytest.importorskip("rasterio")
     from map_folders import write_map

@@ -169,6 +169,16 @@ def test_nerfstudios_normalisation_is_undone(tmp_path: Path, poses: np.ndarray):
     assert torch.allclose(found.cameras.T_world_camera.double(), torch.tensor(poses[:, :3]), atol=1e-4)
 
 
+def test_the_normalisation_of_our_own_data_parser_starts_from_the_scene(tmp_path: Path, poses: np.ndarray):
+    applied = np.eye(4)[[0, 2, 1, 3]]
+    shift, scale = np.array([0.3, -2.0, 1.0]), 0.05
+    mapping = {"transform": np.column_stack([np.eye(3), shift]).tolist(), "scale": scale, "georeference": None}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(mapping))
+    (tmp_path / "transforms.json").write_text(json.dumps({"applied_transform": applied[:3].tolist(), "frames": []}))
+    found = load(tmp_path, exported(normalise(poses, np.eye(3), shift, scale)), replace(survey(), root=tmp_path))
+    assert torch.allclose(found.cameras.T_world_camera.double(), torch.tensor(poses[:, :3]), atol=1e-4)
+
+
 def test_the_normalisation_starts_before_the_applied_transform(tmp_path: Path, poses: np.ndarray):
     # nerfstudio saves transform @ applied_transform: it starts from the coordinates before its own data preparation.
     applied = np.eye(4)[[0, 2, 1, 3]]

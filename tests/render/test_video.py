@@ -60,6 +60,13 @@ def test_a_decoded_video_has_its_frames_size_speed_and_colours(tmp_path: Path):
         assert float(stream.duration * stream.time_base) == pytest.approx(0.2)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a name on Windows has no colon")
+def test_a_name_with_a_colon_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    write_video([flat(COLOURS[0])], Path("2024-06-01T10:30.mp4"), 25.0)
+    assert len(decode(tmp_path / "2024-06-01T10:30.mp4")) == 1
+
+
 def test_the_index_comes_before_the_frames_so_that_browsers_can_start(tmp_path: Path):
     write_video((flat(c) for c in COLOURS), tmp_path / "clip.mp4", 24.0)
     content = (tmp_path / "clip.mp4").read_bytes()

@@ -2,15 +2,19 @@
 
 import json
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 from scipy.spatial.transform import Rotation
 
+from tidefield.commands.common import ZeroShot
+from tidefield.commands.render import Render
 from tidefield.errors import TidefieldError
 from tidefield.render.nerfstudio_path import read_nerfstudio_path
-from tidefield.viewer.key_frames import KeyFrame, interpolate, nerfstudio_path
+from tidefield.viewer.key_frames import KeyFrame, interpolate, nerfstudio_path, render_command
 
 
 def keys() -> list[KeyFrame]:
@@ -52,3 +56,12 @@ def test_the_file_reads_back_as_the_path_in_the_files_coordinates(tmp_path: Path
         assert np.allclose(found.position[k] - origin, frame.position_world, atol=1e-6)
         assert np.allclose(found.rotation[k], frame.rotation, atol=1e-9)
         assert found.focal_px[k] == pytest.approx(180 / math.tan(frame.fov / 2))
+
+
+def test_the_command_that_a_page_tells_renders_what_it_shows():
+    zero = ZeroShot(zero_shot=True, preset="swift", weights=Path("my weights"))
+    words = shlex.split(render_command(["flats 2024/scene", *zero.words]))
+    assert words[:3] == ["tidefield", "render", "flats 2024/scene"]
+    options = tyro.cli(Render, args=words[2:])
+    assert (options.source, options.zero) == (Path("flats 2024/scene"), zero)
+    assert render_command(["run"]) == "tidefield render run flight.mp4 --path camera_path.json"

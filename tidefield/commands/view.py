@@ -7,7 +7,7 @@ import os
 import threading
 import webbrowser
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 log = logging.getLogger(__name__)
+_OF_SCENES = ("width", "device", "allow_missing")
+"""Options that maps have no use for."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ def view(options: View, console: Console) -> None:
     with ExitStack() as stack:
         opened = open_source(source, options.zero, device, options.allow_missing, console, SAMPLING)
         scene, render, _ = stack.enter_context(opened)
-        name = source.resolve().name
-        page = ScenePage(scene, render, name, options.host, options.port, options.width)
+        name, words = source.resolve().name, [source.resolve().name, *options.zero.words]
+        page = ScenePage(scene, render, name, options.host, options.port, options.width, words)
         stack.callback(page.close)
         serve(page.address, options.host, options.no_browser, console)
 
@@ -101,6 +103,10 @@ def _are_maps(sources: tuple[Path, ...]) -> bool:
 
 
 def _view_maps(options: View, console: Console) -> None:
+    of_scenes = {field.name: field.default for field in fields(View) if field.name in _OF_SCENES}
+    given = next((name for name, usual in of_scenes.items() if getattr(options, name) != usual), None)
+    if given is not None:
+        raise RunError(f"--{given.replace('_', '-')} was given with maps: it belongs to runs and scenes; leave it out")
     from tidefield.viewer.atlas import Atlas
     from tidefield.viewer.map_page import MapPage
 

@@ -107,7 +107,8 @@ def _undo_normalisation(pose: Float64[np.ndarray, "F 4 4"], file: Path, root: Pa
     transform[:3] = numbers(top, "transform", file, (3, 4))
     scale = number(top, "scale", file, least=_SMALLEST_SCALE)
     transforms = root / "transforms.json"
-    if transforms.is_file() and not (root / "sparse").is_dir():
+    # What our own data parser wrote, which names a georeference, starts from the scene's own coordinates.
+    if "georeference" not in top and transforms.is_file() and not (root / "sparse").is_dir():
         # The normalisation starts from the coordinates before applied_transform and applied_scale; such a scene's own
         # coordinates are those after them.
         meta, applied = {"applied_scale": 1.0, **read_json(transforms)}, np.eye(4)

@@ -57,7 +57,8 @@ def write_video(
     count, stream = 0, None
     with (
         completed_file(path, overwrite=overwrite) as partial,
-        av.open(str(partial), "w", format="mp4", options={"movflags": "+faststart"}) as container,
+        # FFmpeg takes what is before a colon for a protocol, unless a slash is before it.
+        av.open(str(partial.absolute()), "w", format="mp4", options={"movflags": "+faststart"}) as container,
     ):
         container.metadata.update({"comment": SOFTWARE, **({"title": title} if title else {})})
         for count, frame in enumerate(frames, start=1):

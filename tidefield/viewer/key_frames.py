@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -97,6 +98,11 @@ def nerfstudio_path(
     }
 
 
+def render_command(source: Sequence[str]) -> str:
+    """The command that makes a video along a saved path; the first word of `source` is the run or scene."""
+    return shlex.join(["tidefield", "render", source[0], "flight.mp4", *source[1:], "--path", "camera_path.json"])
+
+
 class PathEditor:
     """The controls of a path: key frames, preview, and the file.
 
@@ -104,7 +110,7 @@ class PathEditor:
         client: whose page it is.
         here: where its camera is.
         place: puts its camera somewhere.
-        name: of the run or scene.
+        source: words of a command line that name what is shown.
         origin_world: of the scene.
     """
 
@@ -113,10 +119,10 @@ class PathEditor:
         client: ClientHandle,
         here: Callable[[], KeyFrame],
         place: Callable[[KeyFrame], None],
-        name: str,
+        source: Sequence[str],
         origin_world: Sequence[float],
     ) -> None:
-        self.client, self._here, self._place, self._name, self._origin = client, here, place, name, origin_world
+        self.client, self._here, self._place, self._source, self._origin = client, here, place, source, origin_world
         self.keys: list[KeyFrame] = []
         self._playing = False
         gui = client.gui
@@ -171,7 +177,5 @@ class PathEditor:
         path = nerfstudio_path(frames, self._origin, WIDTH, HEIGHT, FRAMES_PER_SECOND)
         content = json.dumps(path, allow_nan=False).encode()
         self.client.send_file_download("camera_path.json", content, save_immediately=True)
-        self._text.content = (
-            f"{len(frames)} frames saved. Render them: `tidefield render {self._name} flight.mp4 --path "
-            "camera_path.json`"
-        )
+        command = render_command(self._source)
+        self._text.content = f"{len(frames)} frames saved. Render them: `{command}`"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from typing import TYPE_CHECKING, Any
@@ -73,14 +74,22 @@ class ScenePage:
         name: of the run or scene, without its folder.
         host, port: where to listen.
         width: of sharp pictures, at most.
+        source: words of a command line that name what is shown; `name` if not given.
     """
 
     def __init__(
-        self, scene: Scene, render: Render, name: str, host: str, port: int, width: int = LARGEST_WIDTH
+        self,
+        scene: Scene,
+        render: Render,
+        name: str,
+        host: str,
+        port: int,
+        width: int = LARGEST_WIDTH,
+        source: Sequence[str] = (),
     ) -> None:
         viser = need_viser()
         require_port(host, port)
-        self.scene, self.name, self.width = scene, name, width
+        self.scene, self.source, self.width = scene, source or (name,), width
         layout = layout_of(scene)
         self.scale = SHOWN_DISTANCE / layout.distance
         preview = Preview(scene)
@@ -144,7 +153,7 @@ class _Client:
             link.on_click(lambda _: self._show_address())
             self.link = gui.add_markdown("")
         with tabs.add_tab("Path"):
-            self.editor = PathEditor(client, self._key_frame, self._place, page.name, scene.origin_world.tolist())
+            self.editor = PathEditor(client, self._key_frame, self._place, page.source, scene.origin_world.tolist())
         self._add_photographs()
         cloud = self._add_points()
         photographs.on_update(lambda _: setattr(self.frustums, "visible", photographs.value))
