@@ -196,4 +196,4 @@ def _regions(cells: np.ndarray, grid: Grid) -> list[Region]:
 def _against_truth(change: Change, surveys: Path) -> dict[str, Any]:
     truth = Truth(surveys / "truth.npz", change.grid).change
     truth[~np.isfinite(change.dz)] = 0
-    return compared(change, truth, change.grid)
+    return compared(change, truth, change.grid, CHANGE_M)

@@ -70,8 +70,12 @@ def stable_frame(earlier: Raster, later: Raster, grid: Grid) -> list[Region]:
     return [Region("frame", polygon) for _, polygon in polygons_of(same.astype(np.uint8), grid, same)]
 
 
-def compared(change: Change, truth: np.ndarray, grid: Grid) -> dict[str, Any]:
-    """What was found, beside what is true."""
+def compared(change: Change, truth: np.ndarray, grid: Grid, full: float | None = None) -> dict[str, Any]:
+    """What was found, and what is true.
+
+    Args:
+        full: the amount of change; the largest one if None, which single cells have where truth is interpolated.
+    """
     area = grid.cell_area_m2
     lower, higher = change.outlines.cells(-1), change.outlines.cells(1)
     known = np.isfinite(change.dz)
@@ -87,7 +91,7 @@ def compared(change: Change, truth: np.ndarray, grid: Grid) -> dict[str, Any]:
         "range_m": change.errors.variogram.range_m,
         "nugget": change.errors.variogram.nugget,
     }
-    full = float(np.abs(truth).max())
+    full = float(np.abs(truth).max()) if full is None else full
     if full > 0:
         plateau = np.abs(truth) > 0.95 * full
         record["detected"] = float(significant[plateau].mean())
