@@ -366,13 +366,18 @@ def test_a_run_goes_on_with_some_of_its_options_though_its_preset_has_changed_si
         _require_its_options(Train(scene, tmp_path / "run", method="opensplat"), run)
 
 
-def test_a_pretraining_that_died_before_its_first_save_starts_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def across_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have trainings across scenes learn from one wall alone."""
     at = wall.scene(wall.cameras(5), (1, 3))
     drawn = stream.Drawn(at, stream.DepthPriors(at), at.cameras)
     monkeypatch.setattr(stream.Stream, "draw", lambda *_: drawn)
     monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": at})
+
+
+def test_a_pretraining_that_died_before_its_first_save_starts_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    across_a_wall(monkeypatch)
     options = {"budget": Budget(steps=1), "device": "cpu"}
     with pytest.raises(RunError, match="holds no training"):
         pretrain_command(Pretrain(tmp_path / "out", resume=True, **options), QUIET)
@@ -407,10 +412,7 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
 def test_a_pretraining_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at = wall.scene(wall.cameras(5), (1, 3))
-    drawn = stream.Drawn(at, stream.DepthPriors(at), at.cameras)
-    monkeypatch.setattr(stream.Stream, "draw", lambda *_: drawn)
-    monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": at})
+    across_a_wall(monkeypatch)
     out, said = tmp_path / "out", io.StringIO()
 
     def steps(console: Console = QUIET, **options: Any) -> int:
