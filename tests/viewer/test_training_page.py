@@ -26,11 +26,11 @@ pytest.importorskip("viser", reason="needs viser, which is not installed")
 QUIET = Console(quiet=True)
 
 
-def test_only_who_looks_is_shown_the_network_and_it_is_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_only_who_looks_is_shown_the_network_and_it_is_a_copy(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training, "REFRESH_SECONDS", 0.0)
     scene = textured_wall.scene(textured_wall.cameras(5, 96, 72))
     trainer = SceneTrainer(PRESETS["swift"], scene, 0, choose_device("cpu"))
-    with training.TrainingPage(trainer, tmp_path / "run", "127.0.0.1", 0) as page:
+    with training.TrainingPage(trainer, "run", "127.0.0.1", 0) as page:
         given: list[object] = []
         replace = page.page.frames.replace_method
         monkeypatch.setattr(page.page.frames, "replace_method", lambda method: (given.append(method), replace(method)))

@@ -128,8 +128,9 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
             crs = CRS(about["crs"])
             # A file without a place on Earth, which GeoPackages call undefined, is taken to lie as the surveys do.
             if not is_local(crs):
-                to = Transformer.from_crs(crs, CRS.from_wkt(grid.crs), always_xy=True)
-                if lost := lost_in_conversion(crs, CRS.from_wkt(grid.crs)):
+                own = CRS.from_wkt(grid.crs)
+                to = Transformer.from_crs(crs, own, always_xy=True)
+                if lost := lost_in_conversion(crs, own):
                     _log.warning(f"{path.name}: coordinates {lost}")
         except ProjError as error:
             raise ChangeError(

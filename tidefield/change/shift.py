@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -135,9 +136,13 @@ def find_shift(earlier: Path, later: Path, grid: Grid) -> Shift:
         if (small := picture_grid((earlier, later), grid, float(side))) not in grids.values():
             grids[side] = small
 
+    @cache
+    def as_it_lies(side: int) -> tuple[UInt8[np.ndarray, "rows columns 3"], np.ndarray]:
+        return read_picture(earlier, grids[side])
+
     def shift(side: int, moved_m: tuple[float, float]) -> Shift:
         small = grids[side]
-        pictures = [read_picture(path, small, move) for path, move in ((earlier, (0.0, 0.0)), (later, moved_m))]
+        pictures = as_it_lies(side), read_picture(later, small, moved_m)
         greys = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture, _ in pictures]
         window = _COARSE_WINDOW if side == _COARSER[-1] else _WINDOW
         found = correlate(greys[0], greys[1], pictures[0][1] & pictures[1][1], small.cell_m, window)

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
 from tidefield.commands.train import USED_BEFORE, report_end
-from tidefield.config import PRESETS, Budget, Config, checked_seed, vary
+from tidefield.config import PRESETS, Budget, Config, checked_seed, from_json, vary
 from tidefield.errors import RunError
 from tidefield.files import delete_partials, is_empty, only_writer, read_json, write_json
 
@@ -132,12 +132,9 @@ def _budget_of(folder: Path) -> Budget | None:
     """The budget that a training was started or last continued with; None where an older one states none."""
     found = read_json(folder / PRETRAINING_FILE)
     stated = found.get("budget") if isinstance(found, dict) else None
-    if not isinstance(stated, dict):
+    if stated is None:
         return None
-    minutes, steps = stated.get("minutes"), stated.get("steps")
-    if not (isinstance(minutes, int | float | None) and isinstance(steps, int | None)):
-        raise RunError(f"{folder / PRETRAINING_FILE} has the budget {stated}: expected minutes or steps; give one")
-    return Budget(minutes=minutes, steps=steps).checked()
+    return from_json(Budget, stated, f"{folder / PRETRAINING_FILE}: budget").checked()
 
 
 def _require_same(folder: Path, record: dict[str, Any]) -> None:

@@ -178,7 +178,7 @@ def _train(options: Train, console: Console, again: str) -> None:
             if options.view:
                 from tidefield.viewer.training import TrainingPage
 
-                page = stack.enter_context(TrainingPage(trainer, folder, "127.0.0.1", options.port))
+                page = stack.enter_context(TrainingPage(trainer, folder.resolve().name, "127.0.0.1", options.port))
                 console.print(f"{page.page.address} shows it", highlight=False, soft_wrap=True)
                 callback = _both(callback, page)
             if used >= 1:

@@ -78,7 +78,8 @@ def view(options: View, console: Console) -> None:
     with ExitStack() as stack:
         opened = open_source(source, options.zero, device, options.allow_missing, console, SAMPLING)
         scene, render, _ = stack.enter_context(opened)
-        name, words = source.resolve().name, [source.resolve().name, *options.zero.words]
+        name = source.resolve().name
+        words = [name, *options.zero.words]
         page = ScenePage(scene, render, name, options.host, options.port, options.width, words)
         stack.callback(page.close)
         serve(page.address, options.host, options.no_browser, console)

@@ -17,7 +17,7 @@ from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json, write_text
 from tidefield.machine import describe
-from tidefield.methods import METHODS, UNTRAINED_DEVICE
+from tidefield.methods import METHODS, UNTRAINED_DEVICE, names
 
 NOTHING, MEAN = "-", "mean"
 REGIONS = {
@@ -217,10 +217,10 @@ def cost_table(results: Results) -> Table:
 
 def untrained_limits(results: Results, device: str) -> list[str]:
     """What runs on the processor beside methods that run elsewhere."""
-    names = [method for method in results.methods if method in METHODS and METHODS[method].kind == "untrained"]
-    if not names or device == UNTRAINED_DEVICE:
+    found = [method for method in results.methods if method in names("untrained")]
+    if not found or device == UNTRAINED_DEVICE:
         return []
-    return [f"Without training, on the processor: {', '.join(names)}. Their times are not those of {device}."]
+    return [f"Without training, on the processor: {', '.join(found)}. Their times are not those of {device}."]
 
 
 def nerfacto_limits(results: Results) -> list[str]:

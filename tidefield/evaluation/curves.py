@@ -107,10 +107,8 @@ def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
     cameras, truths, used = [], [], []
     for index in sorted({test[0], test[len(test) // 2]}):
         small = _small(scene, index, smaller)
-        photograph = scene.photographs[index].permute(2, 0, 1)[None].float()
-        mean = F.interpolate(photograph, size=(small.height, small.width), mode="area")
         cameras.append(small)
-        truths.append(mean[0].permute(1, 2, 0).round().to(torch.uint8))
+        truths.append(reduced_photograph(scene, index, small))
         used.append(_used(scene, index, small))
     return QualityCurve(tuple(cameras), tuple(truths), tuple(used))
 
@@ -118,6 +116,13 @@ def make_curve(scene: Scene, smaller: int = SMALLER) -> QualityCurve:
 def _small(scene: Scene, index: int, smaller: int) -> Cameras:
     camera = scene.cameras[index]
     return camera.resized(max(1, camera.width // smaller), max(1, camera.height // smaller))
+
+
+def reduced_photograph(scene: Scene, index: int, small: Cameras) -> UInt8[Tensor, "h w 3"]:
+    """A photograph at the size of a smaller camera, as means over the pixels' areas."""
+    photograph = scene.photographs[index].permute(2, 0, 1)[None].float()
+    mean = F.interpolate(photograph, size=(small.height, small.width), mode="area")
+    return mean[0].permute(1, 2, 0).round().to(torch.uint8)
 
 
 def _used(scene: Scene, index: int, small: Cameras) -> Bool[Tensor, "h w"]:

@@ -209,12 +209,13 @@ def prepare(
         )
         registered = set(models[0])
         placed = [photograph for photograph in good.photographs if photograph.name in registered]
+        mask_names = [f"{photograph.name}.png" for photograph in placed] if _have_masks(placed) else []
         correction = stages.run(
             "images",
             {"colour": colour},
             [
                 *(images / photograph.name for photograph in placed),
-                *(scene / "masks" / f"{photograph.name}.png" for photograph in placed if _have_masks(placed)),
+                *(scene / "masks" / name for name in mask_names),
                 *(scene / name for name in ("transforms.json", "sparse_pc.ply")),
                 *([scene / HOLDOUT_FILE] if holdout else []),
             ],
@@ -230,8 +231,7 @@ def prepare(
 
         if downscale or stages.has_run("downscale"):  # without, what an earlier run has written is removed
             files = [scene / folder / name for folder in reduced for name in models[0]]
-            if _have_masks(placed):
-                files += [scene / f"masks_{factor}" / f"{name}.png" for factor in downscale for name in models[0]]
+            files += [scene / f"masks_{factor}" / name for factor in downscale for name in mask_names]
             stages.run("downscale", {"factors": list(downscale)}, files, reduce)
         return Prepared(
             survey=survey,

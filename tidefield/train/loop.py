@@ -19,7 +19,6 @@ import torch
 from rich.console import Console
 from tensorboardX import SummaryWriter
 from torch import nn
-from torch.nn import functional as F
 
 from tidefield.config import USUAL_SAMPLING, Budget, Config, Sampling
 from tidefield.data.areas import Area, cut, select
@@ -30,6 +29,7 @@ from tidefield.data.matching import MATCHED_PX, Matcher
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
 from tidefield.device import choose_precision
+from tidefield.evaluation.curves import reduced_photograph
 from tidefield.evaluation.metrics import psnr_from_mse
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.network import Network, make_network
@@ -381,10 +381,9 @@ def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:
     index = (scene.test or scene.train)[0]
     camera = scene.cameras[index]
     share = min(1.0, PICTURE_PX / max(camera.width, camera.height))
-    width, height = (max(1, round(share * side)) for side in (camera.width, camera.height))
-    (rendering,) = trainer.views([camera.resized(width, height)])
-    truth = F.interpolate(scene.photographs[index].permute(2, 0, 1)[None].float() / 255, (height, width), mode="area")
-    both = torch.cat([truth[0].permute(1, 2, 0), rendering.colour], dim=1)
+    small = camera.resized(*(max(1, round(share * side)) for side in (camera.width, camera.height)))
+    (rendering,) = trainer.views([small])
+    both = torch.cat([reduced_photograph(scene, index, small).float() / 255, rendering.colour], dim=1)
     writer.add_image("truth and rendering", both.numpy(), trainer.progress.step, dataformats="HWC")
 
 

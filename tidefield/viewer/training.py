@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tidefield.geometry.cameras import Cameras
@@ -28,12 +27,12 @@ class TrainingPage:
 
     Args:
         trainer: what is shown.
-        run: its folder.
+        name: of the run.
         host, port: where to listen.
     """
 
-    def __init__(self, trainer: Trainer, run: Path, host: str, port: int) -> None:
-        self.page = ScenePage(trainer.scene, _as_it_is(trainer), run.resolve().name, host, port)
+    def __init__(self, trainer: Trainer, name: str, host: str, port: int) -> None:
+        self.page = ScenePage(trainer.scene, _as_it_is(trainer), name, host, port)
         self._shown = time.monotonic()
 
     def __call__(self, trainer: Trainer, used: float) -> None:

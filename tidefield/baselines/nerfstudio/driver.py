@@ -166,9 +166,9 @@ def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
     Raises:
         RunError: nerfstudio is not installed, or fails, or the method does not run on the device.
     """
-    if read_job(folder / JOB_FILE, "a checkpoint").get("method") == "splatfacto":
-        require("splatfacto", device)
-    colours = _read_job(folder)[1]
+    _, colours, method = _read_job(folder)
+    if method == "splatfacto":
+        require(method, device)
     with ExitStack() as stack:
         own = Path(stack.enter_context(TemporaryDirectory()))
         file = own / "rendering.npz"
@@ -248,13 +248,13 @@ def _worker(words: Sequence[str | Path | torch.device], log_file: Path, device: 
                 process.wait()
 
 
-def _read_job(folder: Path) -> tuple[tuple[int, float], Colours]:
-    """Steps and seconds of a training that is complete, and the colours of its scene."""
+def _read_job(folder: Path) -> tuple[tuple[int, float], Colours, str | None]:
+    """Steps and seconds of a training that is complete, the colours of its scene, and its method."""
     path = folder / JOB_FILE
     job = read_job(path, "a checkpoint")
     # Of version 0.1, which exported no alpha, there is none.
     background = job.get("background") and from_json(_BACKGROUND, job["background"], f"{path}: background")
-    return job["trained"], Colours(torch.tensor(job["factor"]), background)
+    return job["trained"], Colours(torch.tensor(job["factor"]), background), job.get("method")
 
 
 def export(scene: Scene, folder: Path) -> Colours:

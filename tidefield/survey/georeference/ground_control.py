@@ -124,6 +124,11 @@ class Marks:
         """Surveyed coordinates of the marked points, by name."""
         return {name: self.surveyed_world[self.point == name][0] for name in sorted(set(self.point.tolist()))}
 
+    @property
+    def points_world(self) -> Float64[np.ndarray, "N 3"]:
+        """The same, without names."""
+        return np.array(list(self.points.values()), dtype=np.float64).reshape(-1, 3)
+
 
 def locate_marks(
     model: pycolmap.Reconstruction, control: Control, photographs: Sequence[Photograph], frame: LocalFrame
@@ -345,8 +350,7 @@ def adjust_to_control(
             "them without adjustment, and cannot be checked."
         )
         found = _control_residuals(model, marks.where(agree))
-        used = np.array(list(marks.where(agree).points.values()), dtype=np.float64).reshape(-1, 3)
-        return Adjusted(found, Residuals(), _rejected(model, marks, agree), (note,), used)
+        return Adjusted(found, Residuals(), _rejected(model, marks, agree), (note,), marks.where(agree).points_world)
     refused: set[str] = set()
     floor_m = _MARK_TOLERANCE * float(np.median(marks.width_px)) * _pixel_m(model)
     while shaped_by is not None and len(refused) < _WRONG_POINTS:  # which an adjustment would bend the model to
@@ -372,7 +376,7 @@ def adjust_to_control(
     if (final != agree).any():
         agree, check = final, _cross_validate(sound, marks.where(final), free_lens, progress)
     adjusted = _adjusted(sound, marks.where(agree), free_lens)
-    surveyed = np.array(list(marks.where(agree).points.values()), dtype=np.float64).reshape(-1, 3)
+    surveyed = marks.where(agree).points_world
     if shaped_by is not None:
         error = _control_residuals(model, marks.where(agree)).error_m
         shift = -error.mean(0) if len(error) else np.zeros(3)  # what is rejected now has moved the model, too
