@@ -18,6 +18,7 @@ from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.terrain import hillshade, write_hillshade, write_terrain
+from tidefield.maps.vectors import lost_in_geojson
 
 pytest.importorskip("rasterio")
 LOCAL = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
@@ -34,6 +35,17 @@ def ground() -> np.ndarray:
     """A slope with ripples."""
     y, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
     return (2 + 0.03 * x - 0.02 * y + 0.03 * np.sin(x * 6)).astype(np.float32)
+
+
+def test_what_geojson_loses_where_proj_lacks_a_grid_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
+    wkt = CRS("EPSG:27700").to_wkt()
+    frame = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
+    there = MapFrame(frame, np.zeros(3), np.eye(3), wkt, wkt, "ODN")
+    monkeypatch.setattr("tidefield.maps.vectors.lost_in_conversion", lambda *_: "are converted to 5 m only")
+    assert "coordinates are converted to 5 m only" in str(lost_in_geojson(there))
+    assert lost_in_geojson(LOCAL) is None
+    monkeypatch.setattr("tidefield.maps.vectors.lost_in_conversion", lambda *_: None)
+    assert lost_in_geojson(there) is None
 
 
 def test_plants_are_taken_off_and_ripples_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

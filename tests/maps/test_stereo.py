@@ -197,6 +197,27 @@ def test_the_error_is_large_where_neither_pairs_nor_photographs_determine_the_he
     assert np.median(sharp.sigma[:, 24:40]) < 0.5 * np.median(matched.sigma[:, 24:40])
 
 
+def test_gaps_have_what_fits_the_photographs_of_the_matched_cells_around_and_of_the_sparse_points(
+    scene, monkeypatch: pytest.MonkeyPatch
+):
+    loaded, _ = scene
+    grid = Grid(map_frame(loaded, None), -6.4, 6.4, CELL, 64, 64, 0.0)
+    [tile] = grid.tiles(64, 0)
+    start, grey = sparse_surface(loaded, grid.coarser(COARSEST)), GreyPhotographs(loaded)
+    true = surface.match(tile, start, loaded, grey, CELL)
+    assert true is not None
+    by_chance = np.full((128, 128), np.nan, np.float32)
+    by_chance[40:50, 40:60] = start.on(tile, surface.PAD)[40:50, 40:60] - 2.0
+    right = np.pad(true.height, surface.PAD, mode="edge")
+    right[50:80, 50:80] = np.nan
+    lowered = replace(start, height=start.height - np.float32(2.0))
+    for heights, begin in ((by_chance, start), (right, lowered)):
+        monkeypatch.setattr(Pairs, "heights", lambda *_, heights=heights: heights)
+        found = surface.match(tile, begin, loaded, grey, CELL)
+        assert found is not None
+        assert np.median(np.abs(found.height - true.height)[20:44, 20:44]) < 0.1
+
+
 def test_gaps_are_filled_smoothly_and_say_how_heights_around_them_are_spread():
     rng = np.random.default_rng(0)
     across = np.arange(90, dtype=np.float32)

@@ -38,6 +38,7 @@ from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, GreyPhotographs, Matched, match, sparse_surface
 from tidefield.maps.terrain import blocks, write_hillshade, write_terrain
+from tidefield.maps.vectors import lost_in_geojson
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
 
@@ -75,7 +76,7 @@ STRIP_CELLS = 1_000_000
 GDAL_CACHE_BYTES = 128_000_000
 """Memory of GDAL for blocks, beside those of a row of them in each raster, which would be written again and again
 otherwise. By itself it takes a twentieth of the machine's."""
-VERSION = 6
+VERSION = 7
 """Of tiles; to be raised with what they hold."""
 
 
@@ -391,6 +392,8 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
     )
     write_classes(classes, out / DSM, out / ORTHOPHOTO, water, grid)
     write_masks(out / CLASSES, water, grid, out / MASKS)
+    if lost := lost_in_geojson(grid.frame):
+        log.warning(lost)
     progress(1, 6)
     level_water(_surface(out, unit), _errors(out, unit), out / CLASSES, water, grid)
     progress(2, 6)

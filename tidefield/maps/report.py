@@ -32,10 +32,11 @@ def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fil
     """
     sigma, views = _read(out / rasters["sigma"])[0], _read(out / rasters["views"])[0]
     most = float(np.nanpercentile(sigma, 98)) if np.isfinite(sigma).any() else 1.0
+    unit = result["coordinates"]["unit_up"]
     pictures = [
         ("Orthophoto", _uri(np.nan_to_num(_read(out / rasters["orthophoto"])).transpose(1, 2, 0).astype(np.uint8)), ""),
         ("Hillshade of the surface", _uri(_coloured(_read(out / rasters["hillshade"])[0], 255.0, "gray")), ""),
-        ("Standard error", _uri(_coloured(sigma, most, "magma")), f"Black 0, pale {most:.3g} and more."),
+        ("Standard error", _uri(_coloured(sigma, most, "magma")), f"Black 0, pale {most:.3g} {unit} and more."),
         (
             "Photographs",
             _uri(_coloured(views, float(np.nanmax(views, initial=1.0)), "viridis")),

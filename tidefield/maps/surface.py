@@ -57,6 +57,10 @@ SIGMA_CELLS = 1.4
 SHARP, WIDE = 1.0, 2.5
 """Standard deviations of the two windows, in cells, over whose mean scores are summed: one peak keeps the edges of
 plants, the other bridges bare ground."""
+GAPS, GAP_CELLS, LIKELIER = 0.02, 6.0, 0.03
+"""Share of a tile without matched cells from which these are compared with the sparse points' surface; standard
+deviation of the windows, in cells, over whose mean that is done; and by how much more photographs must correlate
+there."""
 UNDETERMINED, BRIDGED_CELLS = 0.8, 3.0
 """Standard error of a sweep's height, in its steps, at which half of it counts; the rest is a weighted mean over
 windows of so many cells."""
@@ -387,15 +391,18 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     pairs = Pairs(choice.pairs, views, indices, grey, factor, tile.grid.cell, tile.side + 2 * PAD)
     low, high = pairs.narrowed(low, high)
     height = pairs.heights(low, high)
-    if np.isnan(height).all():
-        height, spread = expected, np.full_like(expected, (high - low) / 4)
-    else:
-        above_points, spread = fill_gaps(height - expected)
-        height = expected + above_points
-    matching = score = np.zeros_like(height)
     used = [(views[k], indices[k]) for k in choice.chosen]
     east, north = tile.offsets(PAD)
     step = STEP_PX * tile.grid.cell_up / _parallax(views, choice.chosen, float(np.median(expected)))
+    if np.isnan(height).all():
+        height, spread = expected, np.full_like(expected, (high - low) / 4)
+    else:
+        gaps = np.isnan(height)
+        above_points, spread = fill_gaps(height - expected)
+        height = expected + above_points
+        if gaps.mean() > GAPS:
+            height = _likelier(used, grey, factor, east, north, height, expected, gaps, step)
+    matching = score = np.zeros_like(height)
     for share, half in SWEEPS:
         offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
         found, matching, score = _sweep(used, grey, factor, east, north, height, offsets)
@@ -445,6 +452,40 @@ def _parallax(views: list[View], chosen: Sequence[int], ground: float) -> float:
     slope = np.array([views[k].position[:2] / height for k, height in zip(chosen, above, strict=True)])
     apart = np.linalg.norm(slope[:, None] - slope[None], axis=-1)
     return float(np.clip(np.percentile(apart[np.triu_indices(len(slope), 1)], 90), 0.1, 2.0))
+
+
+def _likelier(
+    used: list[tuple[View, int]],
+    grey: GreyPhotographs,
+    factor: int,
+    east: np.ndarray,
+    north: np.ndarray,
+    filled: Height,
+    expected: Height,
+    gaps: Bool[np.ndarray, "H W"],
+    step: float,
+) -> Height:
+    """Put the sparse points' surface into gaps between matched cells where it fits the photographs better.
+
+    At a survey's edge, which two photographs far apart see, few cells match, often by chance, and what surrounds a gap
+    says little of it.
+
+    Args:
+        filled: heights of matched cells, and of gaps what these say of them.
+        expected: of the sparse points.
+        step: between heights that are tried.
+    """
+    share, half = SWEEPS[0]
+    offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
+    fits = []
+    for start in (filled, expected):
+        score = _sweep(used, grey, factor, east, north, start, offsets)[2]
+        there = (np.isfinite(score) & gaps).astype(np.float32)
+        mean = cv2.GaussianBlur(np.nan_to_num(score) * there, (0, 0), GAP_CELLS)
+        fits.append(mean / np.maximum(cv2.GaussianBlur(there, (0, 0), GAP_CELLS), 1e-3))
+    better = (gaps & (fits[1] > fits[0] + LIKELIER)).astype(np.float32)
+    weight = gaps * cv2.GaussianBlur(better, (0, 0), GAP_CELLS / 2)
+    return (filled + weight * (expected - filled)).astype(np.float32)
 
 
 def _sweep(

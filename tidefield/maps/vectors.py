@@ -14,7 +14,7 @@ from pyproj import CRS, Transformer
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.files import completed_file, write_text
-from tidefield.geometry.geodesy import WGS84
+from tidefield.geometry.geodesy import WGS84, lost_in_conversion
 from tidefield.maps.grid import MapFrame
 from tidefield.maps.rasters import need
 
@@ -52,6 +52,14 @@ def write_geopackage(path: Path, layers: Sequence[Layer], frame: MapFrame) -> No
                 layer=layer.name,
                 append=number > 0,
             )
+
+
+def lost_in_geojson(frame: MapFrame) -> str | None:
+    """In a sentence what GeoJSON of a map loses where PROJ lacks the grid of its datum; None if nothing."""
+    if frame.frame is None:
+        return None
+    lost = lost_in_conversion(CRS.from_wkt(frame.horizontal_wkt), CRS(WGS84))
+    return f"GeoJSON: coordinates {lost}; GeoPackages have the same shapes in the map's coordinates" if lost else None
 
 
 def write_geojson(path: Path, layer: Layer, frame: MapFrame) -> None:
