@@ -74,6 +74,18 @@ def test_the_correlation_of_small_places_of_a_large_survey_is_found():
     assert sum(found.sills) - sill < 0.05
 
 
+def test_outliers_do_not_hide_what_is_correlated_over_most_of_the_stable_ground():
+    rng = np.random.default_rng(3)
+    field = (rng.normal(size=(240, 240)) + 1.5 * correlated_field(rng, (480, 480), 60)[:240, :240]).astype(np.float32)
+    field -= field.mean()
+    spiked = field.copy()
+    spiked[rng.random(field.shape) < 0.005] = 80.0
+    clean, found = (fit_variogram(part, 0.5) for part in (field, spiked))
+    far = [sum(s for s, reach in zip(v.sills, v.ranges_m, strict=True) if reach > 20) for v in (clean, found)]
+    assert far[0] > 0.5
+    assert far[1] == pytest.approx(far[0], rel=0.15)
+
+
 def test_ground_that_is_too_small_to_show_a_correlation_says_so():
     residuals = np.full((3000, 3000), np.nan, np.float32)
     residuals[1000:3000:150, ::300] = np.random.default_rng(0).normal(size=(14, 10))

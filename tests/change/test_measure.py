@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
-from tidefield.change.measure import Change, Options, Register, _slopes, measure
+from tidefield.change.measure import Change, Options, Register, _sampled, _slopes, measure
+from tidefield.change.page import limits
 from tidefield.change.regions import Region, read_regions
 from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
@@ -51,6 +53,7 @@ def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
         assert volume.value_m3 == pytest.approx(true, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_heights_over_other_zeros_are_refused_where_nothing_takes_the_difference(tmp_path: Path):
     surfaces = [open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]]
     one, other = (replace(surface, datum=datum) for surface, datum in zip(surfaces, ("sea", "take-off"), strict=True))
@@ -119,6 +122,7 @@ def test_volumes_of_polygons_are_given_one_by_one(tmp_path: Path):
     assert fill.value_m3 == 0
 
 
+@pytest.mark.thorough
 def test_polygons_that_are_compared_in_part_say_so(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 4, 0.2)
     with rasterio.open(later, "r+") as file:
@@ -201,6 +205,7 @@ def rounded_pair(
     return paths
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [0.1, 0.25])
 @pytest.mark.parametrize("with_sigma", [False, True])
 def test_errors_of_rounded_heights_are_at_least_those_of_the_rounding(tmp_path: Path, step: float, with_sigma: bool):
@@ -216,6 +221,7 @@ def test_errors_of_rounded_heights_are_at_least_those_of_the_rounding(tmp_path: 
     assert low < 0.6 * math.pi * 20**2 * AREA < high
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("step", "noise_m", "offset_m"), [(0.1, 0.03, 0.03), (0.05, 0.015, 0.02), (0.05, 0.004, 0.01)])
 @pytest.mark.parametrize("register", ["vertical", "none"])
 def test_the_shift_of_rounded_heights_is_no_whole_step(
@@ -282,6 +288,7 @@ def test_stable_ground_is_found_outside_of_what_is_asked_about(tmp_path: Path):
     assert found.net.area_m2 == pytest.approx(28**2, rel=0.01)
 
 
+@pytest.mark.thorough
 def test_parts_of_the_survey_share_what_the_choice_of_outlines_adds(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 4, 0.2)
     halves = [
@@ -332,12 +339,28 @@ def test_a_tilt_is_found(tmp_path: Path):
         tilted = file.read(1) + (0.002 * 0.5 * np.arange(240)[None] - 0.001 * 0.5 * np.arange(200)[:, None])
         file.write(tilted.astype(np.float32), 1)
     found = measured(earlier, later, options=Options(register="tilt"))
+    np.testing.assert_allclose(
+        found.stable_before_dz - found.stable_dz,
+        _sampled(found.errors.registration.plane(found.grid, slice(0, 200)), found.stable),
+        atol=1e-5,
+    )
     _, gx, gy = found.errors.registration.coefficients
     assert gx == pytest.approx(0.002, abs=2e-4)
     assert gy == pytest.approx(0.001, abs=2e-4)
     assert np.nanstd(found.dz) < 0.03
 
 
+def test_after_a_tilt_cells_far_out_share_a_larger_error(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 9, 0.0)
+    ring = Region("all", shapely.box(WEST, NORTH - 100, WEST + 120, NORTH))
+    errors = measured(earlier, later, stable=lambda grid: [ring], options=Options(register="tilt")).errors
+    near = errors.near_sigma()
+    assert isinstance(near, np.ndarray)
+    np.testing.assert_allclose(near, errors.registration.deviation(errors.grid, slice(0, 200)))
+    assert near[0, 0] > 2 * near[100, 120]
+
+
+@pytest.mark.thorough
 def test_an_outline_has_the_systematic_error_of_its_own_cells(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 9, 0.3)
     found = measured(earlier, later, options=Options(register="tilt", datum_error_m=0.02))
@@ -405,6 +428,69 @@ def test_the_error_of_a_shift_on_a_slope_is_what_the_vertical_registration_leave
     whole = 0.2 * error * found.net.area_m2 if register == "none" else 0.0
     own = found.errors.registration.systematic_m
     assert found.net.systematic_m3 == pytest.approx(math.hypot(own * found.net.area_m2, whole), rel=0.03)
+
+
+@pytest.mark.parametrize(("shift", "told"), [("none", False), ("auto", False), ("auto", True)])
+def test_a_stated_error_of_the_shift_counts_on_slopes_unless_a_shift_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift: Literal["none", "auto"], told: bool
+):
+    earlier, later, _ = pair(tmp_path, 12, 0.0)
+    for path in (earlier, later):
+        with rasterio.open(path, "r+") as file:
+            file.write((file.read(1) + 0.2 * np.arange(240, dtype=np.float32)), 1)  # 0.4 of cells of 0.5 m
+    tells = Shift(0.0, 0.0, 0.01, 50, 50, 0.5) if told else Shift(None, None, math.nan, 50, 3, 0.5)
+    monkeypatch.setattr("tidefield.change.measure.find_shift", lambda *_: tells)
+    surveys = [replace(open_surface(path), orthophoto=path) for path in (earlier, later)]
+    found = measure(*surveys, Options(register="vertical", shift=shift, shift_error_m=0.05))
+    bare = measure(*surveys, Options(register="vertical", shift=shift))
+    # A vertical registration takes out what the error does on the mean slope, which is all of this one.
+    slope = Options(register="none", shift="none", datum_error_m=0.0, shift_error_m=0.05)
+    assert measure(*surveys, slope).net.systematic_m3 == pytest.approx(0.4 * 0.05 * found.net.area_m2, rel=0.02)
+    assert found.errors.registration.shift_error_m == (0.01 if told else 0.05)
+    assert bare.errors.registration.shift_error_m == (0.01 if told else 0.0)
+    net = measure(*surveys, slope).net
+    # What was stated is not widened for little stable ground.
+    assert net.datum_m3 == pytest.approx(net.systematic_m3)
+    said = any("0.05 m that was stated" in limit for limit in limits(found))
+    assert said == (not told)
+    assert any("compared where they lie" in limit for limit in limits(bare)) == (not told)
+    remarks = " ".join(found.remarks)
+    assert ("0.05 m that was stated counts on slopes" in remarks) == (shift == "auto" and not told)
+    assert any("(--shift-error)" in remark for remark in bare.remarks) == (shift == "auto" and not told)
+
+
+def test_polygons_that_cannot_be_read_are_found_before_heights_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    earlier, later, _ = pair(tmp_path, 0, 0.1)
+    monkeypatch.setattr("tidefield.change.measure.read_difference", lambda *_, **__: pytest.fail("it was measured"))
+
+    def unreadable(grid: Grid) -> list[Region]:
+        raise ChangeError("cannot be read")
+
+    for option in ("stable", "within", "regions"):
+        with pytest.raises(ChangeError, match="cannot be read"):
+            measure(open_surface(earlier), open_surface(later), **{option: unreadable})
+
+
+def test_a_comparison_within_copied_heights_is_made_with_a_remark(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 0, 0.1)
+    gap = np.s_[20:60, 100:160]
+    with rasterio.open(earlier) as file:
+        copied = file.read(1)[gap]
+    with rasterio.open(later, "r+") as file:
+        heights = file.read(1)
+        heights[gap] = copied
+        file.write(heights, 1)
+    box = Region("gap", shapely.box(WEST + 52, NORTH - 28, WEST + 78, NORTH - 12))
+    found = measure(open_surface(earlier), open_surface(later), Options(register="none"), within=lambda grid: [box])
+    assert found.net.value_m3 == pytest.approx(0, abs=1e-3)
+    assert any("as if one had them from the other: errors are too small" in remark for remark in found.remarks)
+
+
+def test_the_order_of_windows_does_not_matter(tmp_path: Path):
+    earlier, later, _ = pair(tmp_path, 0, 0.06)
+    one, other = (measured(earlier, later, options=Options(windows=w)) for w in ((5, 11, 21), (21, 5, 11)))
+    np.testing.assert_array_equal(one.outlines.labels, other.outlines.labels)
+    assert one.cut.value_m3 == pytest.approx(other.cut.value_m3)
 
 
 def test_polygons_of_one_name_stay_apart_and_none_is_called_as_the_whole(tmp_path: Path):

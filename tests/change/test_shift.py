@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyproj import CRS
+from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, noise, pair, write_surface
 
 from tidefield.change.measure import Options, measure
-from tidefield.change.shift import correlate, find_shift
+from tidefield.change.shift import correlate, find_shift, picture_grid
 from tidefield.change.surfaces import ChangeError, Grid, open_surface
 
 
@@ -44,6 +44,7 @@ def test_a_shift_is_found_to_a_tenth_of_a_pixel_under_another_light():
     assert abs(found.east_m + 0.40) < 3 * found.error_m + 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("apart_m", [1.0, 8.0])
 def test_surveys_that_are_metres_apart_are_brought_together(tmp_path: Path, apart_m: float):
     rows, columns = np.indices((1000, 1100))
@@ -84,6 +85,18 @@ def test_unrelated_pictures_do_not_tell_a_shift():
 def test_bland_ground_does_not_tell_a_shift():
     bland = np.full((400, 480), 120, np.float32)
     assert correlate(bland, bland, np.ones(bland.shape, bool), 0.25).windows == 0
+
+
+@pytest.mark.parametrize(("system", "size"), [("EPSG:2229", (0.5, 0.5)), ("EPSG:3857", (0.2, 0.3))])
+def test_pixels_of_orthophotos_are_measured_on_the_ground(tmp_path: Path, system: str, size: tuple[float, float]):
+    x, y = Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(-118.4, 33.8)
+    path = write_surface(
+        tmp_path / "ortho.tif", np.full((3, 40, 60), 100, np.uint8), west=x, north=y, crs=system, size=size
+    )
+    east, north = Transformer.from_crs("EPSG:4326", "EPSG:32611", always_xy=True).transform(-118.4, 33.8)
+    grid = Grid(CRS("EPSG:32611").to_wkt(), east, north, 0.05, 200, 200)
+    expected = {"EPSG:2229": 0.5 * 0.3048, "EPSG:3857": 0.3 * math.cos(math.radians(33.8))}
+    assert picture_grid((path, path), grid).cell_m == pytest.approx(expected[system], rel=0.01)
 
 
 def test_the_later_survey_is_moved_and_its_error_enters_on_slopes(tmp_path: Path):

@@ -10,6 +10,7 @@ import shapely
 from surveys_of_two_dates import NORTH, WEST, noise, write_surface
 
 from tidefield.change.measure import Change, Options, measure
+from tidefield.change.page import water_words
 from tidefield.change.regions import Region
 from tidefield.change.surfaces import open_surface
 from tidefield.change.water import measure_water
@@ -62,6 +63,7 @@ def test_where_the_ground_sank_the_waterline_comes_landward(tmp_path: Path):
     assert line.quantiles_m[1] == pytest.approx(-0.1 / SLOPE, abs=0.7)
 
 
+@pytest.mark.thorough
 def test_areas_under_levels_have_intervals_that_contain_the_truth(tmp_path: Path):
     inside = 0
     for seed in range(6):
@@ -96,3 +98,15 @@ def test_dry_ground_has_no_waterline(dry: Change):
     assert line.lines == ([], [])
     assert json.loads(json.dumps(found.to_json(), allow_nan=False))["waterline"]["move_m"] is None
     assert np.isnan(line.move_m).all()
+
+
+def test_a_waterline_at_one_date_only_has_not_moved_by_any_length(dry: Change):
+    line = measure_water(dry, (1.5, -3.0), ()).waterline
+    assert line is not None
+    assert line.lines[0]
+    assert not line.lines[1]
+    assert np.isnan([*line.move_m, *line.quantiles_m]).all()
+    assert line.land_gained_m2 == pytest.approx(75 * 80, rel=0.03)
+    [words] = water_words(replace(measure_water(dry, (1.5, -3.0), ()), waterline=line))
+    assert "no waterline" in words
+    assert "fell dry, 0.00 m² came under water" in words

@@ -171,6 +171,10 @@ def test_mistakes_are_told_in_one_message(
         patch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
         message = fails(capsys, patch, "change", early, late, tmp_path / "file" / "new")
         assert "cannot be written" in message
+    pictures = ("--orthophotos", early, late, "--shift", "none")
+    with monkeypatch.context() as patch:
+        patch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
+        assert "is no orthophoto" in fails(capsys, patch, "change", early, late, new, *pictures)
     polygons = tmp_path / "polygons.geojson"
     polygons.write_text('{"type": "FeatureCollection", "features": [')
     assert "polygons" in fails(capsys, monkeypatch, "change", early, late, new, "--stable", polygons)
@@ -211,6 +215,7 @@ def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_pa
     assert "seaward on average" in page
 
 
+@pytest.mark.thorough
 def test_the_same_place_then_and_now_is_rendered_from_an_earlier_photograph(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -293,6 +298,7 @@ def test_scenes_of_which_one_has_no_georeference_are_refused_at_once(tmp_path: P
     _check_scenes((tmp_path / "placed", tmp_path / "placed"), (), "cpu")
 
 
+@pytest.mark.thorough
 def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -340,6 +346,10 @@ def test_more_than_two_dates_make_a_series_of_steps_and_of_changes_since_the_fir
         heights = file.read(1)
         heights[:, 60:] = np.nan
         file.write(heights, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("it was measured"))
+        for last, part in ((tmp_path / "none.tif", "cannot be read"), (names[0], "expected the order of time")):
+            assert part in fails(capsys, patch, "change", *names[1:], tmp_path / "wrong", "--series", last)
     call("change", *names[:2], tmp_path / "gap", *words)
     numbers = json.loads((tmp_path / "gap" / "series.json").read_text())
     (low, high), *others = numbers["different_ground_m2"].values()

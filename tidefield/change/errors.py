@@ -218,7 +218,9 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
         return UNMEASURED
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
     every = 1 + math.isqrt(residuals.size // 1_000_000)
-    thinned = residuals[::every, ::every] / np.float32(some.std())
+    # Like the shares of the variogram, of what is left of outliers.
+    clipped = np.clip(some, -_CLIP * scale, _CLIP * scale).std()
+    thinned = np.clip(residuals[::every, ::every], -_CLIP * scale, _CLIP * scale) / np.float32(clipped)
     fitted = _fitted(lags, gammas, pairs)
     if lags[0] > _RESOLVED_CELLS * cell_m and fitted.nugget > _LEAST_SILL:
         # What seems random may be shared by all that is nearer than what was measured.
@@ -256,7 +258,7 @@ def _with_patches(fitted: Variogram, residuals: np.ndarray, cell_m: float) -> Va
         rows, columns = residuals.shape[0] // side, residuals.shape[1] // side
         blocks = residuals[: rows * side, : columns * side].reshape(rows, side, columns, side)
         counts = np.isfinite(blocks).sum(axis=(1, 3))
-        sums = np.where(np.isfinite(blocks), blocks, 0).clip(-_CLIP, _CLIP).sum(axis=(1, 3), dtype=np.float64)
+        sums = np.where(np.isfinite(blocks), blocks, 0).sum(axis=(1, 3), dtype=np.float64)
         full = counts > side**2 / 2
         if full.sum() >= _LEAST_PATCHES:
             break

@@ -165,10 +165,11 @@ def draw_stable_histogram(change: Change, what: str) -> Markup:
     after = change.stable_dz
     figure = figure_of(5.0, 2.7)
     axes = figure.add_axes((0.11, 0.2, 0.86, 0.74))
-    shift = change.errors.registration.vertical_m
-    reach = max(3 * Z95 / 2 * change.errors.registration.after[2], abs(shift) * 1.2, 1e-3)
+    registration = change.errors.registration
+    reach = max(3 * Z95 / 2 * max(registration.after[2], registration.before[2]), 1e-3)
+    reach = max(reach, 1.2 * abs(registration.before[0]))
     edges = np.linspace(-reach, reach, 81)
-    for values, colour, label in ((after + shift, SOFT, "before"), (after, "#1f5f86", "after")):
+    for values, colour, label in ((change.stable_before_dz, SOFT, "before"), (after, "#1f5f86", "after")):
         axes.hist(values, edges.tolist(), histtype="step", color=colour, label=label)
     for sign in (-1, 1):
         axes.axvline(sign * change.detection_m[1], color=LOWER, linewidth=0.8, linestyle="--")

@@ -64,6 +64,8 @@ class Options:
         register: what is subtracted from the later survey; auto is vertical.
         shift: horizontally, from the orthophotos: where they tell it; not at all; or refused where they do not.
         datum_error_m: one sigma of the error that all cells share, as the user knows it.
+        shift_error_m: one sigma of the horizontal shift in each direction, as the user knows it; counts where the
+            orthophotos do not tell the shift.
         windows: cells along each side of the windows in which change is tested.
     """
 
@@ -71,6 +73,7 @@ class Options:
     register: Register = "auto"
     shift: Literal["auto", "none", "images"] = "auto"
     datum_error_m: float | None = None
+    shift_error_m: float | None = None
     windows: tuple[int, ...] = WINDOWS
 
 
@@ -114,6 +117,7 @@ class Change:
         errors: of dz.
         stable: cells that co-registration and errors were measured on; they may lie outside of what is compared.
         stable_dz: dz in these, or in every second, third, ... of them.
+        stable_before_dz: the same before co-registration.
         stable_given: whether the user named them.
         false_alarms: share of stable cells that are significant by themselves: the null test.
         net: of all cells, without a threshold.
@@ -128,6 +132,7 @@ class Change:
     errors: ErrorModel
     stable: Bool[np.ndarray, "rows columns"]
     stable_dz: Float32[np.ndarray, " N"]
+    stable_before_dz: Float32[np.ndarray, " N"]
     stable_given: bool
     outlines: Outlines
     false_alarms: float
@@ -215,6 +220,8 @@ def measure(
     options = options or Options()
     grid = common_grid([earlier, later], options.cell_m)
     remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks])]
+    # What cannot be read is found before all is measured.
+    steady, limits, polygons = ([] if read is None else read(grid) for read in (stable, within, regions))
     target = None if grid.crs is None else CRS.from_wkt(grid.crs)
     for surface in (earlier, later):
         if surface.crs is not None and target is not None and (lost := lost_in_conversion(surface.crs, target)):
@@ -241,11 +248,11 @@ def measure(
             f"{share:.1f}% of the cells, {len(on_water) * grid.cell_area_m2:,.0f} m², are water at one date or both "
             "by the classes of the maps: left out, since their heights are the water's and not the ground's"
         )
-    given = rasterised(stable(grid), grid) if stable is not None else None
+    given = rasterised(steady, grid) if steady else None
     if given is not None:
         given &= np.isfinite(dz)
     # Stable ground lies outside of what is asked about, too.
-    area = rasterised(within(grid), grid) if within is not None else None
+    area = rasterised(limits, grid) if limits else None
     known = int(np.isfinite(dz).sum())
     if area is not None and not np.isfinite(dz[area]).any():
         raise ChangeError(
@@ -260,19 +267,24 @@ def measure(
     unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)[0]
     unmoved[wet] = np.nan
     steps = rounding_m(earlier), rounding_m(later)
-    _leave_out_repeated(dz, unmoved, max(steps), given, remarks)
+    _leave_out_repeated(dz, unmoved, max(steps), given, area, remarks)
     del unmoved
     rounding = math.hypot(*steps) / math.sqrt(12)  # each error is uniform within a step
     model: Model = "vertical" if options.register == "auto" else options.register
     settled = _settle(dz, own, grid, given, model, options, rounding, remarks)
     registration, variogram, sigma, ground = settled
     slopes = None
-    if shift is not None and shift.known:
-        registration = replace(registration, shift_m=moved, shift_error_m=shift.error_m, words=[shift.words()])
+    shift_error_m = shift.error_m if shift is not None and shift.known else options.shift_error_m
+    if shift is not None:
+        registration = replace(registration, shift_m=moved, words=[shift.words()])
+    if shift_error_m is not None:
+        stated = shift is None or not shift.known
+        registration = replace(registration, shift_error_m=shift_error_m, shift_stated=stated)
         slopes = _slopes(earlier, grid)
         if model != "none":
             # The mean over stable ground of what an error of the shift does was subtracted there.
             slopes -= np.stack([_sampled(part, ground).mean() for part in slopes])[:, None, None]
+    shown_before = _sampled(dz, ground)
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
     if len(on_water):
@@ -280,7 +292,7 @@ def measure(
     degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
     errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
     alarms = _false_alarms(dz, errors, ground)
-    shown = _sampled(dz, ground)
+    shown = _sampled(dz, ground), shown_before
     if area is not None:
         dz[~area] = np.nan
         on_water[~area[wet]] = np.nan
@@ -299,7 +311,7 @@ def measure(
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
     outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, options.windows)
-    found = _summed(earlier, later, dz, errors, ground, shown, given is not None, outlines, alarms, regions, remarks)
+    found = _summed(earlier, later, dz, errors, ground, shown, given is not None, outlines, alarms, polygons, remarks)
     partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in found.per_region if one.compared < _WHOLE]
     if partial:
         limited = " and --within reaches" if area is not None else ""
@@ -341,7 +353,12 @@ def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remar
     if not shift.known:
         if options.shift == "images":
             raise ChangeError(f"{shift.words()}: expected at least a quarter; give control, or leave --shift out")
-        remarks.append(shift.words())
+        on_slopes = (
+            "no error has what a shift would do on slopes: state how large it may be (--shift-error)"
+            if options.shift_error_m is None
+            else f"the standard error of {options.shift_error_m:g} m that was stated counts on slopes"
+        )
+        remarks.append(f"{shift.words()}, and {on_slopes}")
     return shift
 
 
@@ -429,7 +446,7 @@ def _settle(
         moved = np.empty_like(dz)
         for rows in grid.strips():
             moved[rows] = dz[rows] - found.plane(grid, rows)
-        outlines = find_outlines(moved, sigma, found.systematic_m, variogram, grid.cell_m, options.windows)
+        outlines = find_outlines(moved, sigma, found.near(grid), variogram, grid.cell_m, options.windows)
         del moved
         ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
     raise AssertionError("the last turn returns")
@@ -440,6 +457,7 @@ def _leave_out_repeated(
     unmoved: Float32[np.ndarray, "rows columns"],
     step_m: float,
     given: Bool[np.ndarray, "rows columns"] | None,
+    area: Bool[np.ndarray, "rows columns"] | None,
     remarks: list[str],
 ) -> None:
     """Leave out cells that one survey has from the other, which were not measured twice, and say so.
@@ -448,6 +466,7 @@ def _leave_out_repeated(
         unmoved: dz without a horizontal shift, which interpolates: only there are the cells the same.
         step_m: what heights are rounded to.
         given: stable ground, if the user named it.
+        area: that the comparison is limited to, likewise.
     """
     same, share = repeated(unmoved, step_m)
     if not share:
@@ -459,7 +478,11 @@ def _leave_out_repeated(
         remarks.append(
             "all heights are the same in both surveys, so that no errors can be measured: intervals have none"
         )
-    elif share > _MOST_REPEATED or (given is not None and np.count_nonzero(given & ~same) < LEAST_STABLE):
+    elif (
+        share > _MOST_REPEATED
+        or (given is not None and np.count_nonzero(given & ~same) < LEAST_STABLE)
+        or (area is not None and not (area & np.isfinite(dz) & ~same).any())
+    ):
         remarks.append(
             f"{alike}: errors are too small if these cells were not measured twice; limit the comparison to what was "
             "(--within), and name stable ground there (--stable)"
@@ -519,11 +542,11 @@ def _summed(
     dz: Float32[np.ndarray, "rows columns"],
     errors: ErrorModel,
     ground: Bool[np.ndarray, "rows columns"],
-    stable_dz: Float32[np.ndarray, " N"],
+    stable_dz: tuple[Float32[np.ndarray, " N"], Float32[np.ndarray, " N"]],
     stable_given: bool,
     outlines: Outlines,
     alarms: float,
-    regions: Callable[[Grid], list[Region]] | None,
+    regions: list[Region],
     remarks: list[str],
 ) -> Change:
     """The volumes of a difference."""
@@ -559,7 +582,7 @@ def _summed(
     for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
         each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
     per_region, empty = [], []
-    for region in regions(grid) if regions is not None else []:
+    for region in regions:
         cells = region.cells(grid)
         inside = cells & known
         if not inside.any():
@@ -576,7 +599,7 @@ def _summed(
         dz,
         errors,
         ground,
-        stable_dz,
+        *stable_dz,
         stable_given,
         outlines,
         alarms,
@@ -612,7 +635,7 @@ def _in_box(
             errors.systematic_of_sum(inside, box) * area,
             len(values) * area,
             degrees_of_freedom=errors.degrees_of_freedom,
-            datum_m3=errors.datum_error_m * len(values) * area,
+            datum_m3=errors.stated_of_sum(inside, box) * area,
         ),
         float(np.abs(values).max()),
     )

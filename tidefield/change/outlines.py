@@ -130,15 +130,16 @@ def _largest_z(
 ) -> Float32[np.ndarray, "rows columns"]:
     """For each cell the z of that window which is most significant."""
     z = np.empty(dz.shape, np.float32)
+    smallest, *larger_ones = sorted(windows)
     halo = max(windows) // 2
     for rows in _strips(len(dz)):
         low, high = max(0, rows.start - halo), min(len(dz), rows.stop + halo)
         inner = slice(rows.start - low, rows.stop - low)
         own, near = (of[low:high] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))
         limited = _limited(dz[low:high], own)
-        first = window_z(limited, own, near, variogram, cell_m, windows[0])[inner]
+        first = window_z(limited, own, near, variogram, cell_m, smallest)[inner]
         z[rows] = first
-        for window in windows[1:]:
+        for window in larger_ones:
             other = window_z(limited, own, near, variogram, cell_m, window)[inner]
             # A large window reaches beyond the edge of a change; the smallest one has to show a little of it, too.
             larger = (np.abs(other) > np.abs(z[rows])) & (first * np.sign(other) > _SHOWS)

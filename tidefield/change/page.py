@@ -138,7 +138,10 @@ def water_words(water: Water | None) -> list[str]:
     words = []
     line = water.waterline
     if line is not None and not all(line.lines):
-        words.append("There is no waterline at these heights of the water at both dates.")
+        words.append(
+            f"There is no waterline at these heights of the water at both dates: {cubic(line.land_gained_m2)} m² fell "
+            f"dry, {cubic(line.land_lost_m2)} m² came under water."
+        )
     elif line is not None:
         move, low, high = line.move_m
         words.append(
@@ -181,9 +184,15 @@ def limits(change: Change, cover: Cover | None = None) -> list[str]:
     if cover is not None:
         green = "Green water with waves" if cover.leaves_out_films else "Shallow water, which is green,"
         found.append(f"{green} counts as plants, unless the water's heights are given (--water).")
-    if change.errors.registration.shift_error_m == 0:
+    registration = change.errors.registration
+    if registration.shift_error_m == 0:
         found.append("The surveys were compared where they lie: no horizontal shift was estimated.")
-    if change.errors.registration.model == "none":
+    elif registration.shift_stated:
+        found.append(
+            "The surveys were compared where they lie: no horizontal shift was estimated. Errors on slopes have the "
+            f"standard error of {registration.shift_error_m:g} m that was stated."
+        )
+    if registration.model == "none":
         found.append("Heights were taken as they are: no vertical shift was estimated.")
     return found
 

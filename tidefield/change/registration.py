@@ -36,7 +36,8 @@ class Registration:
         covariance: of the coefficients; of what is left as a systematic error.
         centre_m: east and north that x and y are counted from.
         shift_m: how far the later survey was moved to the east and north.
-        shift_error_m: one sigma of that in each direction; 0 where it was not moved.
+        shift_error_m: one sigma of that in each direction; 0 where it was neither measured nor stated.
+        shift_stated: whether the user stated that, and nothing was moved.
         stable_cells: on which it was estimated.
         before, after: median, NMAD and 95% deviation of dz over stable ground, metres.
         words: how it was done, for the report.
@@ -51,6 +52,7 @@ class Registration:
     after: tuple[float, float, float]
     shift_m: tuple[float, float] = (0.0, 0.0)
     shift_error_m: float = 0.0
+    shift_stated: bool = False
     words: list[str] = field(default_factory=list)
 
     @property
@@ -61,6 +63,10 @@ class Registration:
     def systematic_m(self) -> float:
         """One sigma of the error at the centre."""
         return math.sqrt(self.covariance[0, 0])
+
+    def near(self, grid: Grid) -> Float32[np.ndarray, "rows columns"] | float:
+        """One sigma of the error that a cell shares with all around it: of each cell where there is a tilt."""
+        return self.deviation(grid, slice(0, grid.rows)) if self.model == "tilt" else self.systematic_m
 
     def plane(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """What was subtracted, for some rows of a grid."""

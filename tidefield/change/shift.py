@@ -18,10 +18,12 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from pyproj import CRS
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from tidefield.change.errors import nmad
-from tidefield.change.surfaces import ChangeError, Grid, opened, warped
+from tidefield.change.surfaces import ChangeError, Grid, longer_side, opened, warped
+from tidefield.geometry.geodesy import horizontal, same_system
 
 _SIDE = 4096
 """Longest side of the pictures that are correlated."""
@@ -68,7 +70,7 @@ class Shift:
         if self.east_m is None or self.north_m is None:
             return (
                 f"the orthophotos do not tell the horizontal shift: {self.agreeing} of {self.windows} windows agree; "
-                "the surveys are compared where they lie, and no error has what a shift would do on slopes"
+                "the surveys are compared where they lie"
             )
         return (
             f"{self.agreeing} of {self.windows} windows of the orthophotos agree on a horizontal shift of "
@@ -82,6 +84,13 @@ def is_picture(dataset: Any) -> bool:
     return dataset.count >= 3 and dataset.dtypes[0] in ("uint8", "uint16")
 
 
+def require_picture(path: Path) -> None:
+    """Raises: ChangeError when a raster has no red, green and blue."""
+    with opened(path) as dataset:
+        if not is_picture(dataset):
+            raise ChangeError(f"{path} is no orthophoto: expected a GeoTIFF with red, green and blue")
+
+
 def picture_grid(paths: tuple[Path, Path], grid: Grid, side: float = _SIDE) -> Grid:
     """The grid that two orthophotos are compared on: their coarser pixels, on the ground of another grid.
 
@@ -91,19 +100,31 @@ def picture_grid(paths: tuple[Path, Path], grid: Grid, side: float = _SIDE) -> G
     Raises:
         ChangeError: one of them is no picture.
     """
-    pixel = 0.0
-    for path in paths:
-        with opened(path) as dataset:
-            if not is_picture(dataset):
-                raise ChangeError(f"{path} is no orthophoto: expected a GeoTIFF with red, green and blue")
-            own = max(abs(dataset.transform.a), abs(dataset.transform.e))
-            if dataset.crs is not None and dataset.crs.is_geographic:
-                own *= 111_320.0
-            pixel = max(pixel, own)
+    pixel = max(_pixel(path, grid) for path in paths)
     west, south, east, north = grid.bounds
     pixel = max(pixel, (east - west) / side, (north - south) / side)
     columns, rows = max(2, math.floor((east - west) / pixel)), max(2, math.floor((north - south) / pixel))
     return Grid(grid.crs, west, north, pixel, columns, rows)
+
+
+def _pixel(path: Path, grid: Grid) -> float:
+    """The longer side of an orthophoto's pixels on the ground, metres."""
+    require_picture(path)
+    with opened(path) as dataset:
+        own = max(abs(dataset.transform.a), abs(dataset.transform.e))
+        if dataset.crs is None or grid.crs is None:
+            return own
+        crs, target = CRS.from_wkt(dataset.crs.to_wkt()), CRS.from_wkt(grid.crs)
+        if same_system(crs, target):
+            return own
+        try:
+            to = Transformer.from_crs(horizontal(crs), target, always_xy=True)
+            return longer_side(dataset.transform, dataset.width, dataset.height, to)
+        except ProjError as error:
+            raise ChangeError(
+                f"{path} cannot be converted from {crs.name} to the surveys' system ({error}): expected an orthophoto "
+                "of their ground; warp it first (gdalwarp)"
+            ) from error
 
 
 def read_picture(

@@ -518,16 +518,24 @@ def _box(surface: Surface, crs: CRS | None) -> tuple[tuple[float, float, float, 
         return box, pixel
     try:
         to = Transformer.from_crs(horizontal(surface.crs), crs, always_xy=True)
-        middle = _at(surface.transform, surface.columns / 2, surface.rows / 2)
-        beside = _at(surface.transform, surface.columns / 2 + 1, surface.rows / 2)
-        x0, y0 = to.transform(*middle, errcheck=True)
-        x1, y1 = to.transform(*beside, errcheck=True)
-        return to.transform_bounds(*box, errcheck=True), math.hypot(x1 - x0, y1 - y0)
+        side = longer_side(surface.transform, surface.columns, surface.rows, to)
+        return to.transform_bounds(*box, errcheck=True), side
     except ProjError as error:
         raise ChangeError(
             f"{surface.path} cannot be converted from {surface.crs.name} to {crs.name} ({error}): expected a system "
             "that both can be converted to; warp one of them first (gdalwarp)"
         ) from error
+
+
+def longer_side(transform: Affine, columns: int, rows: int, to: Transformer) -> float:
+    """The longer side of a raster's middle pixel, in the system that its coordinates are converted to.
+
+    Raises:
+        ProjError: they cannot be converted.
+    """
+    x, y = zip(*(_at(transform, columns / 2 + i, rows / 2 + j) for i, j in ((0, 0), (1, 0), (0, 1))), strict=True)
+    east, north = to.transform(x, y, errcheck=True)
+    return max(math.hypot(east[k] - east[0], north[k] - north[0]) for k in (1, 2))
 
 
 def _at(transform: Affine, column: float, row: float) -> tuple[float, float]:

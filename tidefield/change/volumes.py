@@ -96,7 +96,7 @@ class ErrorModel:
         registration: the systematic error.
         degrees_of_freedom: of the correlated and the systematic part, without the datum's.
         slopes: of the ground to the east and north, beyond what the vertical registration takes out of an error of the
-            horizontal shift; None where nothing was shifted.
+            horizontal shift; None where that has no error.
         datum_error_m: one sigma of what the user stated of the systematic error, metres.
     """
 
@@ -122,7 +122,7 @@ class ErrorModel:
 
     def near_sigma(self) -> Float32[np.ndarray, "rows columns"] | float:
         """One sigma of the error that a cell shares with all around it."""
-        near = self.registration.systematic_m
+        near = self.registration.near(self.grid)
         return near if self.slopes is None else self._shared(np.float32(near), slice(0, self.grid.rows))
 
     def _shared(self, deviation: Any, rows: slice) -> Any:
@@ -142,12 +142,23 @@ class ErrorModel:
         Args:
             box: the rows and columns of the grid that the region covers; all if None.
         """
-        own = self.registration.deviation_of_sum(self.grid, region, box)
+        return math.hypot(self.registration.deviation_of_sum(self.grid, region, box), self._shift_of_sum(region, box))
+
+    def stated_of_sum(self, region: Bool[np.ndarray, "rows columns"], box: tuple[slice, slice] | None = None) -> float:
+        """One sigma of what the user stated of a sum's systematic error, metres times cells.
+
+        Args:
+            box: the rows and columns of the grid that the region covers; all if None.
+        """
+        shift = self._shift_of_sum(region, box) if self.registration.shift_stated else 0.0
+        return math.hypot(self.datum_error_m * int(region.sum()), shift)
+
+    def _shift_of_sum(self, region: np.ndarray, box: tuple[slice, slice] | None) -> float:
         if self.slopes is None:
-            return own
+            return 0.0
         parts = self.slopes if box is None else self.slopes[:, *box]
         east, north = (float(part.sum(where=region, dtype=np.float64)) for part in parts)
-        return math.hypot(own, self.registration.shift_error_m * math.hypot(east, north))
+        return self.registration.shift_error_m * math.hypot(east, north)
 
     def volume(
         self,
@@ -175,5 +186,5 @@ class ErrorModel:
             self.systematic_of_sum(region) * area,
             cells * area,
             degrees_of_freedom=self.degrees_of_freedom,
-            datum_m3=self.datum_error_m * cells * area,
+            datum_m3=self.stated_of_sum(region) * area,
         )

@@ -64,8 +64,10 @@ class Waterline:
         lines: of both dates, in map coordinates.
         wet: cells under water at one date or both.
         land_gained_m2, land_lost_m2: dry at one date only.
-        move_m: mean move towards the water (positive: the land grew), and its 95% interval.
-        quantiles_m: 5, 50 and 95% of the distances of the later line's points from the earlier line, with that sign.
+        move_m: mean move towards the water (positive: the land grew), and its 95% interval; NaN where one date has no
+            line.
+        quantiles_m: 5, 50 and 95% of the distances of the later line's points from the earlier line, with that sign;
+            likewise.
     """
 
     levels_m: tuple[float, float]
@@ -177,7 +179,7 @@ def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: t
     lines = [_edges(w[::step, ::step], known[::step, ::step], thin, offset) for w in wet]
     gained, lost = (float((wet[a] & ~wet[b]).sum()) * grid.cell_area_m2 for a, b in ((0, 1), (1, 0)))
     length = float(np.mean([sum(part.length for part in part_of) for part_of in lines]))
-    if length == 0:
+    if not all(lines):
         nothing = (math.nan, math.nan, math.nan)
         return Waterline(levels, (lines[0], lines[1]), wet[0] | wet[1], gained, lost, nothing, nothing)
     half = Z95 * _level_error(change, earlier, later, levels)

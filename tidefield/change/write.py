@@ -234,14 +234,10 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
     layers: list[Layer] = [("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
     step = 1 + math.isqrt(change.stable.size // 4_000_000)
     thin = change.stable[::step, ::step]
-    coarse = Grid(
-        change.grid.crs,
-        change.grid.west_m,
-        change.grid.north_m,
-        change.grid.cell_m * step,
-        thin.shape[1],
-        thin.shape[0],
-    )
+    # The middle of the cells that are left lies where it lay.
+    offset = (0.5 - 0.5 * step) * change.grid.cell_m
+    west, north = change.grid.west_m + offset, change.grid.north_m - offset
+    coarse = Grid(change.grid.crs, west, north, change.grid.cell_m * step, thin.shape[1], thin.shape[0])
     ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), coarse, thin)]
     ground = sorted(ground, key=lambda shape: -shape.area)[:_MOST_POLYGONS_OF_GROUND]
     layers.append(("stable ground", ground, [{"area_m2": shape.area} for shape in ground]))
@@ -274,22 +270,24 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
     for name, geometries, table in layers:
         if not geometries:
             continue
+        shapes_of = _multi(geometries)
+        polygons = all(shape.geom_type == "MultiPolygon" for shape in shapes_of)
         raw.write(
             path,
-            geometry=shapely.to_wkb(np.array(_multi(geometries), dtype=object)),
+            geometry=shapely.to_wkb(np.array(shapes_of, dtype=object)),
             field_data=[np.array([row[key] for row in table]) for key in table[0]],
             fields=list(table[0]),
             layer=name.replace(" ", "_"),
             driver="GPKG",
-            geometry_type="LineString" if name == "waterlines" else "MultiPolygon",
+            geometry_type="LineString" if name == "waterlines" else "MultiPolygon" if polygons else "Unknown",
             crs=change.grid.crs or PLAIN,
             append=path.exists(),
         )
 
 
 def _multi(shapes: list[BaseGeometry]) -> list[BaseGeometry]:
-    """Lines as they are; of everything else the polygons."""
-    return [shape if shape.geom_type == "LineString" else _polygons(shape) for shape in shapes]
+    """Lines and points as they are; of everything else the polygons."""
+    return [_polygons(shape) if shapely.get_dimensions(shape) == 2 else shape for shape in shapes]
 
 
 def _polygons(shape: BaseGeometry) -> BaseGeometry:
@@ -323,6 +321,7 @@ def summary(change: Change, command: str) -> dict[str, Any]:
             "tilt_m_per_m": list(registration.coefficients[1:]),
             "shift_m": list(registration.shift_m),
             "shift_error_m": registration.shift_error_m,
+            "shift_error_stated": registration.shift_stated,
             "systematic_m": registration.systematic_m,
             "datum_error_m": change.errors.datum_error_m,
             "stable_ground": "given" if change.stable_given else "found",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import date
@@ -69,6 +70,9 @@ class Change:
     datum_error: float | None = None
     """Standard error in metres that all heights of the difference share, as control gives it; added to what stable
     ground shows, or with --register none used instead."""
+    shift_error: float | None = None
+    """Standard error in metres, in each direction, of how the surveys lie next to one another, as control gives it;
+    counts on slopes where the orthophotos tell no shift, or with --shift none."""
     cell: float | None = None
     """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
     windows: tuple[int, ...] = (5, 11, 21)
@@ -126,13 +130,21 @@ def _compare(options: Change, console: Console, work: Path) -> None:
 
 def _series(options: Change, console: Console, work: Path) -> None:
     """Compare surveys step by step and each with the first."""
-    from tidefield.change.series import entries_of, in_order, write_series
+    from tidefield.change.inputs import is_cloud, open_survey
+    from tidefield.change.series import entries_of, write_series
     from tidefield.pages import command_line
 
     paths = (options.earlier, options.later, *options.series)
     dates = _dates(options, len(paths))
     names: list[str] = [""] * len(paths)
     entries, stated = [], list(dates)
+    # What is missing or out of order is found before the first survey is compared.
+    for k, path in enumerate(paths):
+        if not is_cloud(path):
+            stated[k] = open_survey(path, dates[k]).date
+        elif not path.is_file():
+            raise RunError(f"{path} is not there: expected a point cloud; check its name")
+    _require_order(paths, stated)
     with completed_folder(options.out) as folder:
         for end in range(1, len(paths)):
             for start in sorted({0, end - 1}):
@@ -141,11 +153,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
                 found = _measured(options, paths[start], paths[end], (dates[start], dates[end]), own, console)
                 for k, surface in ((start, found.change.earlier), (end, found.change.later)):
                     names[k], stated[k] = surface.name, surface.date
-                if not in_order(stated):
-                    raise RunError(
-                        f"{paths[end]} is of {stated[end]}, before a survey that was named earlier: expected the order "
-                        "of time; exchange them, or state their --dates"
-                    )
+                _require_order(paths[: end + 1], stated[: end + 1])
                 if start == 0:
                     entries += entries_of(found.change, "first", start, end)
                 if start == end - 1:
@@ -161,6 +169,18 @@ def _series(options: Change, console: Console, work: Path) -> None:
                 "different ground (series.html); a polygon that all surveys cover (--within) compares the same"
             )
     console.print(str(options.out), soft_wrap=True)
+
+
+def _require_order(paths: Sequence[Path], dates: Sequence[str | None]) -> None:
+    """Raises: RunError when a survey is of an earlier date than one that was named before it."""
+    from tidefield.change.series import in_order
+
+    for end in range(1, len(paths)):
+        if not in_order(dates[: end + 1]):
+            raise RunError(
+                f"{paths[end]} is of {dates[end]}, before a survey that was named earlier: expected the order of time; "
+                "exchange them, or state their --dates"
+            )
 
 
 def _distinct(names: list[str]) -> list[str]:
@@ -193,6 +213,7 @@ def _measured(
     from tidefield.change.inputs import open_pair
     from tidefield.change.measure import Options, measure
     from tidefield.change.regions import read_regions
+    from tidefield.change.shift import require_picture
     from tidefield.change.water import measure_water
     from tidefield.progress import ProgressBar
 
@@ -200,6 +221,8 @@ def _measured(
     pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2, registered)
     earlier, later = pair.earlier, pair.later
     if options.orthophotos is not None:
+        for path in options.orthophotos:
+            require_picture(path)
         earlier, later = (
             replace(surface, orthophoto=path)
             for surface, path in zip((earlier, later), options.orthophotos, strict=True)
@@ -209,7 +232,9 @@ def _measured(
             f"{one} is of {earlier.date}, {other} of {later.date}: expected the earlier survey first; exchange them, "
             "or state their --dates"
         )
-    asked = Options(options.cell, options.register, options.shift, options.datum_error, options.windows)
+    asked = Options(
+        options.cell, options.register, options.shift, options.datum_error, options.shift_error, options.windows
+    )
     reads = [
         None if path is None else (lambda grid, path=path: read_regions(path, grid))
         for path in (options.stable, options.within, options.polygons)
@@ -343,8 +368,9 @@ def _check_scenes(scenes: tuple[Path, Path], cameras: tuple[str, ...], device: s
 
 def _check(options: Change) -> None:
     """Raises: RunError when an option has no meaning."""
-    if options.datum_error is not None and not 0 <= options.datum_error < 100:
-        raise RunError(f"--datum-error {options.datum_error} was asked for: expected 0 to 100 metres; choose another")
+    for name, error in (("--datum-error", options.datum_error), ("--shift-error", options.shift_error)):
+        if error is not None and not 0 <= error < 100:
+            raise RunError(f"{name} {error} was asked for: expected 0 to 100 metres; choose another")
     if options.cell is not None and not 0 < options.cell < math.inf:
         raise RunError(f"--cell {options.cell} was asked for: expected more than 0 metres; choose another")
     if not options.windows or any(window < 1 or window % 2 == 0 or window > 101 for window in options.windows):
