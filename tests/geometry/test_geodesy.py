@@ -147,6 +147,14 @@ def test_a_compound_system_gives_the_vertical_datum_and_the_unit_of_heights():
     feet = LocalFrame.at("EPSG:2263+6360", (1000000.0, 200000.0, 100.0))
     assert feet.height_m == pytest.approx(30.48, abs=1e-3)
     np.testing.assert_allclose(feet.from_crs(np.array([[1000000.0, 200000.0, 200.0]]))[0], (0, 0, 30.48), atol=1e-3)
+    assert feet.vertical_datum == "NAVD88 height (ftUS)"
+
+
+@pytest.mark.parametrize("vertical", ["5703", "6360", "8228"])
+def test_the_vertical_datum_of_products_in_metres_is_named_in_metres(vertical: str):
+    frame = LocalFrame.at(f"EPSG:6318+{vertical}", (-122.0, 38.0, 100.0))
+    assert frame.to_crs(np.zeros((1, 3)))[0, 2] == pytest.approx(frame.height_m)
+    assert frame.vertical_datum == "NAVD88 height"
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:99999", "", "EPSG:5701", "the moon"])

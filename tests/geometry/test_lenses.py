@@ -195,6 +195,7 @@ def test_the_pinhole_of_a_fisheye_has_square_pixels_and_at_most_the_widest_angle
     assert np.degrees(np.arctan(edges)) == pytest.approx([-WIDEST_DEG / 2, WIDEST_DEG / 2])
 
 
+@pytest.mark.thorough
 def test_a_straight_line_is_straight_when_a_fisheye_is_undistorted() -> None:
     pinhole, size = WIDE.pinhole(), (600, 800)
     v, u = np.mgrid[: size[0], : size[1]] + 0.5

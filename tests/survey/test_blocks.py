@@ -128,6 +128,7 @@ def test_blocks_are_merged_to_one_model_of_the_true_shape(survey, tmp_path: Path
     assert np.abs(left - flight.centres_world).max() < 0.3
 
 
+@pytest.mark.thorough
 def test_finished_blocks_are_kept_by_a_run_that_continues(survey, tmp_path: Path, monkeypatch):
     flight, database = survey
     photographs = flight.survey.photographs

@@ -198,6 +198,7 @@ def test_control_of_the_same_site_is_accepted():
     refuse_elsewhere(Control("EPSG:27700", {"G1": (351139.0, 512875.0, 264.0)}, ()), *HERE)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("crs", "x", "y", "expected"),
     [

@@ -185,6 +185,56 @@ def test_a_single_strip_is_levelled_by_gimbal_angles_if_given():
     assert np.abs(down[:, 2] - truth[:, 2]).max() < 0.01
 
 
+def looking(forward: np.ndarray, centres: np.ndarray, points: np.ndarray, position_m: float) -> Flight:
+    """Photographs held level that look in these directions, without gimbal angles."""
+    generator = np.random.default_rng(4)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    rotations = np.stack([right, np.cross(forward, right), forward], axis=2)
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1
+    )
+    model = photographed(camera, rotations, centres, points, 0.3, generator)
+    places = FRAME.to_geographic(centres + position_m * generator.normal(0, 1, centres.shape))
+    return Flight(model, Survey(Path("."), tuple(map(photograph, range(len(places)), places)), None), centres)
+
+
+@pytest.mark.parametrize("pitch_deg", [-80.0, -30.0, 0.0, 5.0, 35.0])
+def test_photographs_around_a_tree_do_not_turn_it_over(pitch_deg):
+    around, pitch = np.linspace(0, 2 * np.pi, 16, endpoint=False), math.radians(pitch_deg)
+    out = np.c_[np.cos(around), np.sin(around), np.zeros(16)]
+    forward = np.array([0, 0, math.sin(pitch)]) - math.cos(pitch) * out
+    tree = np.random.default_rng(1).uniform((-3, -3, -14), (3, 3, 14), (900, 3))
+    flight = looking(forward, 12 * out, tree, position_m=0.5)
+    assert find_down(flight.model, flight.survey.photographs).direction_model[2] < -0.99
+    model, found = located(flight)
+    assert np.abs(off_m(flight, model, found.frame)).max() < 1.0
+
+
+def wall(rows: int, position_m: float, pitch_deg: float = 2.0) -> Flight:
+    """Parallel photographs of a wall, looking north and slightly upwards."""
+    generator, pitch = np.random.default_rng(1), math.radians(pitch_deg)
+    x, z = np.meshgrid(np.arange(8) * 4.0, np.arange(rows) * 4.0)
+    centres = np.c_[x.ravel(), np.zeros(x.size), z.ravel()]
+    forward = np.tile([0.0, math.cos(pitch), math.sin(pitch)], (x.size, 1))
+    return looking(forward, centres, generator.uniform((-8, 8, -8), (36, 11, 24), (900, 3)), position_m)
+
+
+@pytest.mark.parametrize("position_m", [0.05, 1.0])
+def test_positions_in_front_of_a_wall_determine_its_vertical(position_m):
+    flight = wall(4, position_m)
+    model, found = located(flight)
+    assert np.abs(off_m(flight, model, found.frame)).max() < 0.1 + 1.5 * position_m
+    assert any("alone, to within about" in note and "not look straight down" in note for note in found.notes) == (
+        position_m == 1.0
+    )
+
+
+def test_what_the_vertical_of_parallel_photographs_assumes_is_noted():
+    _, found = located(wall(1, 0.5))
+    assert any("as if the photographs looked straight down" in note for note in found.notes)
+
+
 def test_missing_heights_are_relative_altitudes_or_level_flight():
     flight = fly(lines=3, each=6, position_m=0.5)
     without = all_moved(flight.survey, lambda position: {"height_m": math.nan})
@@ -335,6 +385,14 @@ def test_identical_positions_give_no_georeference():
     _, found = located(flight, all_moved(flight.survey, lambda p: {"latitude_deg": 54.5, "longitude_deg": -2.75}))
     assert found.source == "none"
     assert "do not follow" in found.notes[0]
+
+
+def test_a_scene_without_georeference_has_all_reasons_in_its_first_note():
+    survey = over_two_zeros(all_moved(fly().survey, lambda p: {"latitude_deg": 54.5, "longitude_deg": -2.75}), 10)
+    _, found = located(fly(), survey)
+    assert found.notes[0].startswith("5 of 15 positions are not used: their heights are over")
+    assert "15 photographs have positions, and they do not follow the photographs" in found.notes[0]
+    assert "another file with --gps" in found.notes[0]
 
 
 @pytest.mark.parametrize(

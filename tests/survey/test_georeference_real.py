@@ -42,6 +42,7 @@ def test_gps_residuals_are_the_receivers_noise(name, epsg, horizontal_m, vertica
     assert found.left_out == found.notes == ()
 
 
+@pytest.mark.thorough
 def test_differential_gps_removes_the_bend_of_turin_lot():
     model, found = located("turin_lot")
     assert "instead of 11 cm horizontally and 31 cm vertically" in found.notes[0]
@@ -51,6 +52,7 @@ def test_differential_gps_removes_the_bend_of_turin_lot():
     assert max(down) < -0.9998, "all gimbals said -89.9 degrees or more"
 
 
+@pytest.mark.thorough
 def test_control_of_swindale_is_met_to_decimetres_without_the_wrong_point():
     _, found = located("swindale")
     assert found.source == "ground control"

@@ -126,6 +126,7 @@ def test_a_common_shift_of_all_positions_is_reported_and_ignored(flight):
     assert np.abs(off_m(flight, model, found)).max() < 1.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("marks", [2, 3, 4])
 @pytest.mark.parametrize("positions", [True, False])
 def test_a_mark_moved_by_200_pixels_is_rejected(flight, marks, positions):
@@ -240,9 +241,46 @@ def test_collinear_points_do_not_turn_the_model_over(flight):
     assert np.abs(off_m(flight, model, found)).max() < 5.0
 
 
+def marked_once(survey: Survey) -> Survey:
+    assert survey.control is not None
+    for name in survey.control.points:
+        survey = only_marks(survey, name, 1)
+    return survey
+
+
+@pytest.mark.parametrize("places", [CONTROL[:2], np.column_stack([np.linspace(-35, 35, 5), np.zeros(5)])])
+def test_few_points_marked_once_place_nothing_and_are_refused(flight, places):
+    survey = marked_once(with_control(flight, places))
+    with pytest.raises(
+        SurveyError, match=r"no point of ground control \(G1, G2.*expected marks of a point in two photographs"
+    ):
+        located(flight, survey)
+    near = fly(position_m=0.3)
+    with pytest.raises(SurveyError, match=r"no point of ground control"):
+        located(near, marked_once(with_control(near, places)))
+    both = with_control(near, places)
+    for name in ("G2", "G3", "G4", "G5"):
+        both = only_marks(both, name, 1)
+    _, found = located(near, both)
+    assert found.control.names == ("G1",)
+
+
+def test_many_points_marked_once_adjust_the_model_unless_differential_positions_shape_it():
+    plain, accurate = fly(position_m=0.3), fly(position_m=0.015)
+    model, found = located(plain, marked_once(with_control(plain)))
+    assert len(found.control_world) == 8
+    assert np.median(np.abs(off_m(plain, model, found)[:, :2])) < 0.15
+    fixed = tuple(
+        replace(p, position=replace(p.position, horizontal_m=0.015, vertical_m=0.025))
+        for p in accurate.survey.photographs
+    )
+    with pytest.raises(SurveyError, match="has two marks that fit together"):
+        located(accurate, replace(marked_once(with_control(accurate)), photographs=fixed))
+
+
 def test_one_point_without_positions_is_too_few(flight):
     survey = without_positions(with_control(flight, CONTROL[:1]))
-    with pytest.raises(SurveyError, match="expected three such points"):
+    with pytest.raises(SurveyError, match="expected two such points"):
         located(flight, survey)
 
 

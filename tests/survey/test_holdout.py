@@ -85,6 +85,7 @@ def test_other_pixels_in_held_out_photographs_change_nothing_of_the_others(
     assert (one.cameras.gain - other.cameras.gain).abs().max() < 1e-3  # they depend on the held-out cameras' positions
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_placed_is_left_out_with_one_message_and_without_the_option_everything_is_used(
     made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

@@ -228,6 +228,15 @@ def test_other_layouts_are_imported_with_a_warning_of_losses(tmp_path: Path, cap
     assert [Path(message.split()[0]).name for message in warnings] == ["llff", "blender"]
 
 
+def test_points_are_found_in_training_photographs_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, used = survey(BARREL), []
+    names = [f"./images/{name}" for name in truth.names]
+    write_transforms(tmp_path / "theirs", truth, train_filenames=names[3:], test_filenames=names[:3])
+    monkeypatch.setattr(convert, "find_points", lambda posed, train, root: used.extend(train))
+    import_project(tmp_path / "theirs", tmp_path / "ours")
+    assert used == list(range(3, len(names)))
+
+
 def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:
     write_project(tmp_path / "project")
     assert import_project(tmp_path / "project", tmp_path / "a")[1] is None

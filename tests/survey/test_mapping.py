@@ -15,6 +15,7 @@ from tidefield.survey.sfm.mapping import (
     Heights,
     LensChoice,
     LensTrial,
+    _compare_heights,
     best_of,
     choose_lens,
     lens_notes,
@@ -197,6 +198,17 @@ def test_a_photograph_without_points_has_no_flight_height():
     choice = choose_lens(model, photographs, True, quiet)
     assert choice.heights is not None
     assert choice.heights.calibrated_share == pytest.approx(1.0, abs=0.05)
+
+
+def test_ground_above_the_cameras_gives_no_flight_heights():
+    flight = fly(lines=4, each=6, noise_px=0.2)
+    lens = LensPrior(FOCAL, None, None, "DJI dewarp data", True, 1.04 * FOCAL)
+    photographs = [replace(p, lens=lens, relative_altitude_m=75.0) for p in flight.survey.photographs]
+    model = pycolmap.Reconstruction(flight.model)
+    assert _compare_heights(model, photographs) is not None
+    for point in model.points3D.values():
+        point.xyz = point.xyz + np.array([0.0, 0.0, 150.0])
+    assert _compare_heights(model, photographs) is None
 
 
 def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):

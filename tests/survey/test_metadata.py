@@ -181,7 +181,30 @@ def test_flights_between_pauses_are_judged_each(tmp_path):
         packet = xmp({"AbsoluteAltitude": "+112.300", **HERE, **RTK_FLOAT})
         photograph(tmp_path / f"{k:02d}.jpg", table=table, packet=packet)
     sources = [p.position.source for p in read_survey(tmp_path).photographs if p.position is not None]
-    assert sources == ["EXIF, RTK float"] * 30 + ["EXIF"] * 10
+    assert sources == ["EXIF, RTK float"] * 30 + ["EXIF after the flight"] * 10
+
+
+def test_heights_of_a_flight_without_rtk_that_was_corrected_are_not_mixed_with_those_of_one_that_was_not(tmp_path):
+    """The corrected heights are ellipsoidal, the others barometric, and nothing in the files says so."""
+    for k in range(30):
+        up_m = 0.004 if k < 20 else 14.0  # of which one outlier is no flight
+        table = exif(at(k + (200 if k >= 20 else 0)), place=BRIGHTON, height_m=112.3 + (14.0 if k == 3 else up_m))
+        packet = xmp({"AbsoluteAltitude": "+112.300", **HERE})
+        photograph(tmp_path / f"{k:02d}.jpg", table=table, packet=packet)
+    given = given_positions(read_survey(tmp_path).photographs)
+    assert given.names == tuple(f"{k:02d}.jpg" for k in range(20))
+    assert "10 of 30 positions are not used" in given.notes[0]
+    assert (
+        "over an unknown zero (EXIF after the flight), those of the others over an unknown zero (EXIF)"
+        in given.notes[0]
+    )
+
+
+def test_where_all_flights_were_corrected_their_positions_keep_the_name_of_earlier_versions(tmp_path):
+    for k in range(6):
+        table = exif(at(k + 200 * (k // 3)), place=BRIGHTON, height_m=126.3)
+        photograph(tmp_path / f"{k}.jpg", table=table, packet=xmp({"AbsoluteAltitude": "+112.300", **HERE}))
+    assert {p.position and p.position.source for p in read_survey(tmp_path).photographs} == {"EXIF"}
 
 
 @pytest.mark.parametrize(
@@ -325,6 +348,7 @@ def test_a_distortion_beyond_all_lenses_is_ignored():
     assert (prior.focal_px, prior.distortion) == (3000, None)
 
 
+@pytest.mark.thorough
 def test_descriptions_in_descriptions_are_read_in_linear_time():
     rdf = '<x xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" xmlns:a="a">'
 

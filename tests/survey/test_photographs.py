@@ -41,6 +41,29 @@ def test_photographs_are_found_in_sub_folders_with_any_suffix_and_name(tmp_path)
     assert all(photograph.path.is_file() for photograph in survey.photographs)
 
 
+def test_photographs_in_folders_that_look_like_results_are_counted_and_results_are_not(tmp_path: Path):
+    camera, card = exif({Base.Model: "M1"}), survey_folder(tmp_path / "card")
+    for name in ("odm_flight 2/DJI_0000.JPG", "odm_flight 2/DJI_0001.JPG", "a/flight 3/DJI_0000.JPG"):
+        photograph(card / name, table=camera)
+    for name in ("colmap/images/DJI_0000.JPG", "scene/images/z.jpg", "imported/images/z.jpg", "opensfm/.x/z.jpg"):
+        photograph(card / name, table=camera)
+    for name in ("odm_texturing/z.png", "odm_orthophoto/z.tif", "opensfm/undistorted/images/z.jpg"):
+        photograph(card / name)
+    for folder in ("a/flight 3", "colmap", "scene", "imported"):
+        (card / folder / "sparse").mkdir()
+    (card / "scene" / "georeference.json").write_text("{}")
+    (card / "imported" / "transforms.json").write_text("{}")
+    survey = read_survey(card)
+    assert len(survey.photographs) == 4
+    first, second = survey.remarks
+    assert first.startswith("1 photographs in a/flight 3 are not read, because it looks like results of ODM or a scene")
+    assert second.startswith("2 photographs in odm_flight 2 are not read")
+    for path in card.glob("*.JPG"):
+        path.unlink()
+    with pytest.raises(SurveyError, match=r"has no photographs(.|\n)*2 photographs in odm_flight 2 are not read"):
+        read_survey(card)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_photograph_has_its_upright_size(tmp_path, orientation):
     turned = one(tmp_path, size=(64, 48), table=exif({Base.Orientation: orientation}))

@@ -83,6 +83,7 @@ def test_heights_have_the_unit_in_the_title(tmp_path, title, height_m):
     assert (position.latitude_deg, position.vertical_m) == (54.5, pytest.approx(0.02))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("title", "height_m", "datum"),
     [
@@ -357,6 +358,34 @@ def test_a_file_without_heights_leaves_those_of_exif(tmp_path):
         assert position is not None
         assert (position.longitude_deg, position.height_m, position.datum) == (-91.9, 200, "mean sea level")
         assert position.source == "EXIF, gps.csv"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("gps.csv", "time,speed\n1,2\n"),
+        ("gps.csv", "name,lat,lon\nx,54.5,west\n"),
+        ("geo.txt", "EPSG:4326\nother.jpg 1 2 3\n"),
+        ("geo.txt", "notes of the flight\n"),
+    ],
+)
+def test_a_file_in_the_folder_that_is_none_of_positions_is_remarked_and_refused_if_it_is_given(tmp_path, name, text):
+    photograph(survey_folder(tmp_path, count=3) / "x.jpg")
+    path = written(tmp_path, text, name)
+    survey = read_survey(tmp_path)
+    assert [p.position is not None for p in survey.photographs] == [True] * 3 + [False]
+    assert survey.remarks[0].startswith("The file of positions next to the photographs was not used: ")
+    assert name in survey.remarks[0]
+    assert "rename it or move it away" in survey.remarks[0]
+    with pytest.raises(SurveyError):
+        read_survey(tmp_path, gps=path)
+
+
+def test_a_file_in_the_folder_that_contradicts_itself_is_refused(tmp_path):
+    photograph(survey_folder(tmp_path, count=3) / "x.jpg")
+    written(tmp_path, "name,lat,lon\nx,54.5,2\nx,54.6,2\n")
+    with pytest.raises(SurveyError, match=r"line 3 gives x.jpg a second position"):
+        read_survey(tmp_path)
 
 
 def moved(folder: Path, **places: tuple[float, float]) -> Path:

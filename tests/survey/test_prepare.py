@@ -12,19 +12,20 @@ import ground_flight
 import numpy as np
 import pycolmap
 import pytest
+from camera_files import photograph, xmp
 from ground_flight import ABOVE, FOCAL, Flight, fly
 from located_surveys import unlocated_photograph
 from PIL import Image
 from rich.console import Console
 
-from tidefield.data.georeference import read_georeference
+from tidefield.data.georeference import LeftOut, read_georeference
 from tidefield.data.load import load_scene, read_posed
 from tidefield.errors import RunError, SceneError, SurveyError
 from tidefield.files import LOCK_FILE, only_writer
 from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
-from tidefield.survey.prepare import Prepared, _is_rounded, _require_control, prepare
+from tidefield.survey.prepare import Prepared, _fingerprint, _is_rounded, _require_control, prepare
 from tidefield.survey.quality.assessment import without
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm.blocks import cut
@@ -75,6 +76,7 @@ def test_all_cameras_are_at_their_true_positions(made: tuple[Path, Prepared], fl
     assert camera.focal_length_x == pytest.approx(FOCAL, rel=0.01)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_poses_estimated_in_blocks_or_at_once_are_as_good(
     mapper: Literal["incremental", "global"],
@@ -220,6 +222,7 @@ def test_a_stage_whose_files_are_damaged_is_done_again_with_one_warning(
     assert f"what the stage {stage} wrote is damaged" in warning
 
 
+@pytest.mark.thorough
 def test_a_damaged_database_makes_the_same_scene_again(made: tuple[Path, Prepared], tmp_path: Path):
     scene = shutil.copytree(made[0], tmp_path / "scene")
     (scene / "prepare" / "database.db").write_bytes(b"")
@@ -240,6 +243,7 @@ def test_the_split_of_an_earlier_run_is_not_read_while_photographs_are_written_a
     assert (scene / "transforms.json").read_text(encoding="utf-8") == written
 
 
+@pytest.mark.thorough
 def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import tidefield.survey.sfm.features as features
 
@@ -259,6 +263,7 @@ def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypa
     assert written == [*flight.names[:7], *flight.names[6:]]
 
 
+@pytest.mark.thorough
 def test_a_scene_whose_photographs_are_being_written_is_not_opened(
     made: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -279,6 +284,7 @@ def test_a_scene_whose_photographs_are_being_written_is_not_opened(
     assert len(load_scene(scene).names) == 12
 
 
+@pytest.mark.thorough
 def test_a_mask_of_a_photograph_that_has_no_pose_repeats_nothing(
     flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -293,6 +299,7 @@ def test_a_mask_of_a_photograph_that_has_no_pose_repeats_nothing(
     assert "images: complete already" in caplog.text
 
 
+@pytest.mark.thorough
 def test_found_control_that_fits_nothing_is_remarked_and_the_scene_goes_on(
     made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -340,12 +347,51 @@ def test_the_report_has_no_paths_and_no_options_that_are_off(made: tuple[Path, P
         assert str(folder.parent) not in text
 
 
+def test_a_scene_without_georeference_and_rejected_control_show_on_the_terminal(
+    made: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    from tidefield.commands.prepare import Prepare
+    from tidefield.commands.prepare import prepare as command
+
+    scene, folder = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey.folder
+    left_out = (LeftOut("control point", "G1", "away"), *(LeftOut("mark", f"G2 in {k}.jpg", "away") for k in range(2)))
+    for nowhere in (True, False):
+        located = replace(made[1].georeference, notes=("It is nowhere.", "More."))
+        located = replace(located, frame=None, source="none") if nowhere else replace(located, left_out=left_out)
+        monkeypatch.setattr(
+            "tidefield.survey.prepare.prepare", lambda *_, now=located, **__: replace(made[1], georeference=now)
+        )
+        caplog.clear()
+        command(Prepare(folder, scene), Console(quiet=True))
+        warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        assert warnings == (
+            ["It is nowhere."]
+            if nowhere
+            else [f"1 points and 2 further marks of ground control are left out; why, is in {scene / 'report.html'}"]
+        )
+
+
+def test_angles_of_a_file_of_positions_are_part_of_the_key_and_the_photographs_own_are_not(tmp_path: Path):
+    packet = xmp({"GimbalYawDegree": "30", "GimbalPitchDegree": "-90", "GimbalRollDegree": "0"})
+    for name, own in (("own.jpg", packet), ("a.jpg", b""), ("b.jpg", b"")):
+        photograph(tmp_path / name, packet=own)
+    keys = []
+    for yaw in (10, 20):
+        rows = "".join(f"{name} -92 46 200 {yaw} 5 1\n" for name in ("own.jpg", "a.jpg"))
+        (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{rows}b.jpg -92 46 200\n")
+        keys.append({entry[0]: entry for entry in _fingerprint(read_survey(tmp_path))})
+    assert keys[0]["a.jpg"] != keys[1]["a.jpg"]
+    assert keys[0]["own.jpg"] == keys[1]["own.jpg"]
+    assert {name: len(entry) for name, entry in keys[0].items()} == {"own.jpg": 5, "a.jpg": 6, "b.jpg": 5}
+
+
 def test_every_stage_says_when_it_starts_and_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level("INFO", "tidefield"):
         Stages(tmp_path, 0).run("one", 0, [], lambda _: {})
     assert [record.message for record in caplog.records] == ["one: started", "one: done in 0.0 s"]
 
 
+@pytest.mark.thorough
 def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(flight: Flight, tmp_path: Path):
     folder = shutil.copytree(flight.folder, tmp_path / "both")
     other = fly(folder, rows=2, columns=3, seed=9, first=50, east_m=120.0)
@@ -358,6 +404,7 @@ def test_of_two_places_the_larger_is_made_and_the_other_photographs_are_named(fl
         assert "of a place that nothing connects" in reasons[prepared.models[1][0]]
 
 
+@pytest.mark.thorough
 def test_photographs_without_overlap_are_an_error(tmp_path: Path):
     for k in range(4):
         fly(tmp_path / "card", rows=1, columns=1, seed=20 + k, first=k)
@@ -365,6 +412,7 @@ def test_photographs_without_overlap_are_an_error(tmp_path: Path):
         run(tmp_path / "card", tmp_path / "scene")
 
 
+@pytest.mark.thorough
 def test_two_photographs_that_fit_are_too_few_and_the_others_are_explained(
     flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -419,6 +467,7 @@ def test_a_scene_that_may_not_be_read_is_one_error(part: str, made: tuple[Path, 
             path.chmod(mode)
 
 
+@pytest.mark.thorough
 def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: Path):
     from PIL import ExifTags, Image
 
@@ -438,6 +487,7 @@ def test_rotated_photographs_are_upright_in_the_scene(flight: Flight, tmp_path: 
     assert np.abs(position_error_m(tmp_path / "scene", flight)).max() < 0.3
 
 
+@pytest.mark.thorough
 def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tmp_path: Path):
     card = shutil.copytree(flight.folder, tmp_path / "card")
     used = np.full((ground_flight.HEIGHT, ground_flight.WIDTH), 255, dtype=np.uint8)
@@ -464,6 +514,7 @@ def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tm
     assert not (scene / "masks").exists()
 
 
+@pytest.mark.thorough
 def test_transparent_photographs_become_an_opaque_scene_with_masks(flight: Flight, tmp_path: Path):
     (tmp_path / "card").mkdir()
     alpha = np.full((ground_flight.HEIGHT, ground_flight.WIDTH), 255, dtype=np.uint8)
@@ -482,6 +533,7 @@ def test_transparent_photographs_become_an_opaque_scene_with_masks(flight: Fligh
     assert not any(loaded.photographs.used(i)[-59:].any() for i in range(12))
 
 
+@pytest.mark.thorough
 def test_photographs_of_a_fisheye_become_a_scene_for_nerfstudio_and_for_us(tmp_path: Path):
     lens = FisheyeLens(ground_flight.WIDTH, ground_flight.HEIGHT, 260.0, 260.0, 200.0, 150.0, k1=0.03)
     flight = fly(tmp_path / "card", lens=lens)

@@ -15,11 +15,13 @@ from tidefield.survey.io.image_decoding import upright
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.quality.assessment import (
     QualityDecision,
+    _blurred,
+    _flat_or_badly_exposed,
     assess_quality,
     find_beyond_gap,
     select_photographs,
 )
-from tidefield.survey.quality.measures import sharpness
+from tidefield.survey.quality.measures import Measures, sharpness
 from tidefield.survey.survey import Control, Mark, Survey
 
 SIZE = (400, 300)
@@ -130,6 +132,13 @@ def test_a_badly_exposed_photograph_is_found(tmp_path, factor, kind):
 
 def test_one_stop_more_or_less_is_kept(tmp_path):
     assert not left_out(flight(tmp_path, less=with_light(view(500, 300), 0.5), more=with_light(view(900, 300), 2)))
+
+
+def test_neighbours_without_light_or_sharpness_are_nothing_to_compare_with():
+    bright = Measures(0.1, 200.0, 250.0, 0.6, 0.9, 0.1, 100.0, 0.0)
+    assert _flat_or_badly_exposed(bright, [replace(bright, light=0.0)] * 6) is None
+    assert _blurred(0.1, 0.0, 0.0) is None
+    assert (_blurred(0.0, 0.0, 0.0) or "").startswith("blurred: its sharpness is 0.000")
 
 
 def test_of_a_hovering_drone_the_sharpest_photograph_is_kept(tmp_path):
@@ -249,6 +258,7 @@ def test_tiny_photographs_are_assessed(tmp_path):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "count"), [("brighton_beach", 18), ("turin_lot", 32), ("swindale", 79)])
 def test_every_photograph_of_the_real_surveys_is_kept(name, count):
     survey = read_survey(real_survey(name))

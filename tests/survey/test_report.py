@@ -388,6 +388,7 @@ def test_a_folder_that_cannot_be_written_to_is_an_error_of_the_run(tmp_path):
         write_report(findings(), tmp_path / "file")
 
 
+@pytest.mark.thorough
 def test_two_thousand_photographs_make_a_page_that_can_be_sent(tmp_path):
     position = flight(40, 50)
     picture = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)

@@ -40,6 +40,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_prepare(number: signal.Signals, tmp_path: Path):
     fly(tmp_path / "card", rows=2, columns=3)

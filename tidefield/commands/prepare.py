@@ -99,6 +99,12 @@ def prepare(options: Prepare, console: Console) -> None:
     )
     with writing_to(options.scene):
         page = write_report(collect_findings(prepared, options.scene, _shown(options)), options.scene)
+    located = prepared.georeference
+    if located.frame is None:
+        log.warning(located.notes[0])
+    points, marks = (sum(item.kind == kind for item in located.left_out) for kind in ("control point", "mark"))
+    if points or marks:
+        log.warning(f"{points} points and {marks} further marks of ground control are left out; why, is in {page}")
     missing = len(survey.photographs) - len(prepared.models[0])
     reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
     console.print(

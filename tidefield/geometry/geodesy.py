@@ -15,6 +15,7 @@ Longitude, easting and x come before latitude, northing and y, whatever a system
 
 from __future__ import annotations
 
+import re
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
@@ -42,6 +43,8 @@ _TRUE_AREA = 0.01
 """By how much areas on a map may differ from those on the ground; lengths in one direction may by twice as much."""
 _NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")
 """How the names begin that programs give to what has none."""
+_IN_FEET = re.compile(r" \(ft\w*\)$")
+"""How names of vertical systems end that have a twin in metres."""
 _ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
@@ -71,7 +74,8 @@ class LocalFrame:
                 for one whose metres are not those of the ground, such as Web Mercator, products use the UTM zone of
                 the origin, on the same datum where that exists and on WGS 84 otherwise.
             origin: (easting, northing, height) or (longitude, latitude, height).
-            vertical_datum: None reads it from the system, if this defines one.
+            vertical_datum: None reads it from the system, if this defines one; the metric twin of one in feet where
+                the products' heights are in metres.
 
         Raises:
             ValueError: the system is unknown, neither projected nor geographic, or undefined at the origin.
@@ -86,7 +90,10 @@ class LocalFrame:
                 metric = metric_system(system, origin[0], origin[1])
                 products = system if same_system(metric, system) else metric
         name = _name(products)
-        heights = vertical_datum or _vertical_name(system) or "unknown; heights are as they were given"
+        named = _vertical_name(system)
+        if named is not None and not products.is_compound:
+            named = _IN_FEET.sub("", named)
+        heights = vertical_datum or named or "unknown; heights are as they were given"
         frame = cls(0.0, 0.0, 0.0, name, heights)
         longitude, latitude, height = frame._geodetic(_name(system), np.array([origin], dtype=np.float64))[0]
         return cls(float(longitude), float(latitude), float(height), frame.crs, heights)

@@ -72,8 +72,8 @@ def import_project(
         progress: called with (written, of how many) photographs; reduced ones count once more.
 
     Returns:
-        The scene's model, with points that are triangulated if the project has none that its photographs observed, and
-        its georeference if the project states it.
+        The scene's model, with points that are triangulated from the training photographs if the project has none that
+        its photographs observed, and its georeference if the project states it.
 
     Raises:
         SceneError: `source` is not a scene, or is damaged.
@@ -82,9 +82,10 @@ def import_project(
     """
     refuse_existing(out, replaceable=False)
     reduced_folders(downscale)
-    original = _at_file_size(read_posed(source, allow_missing))
+    read = read_posed(source, allow_missing)
+    original = _at_file_size(read)
     if original.points is None or not len(original.points.uv_px):
-        found = find_points(original, range(len(original.names)), source)
+        found = find_points(original, read.train_and_test[0], source)
         original = replace(original, points=found or original.points)
     posed = _undistorted(original, undistort)
     each = zip(posed.paths, posed.lenses, original.lenses, strict=True)

@@ -429,7 +429,9 @@ def _fingerprint(survey: Survey) -> list:
     for photograph in survey.photographs:
         state = photograph.path.stat()
         position, lens = repr(photograph.position), repr(photograph.lens)
-        fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens])
+        # The photograph's own angles change with its file.
+        angles = [repr(photograph.gimbal_deg)] if photograph.gimbal_is_given else []
+        fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens, *angles])
     return fingerprint
 
 

@@ -78,6 +78,7 @@ class Photograph:
         gimbal_deg: yaw (clockwise from north), pitch (-90 looks straight down), roll of the camera, or None.
         mask: a picture of the upright photograph's size that is black where the photograph is not to be used, or None.
         has_alpha: whether the file may have transparent pixels, which are not to be used either.
+        gimbal_is_given: whether the angles are those of a file of positions, not the photograph's own.
     """
 
     path: Path
@@ -95,6 +96,7 @@ class Photograph:
     gimbal_deg: tuple[float, float, float] | None
     mask: Path | None = None
     has_alpha: bool = False
+    gimbal_is_given: bool = False
 
 
 @dataclass(frozen=True)

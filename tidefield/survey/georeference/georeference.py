@@ -108,8 +108,19 @@ def _level_only(
     points = _points(model) @ rotation.T
     similarity = Similarity(1.0, rotation, -np.append(np.median(points[:, :2], axis=0), _ground(points)))
     _transform(model, similarity)
-    found = f"{len(positions.names)} photographs have positions" if positions.names else "No photograph has a position"
-    reason = "they do not follow the photographs" if len(positions.names) >= 3 else "three are needed"
+    count = sum(photograph.position is not None for photograph in photographs)
+    found = f"{count} photographs have positions" if count else "No photograph has a position"
+    reason, before, after = "three are needed", (), ()
+    if len(positions.names) >= 3:
+        reason, before = "they do not follow the photographs", positions.notes
+        after = (
+            "Check the positions, and in a file of positions its names and the order of its coordinates; or name "
+            "another file with --gps.",
+        )
+    note = (
+        f"{found}, and {reason}: the scene is not georeferenced. Its scale is the model's own and not metres; its "
+        f"vertical is from {down.source}, its north is arbitrary."
+    )
     return Georeference(
         frame=None,
         source="none",
@@ -118,10 +129,7 @@ def _level_only(
         control=Residuals(),
         check=Residuals(),
         left_out=(),
-        notes=(
-            f"{found}, and {reason}: the scene is not georeferenced. Its scale is the model's own and not metres; its "
-            f"vertical is from {down.source}, its north is arbitrary.",
-        ),
+        notes=(" ".join((*before, note, *after)),),
     )
 
 

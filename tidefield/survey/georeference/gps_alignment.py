@@ -33,8 +33,11 @@ _LEAST_M = 0.01
 _MAX_TILT_RAD = math.radians(1.0)
 """If positions determine the vertical less accurately than this, a prior from the photographs is used."""
 _GIMBALS = "the gimbals' pitch"
+_VIEWING = "the mean viewing direction, as if the photographs looked straight down"
 _MAX_GIMBAL_TILT_DEG = 2.0
 """Good positions and gimbals differ by less: by 1.3 degrees in brighton_beach, by 1.2 in turin_lot."""
+_MAX_SIGMAS = 4.0
+"""Photographs that differ by more from the vertical of the positions do not look straight down, but at a wall."""
 _MIRRORED = 0.3
 """Positions were mirrored if their mirror image has a median error of less than this share of theirs."""
 _DATUMS = {
@@ -172,11 +175,21 @@ class Down:
         direction_model: unit vector.
         sigma_rad: standard deviation.
         source: of the direction, as text.
+        below_model: a direction below the horizon, also where the other one is far off.
     """
 
     direction_model: Float64[np.ndarray, " 3"]
     sigma_rad: float
     source: str
+    below_model: Float64[np.ndarray, " 3"]
+
+    def is_upright(self, world_from_model: Similarity) -> bool:
+        """Whether a similarity puts the ground below the cameras."""
+        return bool((world_from_model.rotation @ self.below_model)[2] < 0)
+
+    def off_rad(self, world_from_model: Similarity) -> float:
+        """Angle between this direction and the vertical of a similarity."""
+        return math.acos(np.clip(-(world_from_model.rotation @ self.direction_model)[2], -1, 1))
 
 
 @dataclass(frozen=True)
@@ -214,7 +227,8 @@ def find_down(model: pycolmap.Reconstruction, photographs: Sequence[Photograph])
     """Estimate the direction of gravity from gimbal angles, else from how photographs are usually held.
 
     Photographs are taken level: their x axes are horizontal, whichever way the camera points. Where these axes are all
-    parallel, down is the direction nearest to the mean viewing direction that is perpendicular to them.
+    parallel, they leave the pitch open: down is the direction nearest to the mean viewing direction that is
+    perpendicular to them. This is right for photographs straight down, and off by 90 degrees for those of a wall.
     """
     gimbal = {p.name: p.gimbal_deg for p in photographs if p.gimbal_deg is not None}
     images = [model.image(number) for number in model.reg_image_ids()]
@@ -224,13 +238,18 @@ def find_down(model: pycolmap.Reconstruction, photographs: Sequence[Photograph])
         pitch, roll = np.deg2rad([gimbal[images[i].name][1:] for i in stated]).T
         down_camera = np.stack([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), -np.sin(pitch)], axis=1)
         down_model = np.einsum("nji,nj->ni", R_camera_model[stated], down_camera)
-        return Down(_unit(np.median(down_model, axis=0)), math.radians(1), _GIMBALS)
+        direction = _unit(np.median(down_model, axis=0))
+        return Down(direction, math.radians(1), _GIMBALS, direction)
     x, forward = R_camera_model[:, 0], R_camera_model[:, 2].mean(0)
+    # Between the viewing direction and the image's down, which is below the horizon for pitches from -135 to +45
+    # degrees; the viewing direction itself is above it for cameras that look slightly upwards.
+    below = forward + R_camera_model[:, 1].mean(0)
     strength, axes = np.linalg.eigh(x.T @ x / len(x))
     if strength[1] > 0.05:
-        return Down(axes[:, 0] * (1.0 if axes[:, 0] @ forward >= 0 else -1.0), math.radians(5), "level photographs")
+        direction = axes[:, 0] * (1.0 if axes[:, 0] @ below >= 0 else -1.0)
+        return Down(direction, math.radians(5), "level photographs", direction)
     along = axes[:, 2]
-    return Down(_unit(forward - (forward @ along) * along), math.radians(5), "the mean viewing direction")
+    return Down(_unit(forward - (forward @ along) * along), math.radians(5), _VIEWING, below)
 
 
 def fit_positions(
@@ -270,7 +289,14 @@ def fit_positions(
         used = ~outliers(np.linalg.norm(error, axis=1), 5 * np.linalg.norm(nominal, axis=1))
         sigma = _observed_sigma(error, used, nominal)
         refined, notes = refine_similarity(similarity, centres[used], given[used], sigma[used]), ()
-        if refined.tilt_rad >= _MAX_TILT_RAD:
+        is_open = refined.tilt_rad >= _MAX_TILT_RAD
+        limit_rad = _MAX_SIGMAS * math.hypot(refined.tilt_rad, down.sigma_rad)
+        if is_open and down.source == _VIEWING and down.off_rad(refined.similarity) > limit_rad:
+            notes = (
+                "The vertical is that of the cameras' positions alone, to within about "
+                f"{math.degrees(refined.tilt_rad):.1f} degrees: the photographs do not look straight down.",
+            )
+        elif is_open:
             prior = down.direction_model, down.sigma_rad
             refined = refine_similarity(similarity, centres[used], given[used], sigma[used], *prior)
             notes = (
@@ -279,7 +305,7 @@ def fit_positions(
                 f"{math.degrees(refined.tilt_rad):.1f} degrees.",
             )
         similarity = refined.similarity
-    tilt_deg = math.degrees(math.acos(np.clip(-(similarity.rotation @ down.direction_model)[2], -1, 1)))
+    tilt_deg = math.degrees(down.off_rad(similarity))
     if not notes and down.source == _GIMBALS and tilt_deg > _MAX_GIMBAL_TILT_DEG:
         notes = (
             f"The vertical by the cameras' positions is {tilt_deg:.1f} degrees off that of the gimbals: some heights "
@@ -337,7 +363,7 @@ def _robust_start(
 ) -> tuple[Similarity, float]:
     """Find the similarity of least median distance among those with the ground below the cameras; also the median."""
     candidates = hypotheses(source, target, down.direction_model, np.random.default_rng(0))
-    return least_median([one for one in candidates if (one.rotation @ down.direction_model)[2] < 0], source, target)
+    return least_median([one for one in candidates if down.is_upright(one)], source, target)
 
 
 def _refuse_mirrored(

@@ -255,11 +255,13 @@ def fit_control(
         The similarity, and which marks agree with it.
 
     Raises:
-        SurveyError: there are too few points, or most of the marks fit no similarity.
+        SurveyError: there are too few points, they have too few marks, or most of the marks fit no similarity.
     """
     source, target = _pairs(model, marks)
+    if positions is not None:
+        _require_a_place(source, marks, shaped)
     candidates = hypotheses(source, target, None if positions else down.direction_model, np.random.default_rng(0))
-    candidates = [one for one in candidates if (one.rotation @ down.direction_model)[2] < 0]
+    candidates = [one for one in candidates if down.is_upright(one)]
     if positions is not None:
         prior = positions.world_from_model
         shifts = target - prior(source)
@@ -267,7 +269,7 @@ def fit_control(
     if not candidates:
         raise SurveyError(
             f"{len(source)} control points show in two photographs or more, and the photographs have no positions: "
-            "expected three such points; mark more, or give the photographs' positions"
+            "expected two such points; mark more, or give the photographs' positions"
         )
     similarity = min(candidates, key=lambda one: float((np.minimum(_share(model, marks, one), 1) ** 2).sum()))
     agree = _share(model, marks, similarity) < 1
@@ -282,11 +284,23 @@ def fit_control(
     if not (shaped and positions is not None) and not _are_collinear(target):
         similarity = refine_similarity(similarity, source, target, sigma).similarity
     elif positions is not None:
+        _require_a_place(source, marks.where(agree), shaped)
         similarity = _with_positions(similarity, source, target, positions)
     elif len(source) >= 2:
         prior_down = down.direction_model, down.sigma_rad
         similarity = refine_similarity(similarity, source, target, sigma, *prior_down).similarity
     return similarity, _share(model, marks, similarity) < 1
+
+
+def _require_a_place(source: Float64[np.ndarray, "N 3"], marks: Marks, shaped: bool) -> None:
+    """Raise an error where marks move nothing: no point is in the model, and too few are to be adjusted to."""
+    names = list(marks.points)
+    if len(source) == 0 and (shaped or _are_collinear(marks.points.values())):
+        raise SurveyError(
+            f"no point of ground control ({list_names(names)}) has two marks that fit together, and one mark does not "
+            "place a point in the model: expected marks of a point in two photographs; mark each point in two or more, "
+            "or leave ground control out"
+        )
 
 
 def _are_collinear(points: Collection[Float64[np.ndarray, " 3"]]) -> bool:

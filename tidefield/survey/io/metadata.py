@@ -122,7 +122,7 @@ class PhotographMetadata:
         names = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
         return self.xmp_number("GpsLatitude", "GPSLatitude", "Latitude"), self.xmp_number(*names)
 
-    def position(self, corrected: bool) -> Position | None:
+    def position(self, corrected: bool, of_exif: str = "EXIF") -> Position | None:
         """Position of the camera by its receiver, or None.
 
         The standard deviations are those of the maker (of the two horizontal ones of DJI's RTK, the larger; Pix4D's),
@@ -130,8 +130,9 @@ class PhotographMetadata:
 
         Args:
             corrected: whether EXIF's position was written after the flight; it is not the drone's own then.
+            of_exif: the source's name where it is EXIF.
         """
-        (latitude, longitude), source = self._degrees_of_exif, "EXIF"
+        (latitude, longitude), source = self._degrees_of_exif, of_exif
         if not math.isfinite(latitude + longitude):
             (latitude, longitude), source, corrected = self._own_degrees, "XMP", False
         if not math.isfinite(latitude + longitude):

@@ -6,7 +6,7 @@ import math
 import os
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -49,15 +49,20 @@ _RAWS = (
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
 _OTHER_IMAGES = (".avif", ".webp", ".jp2", ".jxl", ".bmp", ".gif")
-# Hidden folders, those of network storage and of macOS archives, and OpenDroneMap's results.
-_FOREIGN_FOLDERS = (".", "@eadir", "__macosx", "opensfm", "odm_")
+# Hidden folders, those of network storage and of macOS archives.
+_HIDDEN_FOLDERS = (".", "@eadir", "__macosx")
+_ODM_FOLDERS = ("opensfm", "odm_")
 _CORRECTED_SHARE = 0.1
 """Of a flight's photographs: where so many are far from the drone's own positions, it was corrected."""
 _REPEATED_SHARE = 0.9
 """Of a flight's photographs: where EXIF repeats the drone's own positions in so many, it was not corrected."""
+_AFTER_FLIGHT = "EXIF after the flight"
+"""Source of the positions of a flight that was corrected where another was not: their heights may have two zeros."""
 _PAUSE_S = 120.0
 """Photographs further apart in time are of two flights."""
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared
+_WRITTEN_PARTS = ("transforms.json", *_SCENE_PARTS[1:])
+"""Of scenes that `prepare` or `import` wrote."""
 
 
 def read_survey(
@@ -71,9 +76,9 @@ def read_survey(
     """Read all photographs (JPEG, PNG, TIFF, HEIC) in a folder and its sub-folders, with positions and ground control.
 
     Hidden folders, scenes (folders with a `sparse` folder or a `georeference.json`) and OpenDroneMap's results are
-    skipped. Photographs without a focal length are left out if they are few: none is held to what is stated unless all
-    are. A `gps.csv` or ODM's `geo.txt` directly in the folder gives positions to photographs whose EXIF has none, an
-    ODM `gcp_list.txt` ground control.
+    skipped, with a remark if they hold photographs that are nowhere else. Photographs without a focal length are left
+    out if they are few: none is held to what is stated unless all are. A `gps.csv` or ODM's `geo.txt` directly in the
+    folder gives positions to photographs whose EXIF has none, an ODM `gcp_list.txt` ground control.
 
     Args:
         folder: the photographs.
@@ -83,8 +88,8 @@ def read_survey(
         masks: a folder with NAME.png for photographs called NAME; without it, `masks` in the folder, if it has any.
 
     Raises:
-        SurveyError: fewer than three photographs can be read, two differ only in suffix or case, or a file of
-            positions or the given ground control cannot be parsed.
+        SurveyError: fewer than three photographs can be read, two differ only in suffix or case, the given file of
+            positions or of ground control cannot be parsed, or a file gives a photograph two positions.
     """
     listed, about_files = _list_photographs(folder)
     paths, mask_of, remarks = _find_masks(folder, listed, masks)
@@ -159,16 +164,18 @@ def _with_positions(read: Sequence[_Read]) -> list[Photograph]:
     far = moved_m > CORRECTED_M
     groups = [np.arange(len(read)), *flights]
     any_corrected = any(far[group].mean() >= _CORRECTED_SHARE for group in groups if len(group) >= FEWEST)
-    corrected = far.copy()
+    corrected, whole = far.copy(), np.zeros(len(read), dtype=bool)
     for flight in flights if any_corrected else ():
         # Without times, photographs of a corrected flight and of another may be one group.
         timed = all(math.isfinite(read[k].photograph.time_s) for k in flight)
         near = flight if timed else flight[~far[flight]]
         if len(near) == 0 or (moved_m[near] <= ROUNDING_M).mean() < _REPEATED_SHARE:
-            corrected[flight] = True
+            corrected[flight] = whole[flight] = True
+    # Where all flights were corrected, the name stays as it is, because it is part of the keys of earlier scenes.
+    apart = whole & ~whole.all()
     return [
-        replace(one.photograph, position=one.metadata.position(bool(of_exif)))
-        for one, of_exif in zip(read, corrected, strict=True)
+        replace(one.photograph, position=one.metadata.position(bool(of_exif), _AFTER_FLIGHT if other else "EXIF"))
+        for one, of_exif, other in zip(read, corrected, apart, strict=True)
     ]
 
 
@@ -212,7 +219,8 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
         if not folder.is_dir():
             found = "a file" if folder.exists() else "nothing"
             raise SurveyError(f"{folder} is {found}: expected a folder of photographs; give one")
-        paths = sorted(_walk(folder, _raise))
+        results: list[Path] = []
+        paths = sorted(_walk(folder, _raise, results))
     except OSError as error:
         raise SurveyError(
             f"{error.filename} cannot be read ({error.strerror}): expected a folder of yours; give one"
@@ -233,48 +241,91 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
             photographs.append(path)
         elif suffix in _RAWS or suffix in _OTHER_IMAGES:
             (raws if suffix in _RAWS else others).append(path.relative_to(folder).as_posix())
+    in_results = _remarks_on_results(folder, results, {path.name for path in photographs})
     if photographs:
         skipped = {
             "camera raw files are not read": (raws, "develop them first"),
             "pictures of other formats are not read": (others, "convert them to JPEG, PNG or TIFF"),
             "linked folders are not followed": (links, "move the photographs, or give the folder that has them"),
         }
-        return photographs, [
+        about = [
             f"{len(names)} {what} ({list_names(sorted(names))}): {todo}."
             for what, (names, todo) in skipped.items()
             if names
         ]
+        return photographs, about + in_results
     if raws:
         raise SurveyError(
             f"{folder} has {len(raws)} camera raw files ({list_names(sorted(raws))}) and no photographs: "
             "expected JPEG, PNG or TIFF; develop them first, all with the same settings"
         )
     found = f"images of other formats ({list_names(sorted(others))})" if others else "no photographs"
-    raise SurveyError(f"{folder} has {found}: expected JPEG, PNG or TIFF files; give their folder, or convert them")
+    raise SurveyError(
+        f"{folder} has {found}: expected JPEG, PNG or TIFF files; give their folder, or convert them"
+        + "".join(f"\n{remark}" for remark in in_results)
+    )
+
+
+def _remarks_on_results(folder: Path, results: Sequence[Path], names: Collection[str]) -> list[str]:
+    """Remarks on folders that are skipped as results and hold photographs.
+
+    Results hold pictures, too: textures and maps come from no camera, and the photographs of a scene are in `images`,
+    by the names that they have elsewhere.
+
+    Args:
+        results: the skipped folders.
+        names: of the photographs that are read.
+    """
+    remarks = []
+    for home in sorted(results):
+        there = [path for path in _walk(home) if path.suffix.casefold() in _PHOTOGRAPHS]
+        copies = {
+            path
+            for path in there
+            if path.name in names and any(part.startswith("images") for part in path.relative_to(home).parts[:-1])
+        }
+        count = sum(map(_names_camera, {*there} - copies))
+        if count:
+            remarks.append(
+                f"{count} photographs in {home.relative_to(folder).as_posix()} are not read, because it looks like "
+                "results of ODM or a scene: move them into another folder, or give the folder itself."
+            )
+    return remarks
 
 
 def _raise(error: OSError) -> None:
     raise error
 
 
-def _walk(folder: Path, on_error: Callable[[OSError], None] | None = None) -> Iterator[Path]:
+def _walk(
+    folder: Path, on_error: Callable[[OSError], None] | None = None, results: list[Path] | None = None
+) -> Iterator[Path]:
     """All files in a folder and its sub-folders, and the sub-folders that are links, which are not followed.
 
     Args:
         on_error: is called where a folder cannot be read; None skips it.
+        results: a list to which folders are added that look like results of another program, and are skipped.
     """
     for parent, folders, files in os.walk(folder, onerror=on_error):
-        folders[:] = [
+        shown = [name for name in folders if not name.casefold().startswith(_HIDDEN_FOLDERS)]
+        skipped = {
             name
-            for name in folders
-            if not name.casefold().startswith(_FOREIGN_FOLDERS)
-            # Unlike Path.exists, this raises no error where a folder may not be entered.
-            and not any(os.path.exists(os.path.join(parent, name, part)) for part in _SCENE_PARTS)
-        ]
+            for name in shown
+            if name.casefold().startswith(_ODM_FOLDERS) or _has(os.path.join(parent, name), _SCENE_PARTS)
+        }
+        folders[:] = [name for name in shown if name not in skipped]
+        if results is not None:
+            there = (Path(parent, name) for name in sorted(skipped))
+            results += (path for path in there if not path.is_symlink() and not _has(path, _WRITTEN_PARTS))
         yield from (Path(parent, name) for name in files if not name.startswith("."))
         # Linked masks are found by their names.
         links = (Path(parent, name) for name in folders if os.path.islink(os.path.join(parent, name)))
         yield from (path for path in links if path != folder / MASKS)
+
+
+def _has(folder: str | Path, parts: Sequence[str]) -> bool:
+    """Whether one of these is in a folder; unlike Path.exists, no error where the folder may not be entered."""
+    return any(os.path.exists(os.path.join(folder, part)) for part in parts)
 
 
 def _refuse_collisions(names: Sequence[str]) -> None:
@@ -363,6 +414,15 @@ def _is_mask(path: Path) -> bool:
     try:
         with quiet_pillow(), open_image(path) as image:
             return image.mode in ("1", "L", "LA", "P") and not read_metadata(image).camera
+    except SurveyError:
+        return False
+
+
+def _names_camera(path: Path) -> bool:
+    """Whether a picture is a photograph by its metadata."""
+    try:
+        with quiet_pillow(), open_image(path) as image:
+            return bool(read_metadata(image).camera)
     except SurveyError:
         return False
 

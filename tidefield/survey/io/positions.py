@@ -101,6 +101,10 @@ _Row: TypeAlias = tuple[str, str, list[float]]
 """A photograph, the place in the file for messages, and the numbers of `_GEO`, NaN where unknown."""
 
 
+class _Contradiction(SurveyError):
+    """A file that is one of this survey's positions gives a photograph two of them."""
+
+
 @dataclass(frozen=True)
 class GpsRecord:
     """Position of a photograph from a file, and the camera's yaw, pitch (-90 looks straight down) and roll, or None."""
@@ -115,7 +119,8 @@ def locate_photographs(
     """Combine the positions of EXIF with those of a file, and drop those that cannot be right.
 
     Args:
-        folder: of the photographs; where EXIF positions are missing, one of `GPS_FILES` in it is read.
+        folder: of the photographs; where EXIF positions are missing, one of `GPS_FILES` in it is read. If it cannot be
+            parsed, it is only remarked.
         photographs: with their positions from EXIF.
         gps: a file of positions, which has priority over EXIF and over the files in the folder.
 
@@ -123,14 +128,20 @@ def locate_photographs(
         The photographs in their order, and remarks on what was dropped and what is missing.
 
     Raises:
-        SurveyError: a file of positions cannot be parsed.
+        SurveyError: the given file cannot be parsed, or any gives a photograph two positions.
     """
     located, remarks = _drop_impossible(photographs)
     file = gps
     if file is None and any(photograph.position is None for photograph in located):
         file = find_file(folder, GPS_FILES)
     if file is not None:
-        records, about_file = read_gps_file(file, PhotographNames(photograph.name for photograph in photographs))
+        try:
+            records, about_file = read_gps_file(file, PhotographNames(photograph.name for photograph in photographs))
+        except SurveyError as error:
+            if gps or isinstance(error, _Contradiction):
+                raise
+            remark = f"The file of positions next to the photographs was not used: {error}."
+            records, about_file = {}, [f"{remark} If it is no such file, rename it or move it away."]
         others = [p for p in located if p.position and p.name not in records]
         if gps and others:
             about_file.append(
@@ -141,8 +152,13 @@ def locate_photographs(
             record = records.get(photograph.name)
             if record and (gps or photograph.position is None):
                 position = _with_height(record.position, photograph.position)
-                gimbal = photograph.gimbal_deg or record.gimbal_deg
-                located[index] = replace(photograph, position=position, gimbal_deg=gimbal)
+                given = record.gimbal_deg if photograph.gimbal_deg is None else None
+                located[index] = replace(
+                    photograph,
+                    position=position,
+                    gimbal_deg=given or photograph.gimbal_deg,
+                    gimbal_is_given=given is not None,
+                )
         located, impossible_in_file = _drop_impossible(located)
         remarks += [*about_file, *impossible_in_file]
     elif unused := find_file(folder, GPS_FILES):
@@ -376,7 +392,9 @@ def _records(path: Path, read: Sequence[_Row], system: CRS, datum: VerticalDatum
         if not math.isfinite(latitude):
             raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {system.srs!r}; correct either")
         if not np.array_equal(given.setdefault(name, values), values, equal_nan=True):
-            raise SurveyError(f"{where} gives {name} a second position: expected one line per photograph; remove one")
+            raise _Contradiction(
+                f"{where} gives {name} a second position: expected one line per photograph; remove one"
+            )
         height, yaw, pitch, roll, across, up = values[2:]
         # ODM counts the pitch from straight down; three zeros stand for angles that are not available.
         is_turned = math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll))

@@ -216,7 +216,7 @@ def _flat_or_badly_exposed(measures: Measures, neighbours: Sequence[Measures]) -
             f"{DARK_HIGHLIGHTS:.0f} is the limit."
         )
     usual = _median([other.light for other in neighbours])
-    if measures.clipped > GLARING_CLIPPED and measures.light > GLARING_LIGHT * usual:
+    if measures.clipped > GLARING_CLIPPED and usual > 0 and measures.light > GLARING_LIGHT * usual:
         return (
             f"over-exposed: {measures.clipped:.0%} of it is clipped, and it has {measures.light / usual:.1f} times the "
             f"light of its {len(neighbours)} neighbours; {GLARING_CLIPPED:.0%} and {GLARING_LIGHT} times are the limit."
@@ -233,14 +233,15 @@ def _blurred(sharpness: float, usual: float, of_neighbours: float) -> str | None
     """Compare the sharpness with fixed limits, with the median of its camera, and with that of its neighbours."""
     if math.isnan(sharpness):
         return None
-    to_survey, to_neighbours = sharpness / usual, sharpness / (of_neighbours if of_neighbours > 0 else usual)
-    soft = sharpness < SOFT and to_neighbours < SOFT_OF_NEIGHBOURS and to_survey < SOFT_OF_SURVEY
-    if soft or (to_neighbours < SOFTER_OF_NEIGHBOURS and to_survey < SOFTER_OF_SURVEY):
-        limits = f"{SOFT} and {SOFT_OF_NEIGHBOURS:.0%}" if soft else f"{SOFTER_OF_NEIGHBOURS:.0%}"
-        return (
-            f"blurred: its sharpness is {sharpness:.3f}, {to_neighbours:.0%} of its neighbours' and {to_survey:.0%} of "
-            f"the survey's; {limits} of the neighbours' is the limit."
-        )
+    if usual > 0:
+        to_survey, to_neighbours = sharpness / usual, sharpness / (of_neighbours if of_neighbours > 0 else usual)
+        soft = sharpness < SOFT and to_neighbours < SOFT_OF_NEIGHBOURS and to_survey < SOFT_OF_SURVEY
+        if soft or (to_neighbours < SOFTER_OF_NEIGHBOURS and to_survey < SOFTER_OF_SURVEY):
+            limits = f"{SOFT} and {SOFT_OF_NEIGHBOURS:.0%}" if soft else f"{SOFTER_OF_NEIGHBOURS:.0%}"
+            return (
+                f"blurred: its sharpness is {sharpness:.3f}, {to_neighbours:.0%} of its neighbours' and "
+                f"{to_survey:.0%} of the survey's; {limits} of the neighbours' is the limit."
+            )
     if sharpness < HOPELESSLY_SOFT:
         return f"blurred: its sharpness is {sharpness:.3f}; {HOPELESSLY_SOFT} is the limit."
     return None

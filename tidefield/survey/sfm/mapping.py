@@ -347,7 +347,10 @@ def _adjust(model: pycolmap.Reconstruction, lens: str, focal: bool) -> None:
 
 
 def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> Heights | None:
-    """Compare flight heights; None if the maker does not state two focal lengths of one lens, or no heights exist."""
+    """Compare flight heights; None if the maker does not state two focal lengths of one lens, or no heights exist.
+
+    Also None where the ground is above the cameras, as wrong positions have it.
+    """
     stated = {(p.lens.focal_px, p.lens.design_focal_px) for p in photographs if p.lens and p.lens.design_focal_px}
     if len(stated) != 1 or len(model.cameras) != 1:
         return None
@@ -367,6 +370,8 @@ def _compare_heights(model: pycolmap.Reconstruction, photographs: Sequence[Photo
     if len(shares) < MIN_POSITIONS:
         return None
     share = float(np.median(shares))
+    if share <= 0:
+        return None
     return Heights(calibrated, design, share, share * design / calibrated)
 
 
