@@ -1,4 +1,4 @@
-"""How all tests run: shapes checked (jaxtyping, enforced by beartype), on one thread, the slow ones on request."""
+"""How all tests run: shapes checked (jaxtyping, enforced by beartype), on one thread, the long ones on request."""
 
 import logging
 import os
@@ -26,7 +26,8 @@ def messages_as_before() -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow", action="store_true", help="run the tests that take more than a minute, too")
+    parser.addoption("--thorough", action="store_true", help="run the tests that take several seconds each, too")
+    parser.addoption("--slow", action="store_true", help="run these and the tests that take more than a minute")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -34,6 +35,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     skips = {}
     if not config.getoption("--slow"):
         skips["slow"] = pytest.mark.skip(reason="takes more than a minute; run with --slow")
+        if not config.getoption("--thorough"):
+            skips["thorough"] = pytest.mark.skip(reason="takes several seconds; run with --thorough")
     if not torch.cuda.is_available():
         skips["gpu"] = pytest.mark.skip(reason="needs a CUDA device, and there is none")
     for item in items:
