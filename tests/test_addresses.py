@@ -317,6 +317,7 @@ def test_what_failed_is_not_sent_and_what_was_not_sent_is_shown(bucket: Path, ca
     assert "not sent yet: 1 file, 0 MB" in shown
 
 
+@pytest.mark.thorough
 def test_a_worker_with_an_empty_cache_copies_the_scene_and_sends_its_tiles(bucket: Path, scene: Path):
     shutil.copytree(scene, bucket / "scene")
     options = Map(copy(bucket), copy(bucket, "map"), device="cpu", zero=ZeroShot(zero_shot=True))

@@ -47,6 +47,7 @@ def test_trained_weights_render_a_scene_by_photograph_name(folder: Path) -> None
         tidefield.zero_shot(alone, device="cpu")(camera)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["swift", "nearest", "sparse-depth", "plane-sweep"])
 def test_the_view_of_a_photograph_is_made_without_its_pixels_unless_it_has_no_name(method: str) -> None:
     def render(scene: Scene, camera: Cameras) -> torch.Tensor:
@@ -63,6 +64,7 @@ def test_the_view_of_a_photograph_is_made_without_its_pixels_unless_it_has_no_na
     assert not torch.equal(render(scene, nameless), render(other, nameless))
 
 
+@pytest.mark.thorough
 def test_a_run_is_opened_with_its_scene_and_renders_as_it_was_trained(folder: Path) -> None:
     options = Train(folder / "flats", folder / "run", budget=Budget(steps=2), width=48, device="cpu")
     train(options, Console(quiet=True))

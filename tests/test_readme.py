@@ -65,6 +65,7 @@ def test_readme_fits_two_screens() -> None:
     assert len(README.splitlines()) <= 130
 
 
+@pytest.mark.thorough
 def test_the_python_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     from tidefield.commands.train import Train, train
     from tidefield.config import Budget

@@ -91,10 +91,12 @@ class Recorder(Generic[T, R]):
 
 
 def moved(inputs: T, device: torch.device) -> T:
-    """Return inputs from the processor on a device, without waiting for what it is at work on."""
+    """Return inputs from the processor on a device; on a GPU of CUDA without waiting for what it is at work on."""
     if device.type == "cpu":
         return inputs
-    return map_tensors(inputs, lambda tensor: tensor.to(device, non_blocking=tensor.device.type == "cpu"))
+    # Others, such as MPS, may read the memory of a tensor that is released meanwhile.
+    ahead = device.type == "cuda"
+    return map_tensors(inputs, lambda tensor: tensor.to(device, non_blocking=ahead and tensor.device.type == "cpu"))
 
 
 class _Recording(Generic[T, R]):

@@ -187,7 +187,7 @@ def test_nothing_is_learned_from_background_at_any_exposure(scene: Scene):
         background_rgb=(1.0, 1.0, 1.0),
     )
     learner = NerfTrainer(SMALL, empty, 0, CPU)
-    learner.nerf.coarse, learner.nerf.fine = Nothing(SMALL), Nothing(SMALL)
+    learner.network.coarse, learner.network.fine = Nothing(SMALL), Nothing(SMALL)
     assert learner.loss()[0].item() == pytest.approx(0, abs=1e-10)
 
 

@@ -228,6 +228,7 @@ def looks_like(rendering: Rendering, truth: torch.Tensor, camera: Cameras) -> No
     torch.testing.assert_close(rendering.depth, wall.true_depth(camera), atol=0.01, rtol=0)
 
 
+@pytest.mark.thorough
 def test_what_nerfstudio_has_learned_comes_back_as_the_view_of_the_camera(tmp_path: Path, standin: None):
     cameras = wall.with_gains(wall.cameras(5, 96, 72))
     cameras = replace(cameras, focal_px=torch.tensor([[96.0, 80.0]] * 5), principal_px=torch.tensor([[45.0, 38.0]] * 5))
@@ -240,6 +241,7 @@ def test_what_nerfstudio_has_learned_comes_back_as_the_view_of_the_camera(tmp_pa
     assert view.opacity.min() == 1
 
 
+@pytest.mark.thorough
 def test_a_run_that_was_moved_is_rendered_and_nothing_in_it_changes(tmp_path: Path, standin: None):
     scene, run = wall.scene(wall.cameras(5, 96, 72), test=(1, 3)), tmp_path / "run"
     run.mkdir()
@@ -312,6 +314,7 @@ def test_photographs_with_alpha_are_exported_with_it_and_composited_give_the_sam
         assert not colour[alpha[..., 0] == 0].any()
 
 
+@pytest.mark.thorough
 def test_the_background_of_a_scene_with_alpha_comes_back_without_gain(
     transparent: Scene, tmp_path: Path, standin: None
 ):

@@ -140,6 +140,7 @@ def test_the_colour_changes_with_the_direction_in_the_world_as_the_harmonics_say
         torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("at_once", [1, 7, 2048])
 def test_many_gaussians_look_as_pixel_by_pixel(at_once: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "AT_ONCE", at_once)

@@ -161,6 +161,7 @@ def test_copies_of_a_survey_lie_apart() -> None:
     assert torch.cdist(copies, copies).fill_diagonal_(torch.inf).min() > 3
 
 
+@pytest.mark.thorough
 def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, small = tmp_path / "scene", tiny("swift")
     write_colmap(scene, survey(PINHOLE))

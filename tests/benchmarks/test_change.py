@@ -63,6 +63,7 @@ def test_figures_that_an_earlier_version_stored_are_refused(tmp_path):
     assert not (tmp_path / "page.md").exists()
 
 
+@pytest.mark.thorough
 def test_the_command_is_measured_on_a_small_pair(tmp_path):
     from benchmarks.change_size import measure_size
 

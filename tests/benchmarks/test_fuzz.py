@@ -71,6 +71,7 @@ def fill_memory(folder: Path) -> None:
 PLANTED = {function.__name__: function for function in (accept, refuse, fail, end, compute, fill_memory)}
 
 
+@pytest.mark.thorough
 @linux
 def test_a_finding_is_an_error_an_end_or_too_much_time_or_memory_and_does_not_end_the_campaign(tmp_path: Path):
     readers = [

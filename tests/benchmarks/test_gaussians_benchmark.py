@@ -50,6 +50,7 @@ def test_uncovered_pixels_are_black(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["psnr"] < 12 < 18 < found["psnr_covered"]
 
 
+@pytest.mark.thorough
 def test_a_scene_is_measured_once(tmp_path: Path) -> None:
     write_survey(make_survey("ground_textures", seed=5, views=9, width=64), tmp_path / "flat")
     said: list[str] = []

@@ -20,6 +20,7 @@ def test_errors_are_those_of_known_numbers():
     assert found["nmad_m"] == pytest.approx(1.4826)
 
 
+@pytest.mark.thorough
 def test_semi_global_matching_finds_the_ground(tmp_path: Path):
     write_survey(make_survey("ground_textures", seed=4, views=6, width=320), tmp_path / "scene")
     scene = load_scene(tmp_path / "scene", hold_out=False, cache=tmp_path / "cache")
@@ -83,6 +84,7 @@ def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: 
     assert "16 tiles" in said[1]
 
 
+@pytest.mark.thorough
 def test_an_orthophoto_is_warped_to_where_the_photograph_shows_it(tmp_path: Path):
     from benchmarks.map_views import warp
     from tidefield.maps.grid import Tile

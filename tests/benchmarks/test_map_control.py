@@ -19,6 +19,7 @@ pytest.importorskip("rasterio")
 FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
 
 
+@pytest.mark.thorough
 def test_the_surface_misses_points_by_what_they_were_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     survey = make_survey("ground_textures", seed=4, views=9, width=240)

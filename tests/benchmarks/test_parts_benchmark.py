@@ -14,6 +14,7 @@ from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.checkpoint import write_weights
 
 
+@pytest.mark.thorough
 def test_weights_are_compared_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     scene = tmp_path / "flat"
     write_survey(make_survey("ground_textures", seed=5, views=9, width=64), scene)

@@ -253,6 +253,7 @@ def test_the_cache_of_photographs_is_shown_and_emptied(
     assert [path.name for path in (tmp_path / "tidefield").iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.thorough
 def test_the_demonstration_makes_all_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

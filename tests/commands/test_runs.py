@@ -21,6 +21,7 @@ from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield.commands import demo
+from tidefield.commands.common import ZeroShot
 from tidefield.commands.evaluate import Evaluate, evaluate
 from tidefield.commands.pretrain import PRETRAINING_FILE, Pretrain
 from tidefield.commands.pretrain import pretrain as pretrain_command
@@ -32,6 +33,7 @@ from tidefield.evaluation.curves import CURVE_FILE
 from tidefield.files import only_writer
 from tidefield.model.network import make_network
 from tidefield.processes import Ended
+from tidefield.progress import ProgressBar
 from tidefield.train import checkpoint, loop, pretrain, stream
 from tidefield.train.checkpoint import (
     CHECKPOINT_FILE,
@@ -93,6 +95,7 @@ def files(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.thorough
 def test_a_run_that_replaces_another_and_dies_leaves_nothing_of_it(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +117,7 @@ def test_a_run_that_replaces_another_and_dies_leaves_nothing_of_it(
         evaluate(Evaluate(run, device="cpu"), QUIET)
 
 
+@pytest.mark.thorough
 def test_a_resumed_run_keeps_the_points_of_its_curve_up_to_its_checkpoint(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     start(scene, run, steps=4, curve=True)
@@ -150,6 +154,7 @@ def test_an_interrupted_demonstration_continues_its_training(
     assert "interrupted; the same command continues" in console.export_text()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [{}, {"from_scratch": True}])
 def test_a_run_that_died_before_its_first_save_starts_again_on_resume(
     options: dict[str, Any],
@@ -189,6 +194,27 @@ def test_weights_for_a_training_that_starts_without_are_one_clear_error(
     assert not (tmp_path / "run" / RUN_FILE).exists()
 
 
+def test_a_warning_says_at_once_what_memory_whole_photographs_take(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(stream, "WHOLE_WIDTHS", (32, 40))
+    monkeypatch.setattr("tidefield.commands.train.load", lambda *_: pytest.fail("photographs were decoded"))
+    options = {"preset": "paper", "from_scratch": True, "device": "cpu"}
+    for width, found in ((None, 64), (48, 48), (1000, 64)):
+        with pytest.raises(pytest.fail.Exception, match="were decoded"):
+            train(Train(scene, tmp_path / "run", width=width, **options), QUIET)
+        [message] = caplog.messages
+        assert f"here of {found} pixels" in message
+        assert "--width 40" in message
+        caplog.clear()
+    with pytest.raises(pytest.fail.Exception, match="were decoded"):
+        train(Train(scene, tmp_path / "run", width=40, **options), QUIET)
+    with pytest.raises(pytest.fail.Exception, match="were decoded"):
+        train(Train(scene, tmp_path / "run", device="cpu"), QUIET)
+    assert not caplog.messages
+
+
+@pytest.mark.thorough
 def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     start(scene, run, steps=3)
@@ -199,6 +225,7 @@ def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given
         assert read_run(run).budget == Budget(steps=steps)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("other", "said"),
     [
@@ -288,6 +315,26 @@ def test_the_picture_of_a_training_is_a_small_one(scene: Path, tmp_path: Path, m
     monkeypatch.setattr(loop.SummaryWriter, "add_image", add_image)
     start(scene, tmp_path / "run")
     assert shapes == [(18, 48, 3)]
+
+
+def test_photographs_that_an_evaluation_reads_at_another_width_show_progress(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start(scene, tmp_path / "run", steps=1)
+    shown: list[str] = []
+    show = ProgressBar.__call__
+
+    def noted(bar: ProgressBar, *progress: Any) -> None:
+        shown.append(bar._job)
+        show(bar, *progress)
+
+    monkeypatch.setattr(ProgressBar, "__call__", noted)
+    evaluate(Evaluate(tmp_path / "run", tmp_path / "out", width=36, device="cpu"), QUIET)
+    assert shown.count("Reading photographs") == 9
+    shown.clear()
+    options = {"zero": ZeroShot(zero_shot=True), "width": 28, "opened_width": 48, "device": "cpu"}
+    evaluate(Evaluate(scene, tmp_path / "other", **options), QUIET)
+    assert shown.count("Reading photographs") == 9
 
 
 def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Path) -> None:
@@ -403,10 +450,33 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
     for others, was in (
         ({"seed": 3}, "seed 0, not 3"),
         ({"variant": "no-depth-loss"}, "variant None, not no-depth-loss"),
-        ({"real": (tmp_path / "flats",)}, r"real \[\], not \['flats'\]"),
+        ({"real": (tmp_path / "flats",)}, r"real \[\], not \['.*flats'\]"),
     ):
         with pytest.raises(RunError, match=f"was started with {was}: expected the same options"):
             pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, **others), QUIET)
+
+
+def test_a_pretraining_is_not_continued_with_another_scene_of_the_same_name(
+    tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    across_a_wall(monkeypatch)
+    own, other = tmp_path / "a" / "flats", tmp_path / "b" / "flats"
+    for folder in (own, other):
+        shutil.copytree(scene, folder)
+
+    def go_on(real: Path, steps: int, resume: bool = True) -> None:
+        options = {"budget": Budget(steps=steps), "device": "cpu", "resume": resume}
+        pretrain_command(Pretrain(tmp_path / "out", real=(real,), **options), QUIET)
+
+    go_on(own, 1, resume=False)
+    file = tmp_path / "out" / PRETRAINING_FILE
+    started = json.loads(file.read_text())
+    assert started["real"] == [str(own.resolve())]
+    with pytest.raises(RunError, match=r"was started with real \['.*/a/flats'\], not \['.*/b/flats'\]: expected"):
+        go_on(other, 2)
+    file.write_text(json.dumps({**started, "real": ["flats"]}))  # as of an earlier version
+    go_on(own, 2)
+    assert json.loads(file.read_text())["real"] == started["real"]
 
 
 def test_a_pretraining_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(

@@ -179,6 +179,7 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
         assert figure.width == 3 * 320 + 2 * 4
 
 
+@pytest.mark.thorough
 def test_tables_say_what_trained_weights_know_of_a_scene(disk: Path, tmp_path: Path):
     learned = learned_from()
     assert learned == ("brighton_beach", "turin_lot"), "what the file of the shipped weights says"
@@ -312,6 +313,7 @@ def test_the_limits_of_opensplat_are_stated(disk: Path, tmp_path: Path):
     assert opensplat_limits(read_results(out, ["flats"], ["nearest"])) == []
 
 
+@pytest.mark.thorough
 def test_opensplat_is_compared_with_the_program_that_is_named(
     disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -471,6 +473,7 @@ def test_tidefield_understands_what_it_is_asked(method: str, monkeypatch: pytest
     assert called == list(asked)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("is_quiet", [False, True])
 def test_what_a_comparison_runs_is_as_quiet_as_itself(
     is_quiet: bool, disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -503,6 +506,7 @@ def test_missing_software_is_reported_before_anything_is_trained(
             compare_command(options, Console(quiet=True))
 
 
+@pytest.mark.thorough
 def test_mistakes_are_reported_before_anything_is_trained(disk: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr("tidefield.compare.run.run_measured", lambda *_: pytest.fail("something was run"))
     options = Compare((disk,), methods=("nearest",), out=tmp_path / "out", device="cpu")

@@ -110,6 +110,7 @@ def test_points_of_an_area_are_observed_where_they_were(scene: Scene, areas: lis
     assert select(lonely, CUT(scene)[-1]).scene.points is None
 
 
+@pytest.mark.thorough
 def test_training_sees_in_an_area_what_it_would_see_in_the_whole_scene(scene: Scene, areas: list[Area]):
     priors, config = DepthPriors(scene, match=Matcher(scene)), replace(SMALL.train, tiles=12)
     for area in (areas[0], areas[3]):

@@ -145,6 +145,7 @@ def test_training_across_scenes_matches_and_reads_photographs_as_training_on_one
     assert torch.equal(own[0].detail, own[1].detail)
 
 
+@pytest.mark.thorough
 def test_a_view_comes_closer_to_the_photograph_that_was_not_used(tmp_path: Path):
     write_survey(make_survey("ground_textures", seed=3, views=9, width=192), tmp_path)
     scene = load_scene(tmp_path, width=96)

@@ -59,6 +59,7 @@ def hull_of(cameras: Cameras, train: range) -> Hull:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", [80, 900])
 def test_the_hull_holds_the_ball_and_little_else(size: int):
     hull = hull_of(around(size=size), range(24))

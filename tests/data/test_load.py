@@ -1,4 +1,5 @@
 import json
+import logging
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,8 @@ from scenes_on_disk import (
 from shared_data import SHARED
 
 from tidefield.data.georeference import read_georeference
-from tidefield.data.load import load_scene
+from tidefield.data.images import read_at_size
+from tidefield.data.load import at_twice_the_size, at_width, load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import rectify
@@ -393,13 +395,43 @@ def test_transparent_photographs_of_any_layout_get_a_white_background(tmp_path: 
     clear = tuple(np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)]) for picture in truth.pictures)
     write_transforms(tmp_path, replace(truth, pictures=clear))
     assert load_scene(tmp_path).background_rgb is None
-    clear[2][:10, :, 3] = 0
+    for picture in clear:
+        picture[:10, :, 3] = 0
     write_pictures(tmp_path / "images", replace(truth, pictures=clear))
     scene = load_scene(tmp_path)
     assert scene.background_rgb == (1.0, 1.0, 1.0)
     assert (scene.photographs[scene.index(truth.names[2])][:10] == 255).all()
 
 
+def test_transparent_pixels_of_some_photographs_alone_are_masked(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    truth = survey(PINHOLE)
+    pictures = list(truth.pictures)
+    for k in (2, 3):
+        pictures[k] = np.dstack([pictures[k], np.full((48, 64), 255, np.uint8)])
+    pictures[3][:10, :, 3] = 0
+    write_transforms(tmp_path, replace(truth, pictures=tuple(pictures)))
+    scene = load_scene(tmp_path)
+    index = scene.index(truth.names[3])
+    assert scene.background_rgb is None
+    assert scene.hull is None
+    assert f"transparent pixels of {Path(truth.names[3]).name} are not used" in caplog.text
+    for own in (scene, at_width(scene, 32), at_twice_the_size(at_width(scene, 32))):
+        assert own is not None
+        used, colours = own.photographs.used(index), own.photographs[index]
+        rows = 10 * len(used) // 48
+        assert not used[:rows].any()
+        assert used[rows + 1 :].all()
+        assert all(own.photographs.used(i).all() for i in range(9) if i != index)
+        assert (colours[: rows - 1] < 255).any(-1).all(), "of the nearest used pixels"
+    mask = read_at_size(scene.photographs, index, 64, 48)[1]
+    assert mask is not None
+    assert torch.equal(scene.photographs.used(index), mask)
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["caliterra", "brighton_beach", "swindale", "turin_lot", "fern", "lego"])
 def test_real_scenes_load_with_sane_ranges_and_points_where_they_were_seen(name: str) -> None:
     if not (REAL / name).is_dir():

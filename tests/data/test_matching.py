@@ -339,6 +339,19 @@ def test_the_depth_priors_of_training_are_matched_once():
     torch.testing.assert_close(tiles[1], inside.flatten())
 
 
+def test_the_spread_of_depths_that_hardly_differ_keeps_its_digits():
+    noise = torch.randn(40, 60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    known = torch.ones_like(noise)
+
+    def spread(found: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        fit = matching._Fit(known.to(found), known.to(found), 1e-5)
+        return matching._surface(found, fit)[1] - matching.HALF_PX * fit.step
+
+    found = 1 / 60 * (1 + 2e-4 * noise)
+    assert spread(found).min() > 1e-7
+    torch.testing.assert_close(spread(found.float()).double(), spread(found), rtol=0.02, atol=0)
+
+
 def test_the_last_smoothing_averages_noise_and_keeps_edges():
     torch.manual_seed(0)
     steps = torch.where(torch.arange(40) < 20, 0.0, 3.0).expand(30, 40)

@@ -59,6 +59,7 @@ def test_a_resumed_training_renders_once_for_each_share_that_is_left(tmp_path: P
     assert json.loads((tmp_path / "curve.json").read_text()) == [[7.0, 100.0]] * 3
 
 
+@pytest.mark.thorough
 def test_a_training_leaves_a_point_for_each_share_of_its_budget(tmp_path: Path):
     scene = wall.scene(wall.cameras(6), (1, 3))
     trainer, budget, curve = SceneTrainer(SMALL, scene, 0, torch.device("cpu")), Budget(steps=32), make_curve(scene)

@@ -5,9 +5,11 @@ import threading
 import pytest
 import textured_wall as wall
 import torch
+from torch import Tensor
 
 from tidefield.config import PRESETS, SWIFT
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours
+from tidefield.geometry.cameras import Cameras
 from tidefield.model import cache as feature_cache
 from tidefield.model.cache import (
     FREE_SHARE,
@@ -22,6 +24,7 @@ from tidefield.model.cache import (
 )
 from tidefield.model.network import Network, make_network
 from tidefield.model.renderer import Renderer
+from tidefield.model.views import Views
 from tidefield.parallel import read_ahead
 
 CPU = torch.device("cpu")
@@ -66,6 +69,57 @@ def test_what_a_tile_shows_is_read_from_a_block_that_holds_it(network: Network):
     truth = at.photographs[1][row.clamp(max=95), column.clamp(max=159)].float() / 255
     # Bilinear between pixels against the nearest pixel of a smooth wall.
     assert (found.colours.reshape(-1, 3) - truth).abs().mean() < 0.08
+
+
+@pytest.mark.usefixtures("small_blocks")
+@torch.inference_mode()
+def test_ground_next_to_what_stands_on_it_is_read_from_the_block_that_holds_both(network: Network):
+    """Blocks of 64 pixels begin every 32: the one around pixel 79 ends at 96."""
+    at = scene()
+    view, neighbours = at.cameras[1], Neighbours(torch.full((1, 1), 1), torch.ones(1, 1, 4))
+
+    def shown(*columns: float) -> Tensor:
+        uv = torch.tensor([[[u, 40.0] for u in columns]])
+        return view.position_world + 5 * view.directions_world(uv)[0]
+
+    def valid(cache: FeatureCache, ends: Tensor | None, *columns: float) -> list[bool]:
+        views = cache.views(view, neighbours, shown(79.0), ends)
+        points = shown(*columns)[None]
+        directions = points - view.position_world
+        count = len(columns)
+        found = views.read(1, points, directions, torch.full((1, count, 2), 0.5), torch.ones(1, count))
+        return found.valid.flatten().tolist()
+
+    cache = FeatureCache(network, at, CPU)
+    assert valid(cache, None, 74.0, 84.0, 104.0) == [True, True, False]
+    assert valid(cache, shown(79.0, 104.0)[None], 74.0, 84.0, 104.0) == [True, True, True]
+    assert valid(cache, shown(79.0, 1000.0)[None], 74.0, 84.0) == [True, True], "the middle is always in it"
+    alone = FeatureCache(network, at, CPU)
+    for ends in (None, shown(79.0, 88.0)[None], shown(45.0, 70.0)[None]):
+        alone.views(view, neighbours, shown(79.0), ends)
+    assert len(alone._slots) == 1, "one that holds all is not left"
+
+
+def test_a_tile_reaches_from_its_nearest_to_its_farthest_surface(network: Network, monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    view, given = at.cameras[TARGET], []
+
+    def noted(cache: FeatureCache, camera: Cameras, neighbours: Neighbours, middle: Tensor, ends: Tensor) -> Views:
+        given.append((middle, ends))
+        return views(cache, camera, neighbours, middle, ends)
+
+    views = FeatureCache.views
+    monkeypatch.setattr(FeatureCache, "views", noted)
+    prior = torch.tensor([1 / 5, 1 / 4, 1 / 6])[:, None, None].repeat(1, 24, 40)
+    prior[0, 2, 9] = 1 / 4.5  # a cell of the second tile
+    prior[0, 20:, 32:] = torch.nan
+    Renderer(network, at, SWIFT, CPU)(view, prior)
+    [(middle, ends)] = given
+    (uv, z), (at_middle, _) = view.project(ends.flatten(0, 1)), view.project(middle)
+    torch.testing.assert_close(uv.reshape(15, 2, 2), at_middle.reshape(15, 1, 2).expand(-1, 2, -1), atol=1e-3, rtol=0)
+    depth = torch.full((15, 2), 5.0)
+    depth[1, 0], depth[14, 0] = 4.5, 24 / 5
+    torch.testing.assert_close(z.reshape(15, 2), depth)
 
 
 @pytest.mark.usefixtures("small_blocks")

@@ -211,6 +211,7 @@ def test_the_order_of_the_views_does_not_matter(kind: type[ColourBlend]):
     torch.testing.assert_close(own(permuted, views, direction), own(evidence, gathered, direction))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", BLENDS)
 @pytest.mark.parametrize("seen", [True, False])
 def test_gradients_are_right_whether_or_not_a_view_sees_the_sample(seen: bool, kind: type[ColourBlend]):

@@ -70,6 +70,7 @@ def test_where_views_see_an_opaque_scene_all_light_is_stopped(name: str):
 DRAWN = [part for part in PARTS["swift"] if SWIFT.network.has(part) and part != "doubled photographs"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("part", DRAWN)
 def test_without_a_part_the_network_is_finite_and_renders_something_else(part: Part):
     without = replace(SWIFT, network=replace(SWIFT.network, without=(*SWIFT.network.without, part)))
@@ -230,6 +231,7 @@ def test_without_jitter_rendering_repeats_and_with_it_it_varies_with_the_seed():
     assert not torch.equal(one.colour, other.colour)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("side", [1, 2])
 def test_views_in_turn_are_those_of_each_camera(side: int):
     at = scene()

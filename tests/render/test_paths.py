@@ -16,6 +16,7 @@ from tidefield.render.camera_paths import (
     GENTLE,
     SHAPES,
     Shape,
+    _plane_normal,
     among_cameras,
     free_camera,
     layout_of,
@@ -71,7 +72,7 @@ def test_a_path_of_less_reach_stays_within_that_of_more(kind: str, path: str):
 
 @pytest.mark.parametrize("frames", [1, 2])
 @pytest.mark.parametrize("path", SHAPES)
-@pytest.mark.parametrize("kept", [2, 3])
+@pytest.mark.parametrize("kept", [1, 2, 3])
 @pytest.mark.parametrize("kind", SCENES)
 def test_few_photographs_and_few_frames_are_enough(kind: str, kept: int, path: str, frames: int):
     scene = replace(SCENES[kind](), train=tuple(range(kept)))
@@ -79,6 +80,13 @@ def test_few_photographs_and_few_frames_are_enough(kind: str, kept: int, path: s
     assert (position.shape, rotation.shape) == ((frames, 3), (frames, 3, 3))
     assert position.isfinite().all()
     assert rotation.isfinite().all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_photographs_have_no_plane(count: int):
+    random, down = np.random.default_rng(0), np.array([0.0, 0.6, -0.8])
+    for _ in range(100):
+        assert (_plane_normal(random.normal(size=(count, 3)), down) == -down).all()
 
 
 def test_the_tour_passes_through_the_cameras_in_order_at_constant_speed():

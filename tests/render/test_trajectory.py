@@ -29,6 +29,7 @@ def seen_shares(scene: Scene, cameras: Cameras) -> list[float]:
     return [float(doubly_seen(scene, small[k]).float().mean()) for k in range(len(small))]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("kind", SCENES)
 def test_every_path_has_the_asked_size_and_the_photographs_view_range_and_exposure(kind: str, path: str):
@@ -51,6 +52,7 @@ def test_every_path_stays_among_the_photographs(kind: str, path: str):
     assert nearest.max() < 0.5 * layout_of(scene).distance
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("every", [1, 5])
 def test_frames_over_a_survey_are_nearly_full_of_what_two_photographs_see(path: str, every: int):
@@ -72,6 +74,7 @@ def strip_length(cameras: Cameras) -> float:
     return float((cameras.position_world[-1] - cameras.position_world[0]).norm())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", PATHS)
 def test_the_same_call_gives_the_same_path(path: str):
     first, second = path_of(path, survey(), 30), path_of(path, survey(), 30)

@@ -137,6 +137,7 @@ def test_orthophoto_matches_a_camera_far_above() -> None:
     assert ((far - depth) - map_height).abs().median() < 2e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("category", list(CATEGORIES))
 def test_every_category_has_overlap_contrast_and_sparse_points(category: str) -> None:
     scene = survey(category)

@@ -250,6 +250,7 @@ def test_a_run_of_somebody_else_is_one_clear_error(trained: bytes, tmp_path: Pat
         load_network(tmp_path, make_network(SMALL.network))
 
 
+@pytest.mark.thorough
 def test_what_a_cpu_computed_in_is_kept_on_resume(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

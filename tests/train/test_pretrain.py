@@ -66,6 +66,7 @@ def test_recipes_repeat_and_differ() -> None:
     assert all(index < one.views for one in every for index in one.misposed)
 
 
+@pytest.mark.thorough
 def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(stream, "recipe", small_recipe)
@@ -91,6 +92,23 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
 
 
+def test_only_processes_that_make_scenes_have_one_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "make_survey", lambda *_: None)
+    monkeypatch.setattr(stream, "misposed", lambda *_: None)
+    monkeypatch.setattr(stream, "write_survey", lambda _, folder, **__: folder.mkdir())
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        stream.make(small_recipe(0, 0), tmp_path / "made")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(stream, "cores", lambda: 1)
+    with Stream(tmp_path / "scenes", [], 7, SMALL) as scenes:
+        assert scenes.maker.submit(torch.get_num_threads).result() == 1
+
+
 @pytest.mark.parametrize(("cores", "processes", "makers"), [(2, 1, 1), (16, 1, 4), (16, 4, 1), (128, 1, 8)])
 def test_processes_that_make_scenes_have_some_cores_each(
     cores: int, processes: int, makers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -101,6 +119,7 @@ def test_processes_that_make_scenes_have_some_cores_each(
         assert scenes.makers == makers
 
 
+@pytest.mark.thorough
 def test_several_processes_make_the_scenes_that_one_makes_but_a_few_ahead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,6 +281,7 @@ def learn_together(rank: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.thorough
 def test_two_processes_learn_the_same_from_different_scenes(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -275,6 +295,22 @@ def test_two_processes_learn_the_same_from_different_scenes(tmp_path: Path) -> N
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
     assert any(not torch.equal(value, first[name]) for name, value in alone.network.state_dict().items())
+
+
+def test_scenes_of_one_name_are_all_validated_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    at = wall.scene(wall.cameras(3))
+    monkeypatch.setattr(pretrain, "load_scene", lambda path, **_: replace(at, root=path))
+    monkeypatch.setattr(pretrain, "make", lambda *_: None)
+    real = [tmp_path / name for name in ("b/scene", "a/scene", "a/river_mouths", "a/other")]
+    for order in (real, real[::-1]):
+        found = {name: own.root for name, own in pretrain.validation_scenes(tmp_path, order, QUIET).items()}
+        assert {name: path for name, path in found.items() if name not in pretrain.CATEGORIES} == {
+            "other": real[3],
+            "river_mouths-2": real[2],
+            "scene": real[1],
+            "scene-2": real[0],
+        }
+        assert found["river_mouths"] == tmp_path / "validation" / "river_mouths"
 
 
 def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,6 +379,7 @@ def test_what_ships_fits_its_preset_and_its_card() -> None:
         assert weights_sha256(file) in card
 
 
+@pytest.mark.thorough
 def test_the_command_pretrains_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(stream, "recipe", small_recipe)

@@ -16,7 +16,7 @@ from tidefield.config import SWIFT, Budget, Config
 from tidefield.data.load import at_twice_the_size, load_scene
 from tidefield.data.scene import Scene
 from tidefield.evaluation.metrics import prepare_torchvision
-from tidefield.recording import WARM_UPS, Recorder, map_tensors, recording_lock
+from tidefield.recording import WARM_UPS, Recorder, map_tensors, moved, recording_lock
 from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.loop import SceneTrainer
 
@@ -46,6 +46,7 @@ def detailed_scene(folder: Path) -> Scene:
     return replace(scene, cameras=cameras)
 
 
+@pytest.mark.thorough
 def test_what_a_loss_computes_can_be_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepare_torchvision()
     import torchmetrics.functional.image  # noqa: F401 - makes constants on the processor when it is imported
@@ -117,6 +118,21 @@ def test_nothing_new_is_recorded_while_another_thread_computes(monkeypatch: pyte
         assert recorder(torch.ones(3)) == "replayed", "only what is new has to wait"
         assert recorder(torch.ones(4)) == "computed"
     assert not recording_lock.locked()
+
+
+@pytest.mark.parametrize(("device", "waits"), [("mps", True), ("cuda:0", False)])
+def test_only_cuda_reads_the_memory_of_the_processor_later(
+    device: str, waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def to(tensor: Tensor, to: torch.device, non_blocking: bool = False) -> Tensor:
+        asked.append((str(to), non_blocking))
+        return tensor
+
+    monkeypatch.setattr(Tensor, "to", to)
+    moved((torch.ones(3), torch.ones(4)), torch.device(device))
+    assert asked == [(device, not waits)] * 2
 
 
 @pytest.mark.gpu

@@ -106,6 +106,7 @@ def test_encoders_whose_features_nothing_bounds_learn_more_slowly(
         assert rates[parameter] == pytest.approx(share * rate / SMALL.train.warm_up, rel=0.01), name
 
 
+@pytest.mark.thorough
 def test_photographs_of_two_sizes_are_learned_from_and_evaluated(tmp_path: Path) -> None:
     mixed = wall.mixed_scene()
     trainer = SceneTrainer(replace(SMALL, train=replace(SMALL.train, tiles=4)), mixed, seed=3, device=CPU)
@@ -122,6 +123,7 @@ def in_areas(monkeypatch: pytest.MonkeyPatch, each: int = 2) -> None:
     monkeypatch.setattr("tidefield.train.loop.STEPS_EACH", each)
 
 
+@pytest.mark.thorough
 def test_a_large_scene_is_learned_area_by_area_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     in_areas(monkeypatch)
     trainer = SceneTrainer(SMALL, wall.scene(wall.cameras(14, step=1.2)), seed=3, device=CPU)
@@ -142,6 +144,7 @@ def test_a_large_scene_is_learned_area_by_area_all_of_it(monkeypatch: pytest.Mon
     assert any(not torch.equal(value, weights(trainer)[name]) for name, value in first.items())
 
 
+@pytest.mark.thorough
 def test_a_training_by_areas_is_resumed_bit_for_bit_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     in_areas(monkeypatch)
     scene, budget = wall.scene(wall.cameras(14, step=1.2)), Budget(steps=12)
@@ -158,6 +161,7 @@ def test_a_training_by_areas_is_resumed_bit_for_bit_too(tmp_path: Path, monkeypa
         assert torch.equal(value, weights(second)[name]), name
 
 
+@pytest.mark.thorough
 def test_what_an_area_needed_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     in_areas(monkeypatch, each=1)
     trainer = SceneTrainer(SMALL, wall.scene(wall.cameras(14, step=1.2)), seed=3, device=CPU)
@@ -171,6 +175,7 @@ def test_what_an_area_needed_is_given_back(monkeypatch: pytest.MonkeyPatch) -> N
         assert len(alive) <= 4, "one area's at a time"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("at_once", [True, False])
 def test_training_begins_with_few_photographs_and_learns_from_all(
     at_once: bool, monkeypatch: pytest.MonkeyPatch
@@ -278,6 +283,7 @@ def test_memory_of_training_does_not_grow_with_the_photographs(tmp_path: Path) -
     assert (together[1] - few[1]) / (320 - 192) > 0.6e6, "this test would notice"
 
 
+@pytest.mark.thorough
 def test_training_goes_on_from_the_shipped_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setitem(PRESETS, "swift", SMALL)
@@ -470,6 +476,32 @@ def test_gradients_are_clipped_to_a_norm_of_one(scene: Scene) -> None:
     trainer.step(Budget(steps=10))
     norms = [p.grad.norm() for p in trainer.network.parameters() if p.grad is not None]
     assert torch.stack(norms).norm().item() == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("at", ["gradient", "loss"])
+def test_what_is_not_finite_is_never_saved(
+    at: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tidefield.train.loop.SAVE_SECONDS", 0.0)
+    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    backward = trainer.backward
+
+    def overflowing() -> torch.Tensor:
+        error = backward()
+        if trainer.progress.step < 2:
+            return error
+        if at == "loss":
+            return error * torch.nan
+        gradient = next(p.grad for p in trainer.network.parameters() if p.grad is not None)
+        gradient[0] = torch.nan
+        return error
+
+    trainer.backward = overflowing  # type: ignore[method-assign]
+    with pytest.raises(FloatingPointError, match="at step 3; this is a defect of the program"):
+        train(trainer, tmp_path, Budget(steps=3), Console(quiet=True))
+    again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
+    assert load_network(tmp_path, again.network).step == 2
+    assert all(value.isfinite().all() for value in weights(again).values())
 
 
 def older(config: Config) -> dict[str, Any]:

@@ -75,6 +75,7 @@ def sharpness(picture: Float64[np.ndarray, "H W 3"]) -> float:
     return float(np.abs(np.diff(picture, axis=0)).mean() + np.abs(np.diff(picture, axis=1)).mean())
 
 
+@pytest.mark.thorough
 def test_the_camera_moves_the_picture_sharpens_and_a_path_is_saved_and_read(tmp_path: Path):
     scene = wall()
     with page_of(scene) as page, open_browser() as browser:
@@ -127,6 +128,7 @@ def test_the_camera_moves_the_picture_sharpens_and_a_path_is_saved_and_read(tmp_
     assert view.colour.shape == (36, 64, 3)
 
 
+@pytest.mark.thorough
 def test_a_picture_that_rests_is_sharper_than_the_first_one():
     with page_of(wall()) as page, ExitStack() as stack, open_browser() as browser:
         may_render, make = threading.Event(), page.frames._render

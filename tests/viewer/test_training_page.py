@@ -10,8 +10,9 @@ from networks import SMALL
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
+from tidefield.baselines.nerf import NerfTrainer
 from tidefield.commands.train import Train, train
-from tidefield.config import PRESETS, Budget
+from tidefield.config import PRESETS, Budget, NerfConfig
 from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
@@ -71,6 +72,21 @@ def test_nothing_is_recorded_while_a_picture_of_a_training_is_made(monkeypatch: 
     assert not recording_lock.locked()
 
 
+def test_what_is_shown_of_a_nerf_is_a_copy_too():
+    scene = textured_wall.scene(textured_wall.cameras(5, 8, 6))
+    small = NerfConfig(coarse=4, fine=4, depth=2, width=16)
+    trainer = NerfTrainer(small, scene, 0, choose_device("cpu"))
+    torch.nn.init.constant_(trainer.network.fine.density.bias, 5.0)  # something is seen
+    shown = training._as_it_is(trainer)
+    before = shown(scene.cameras[0]).colour
+    with torch.no_grad():
+        for value in trainer.network.parameters():
+            value.mul_(0)
+    assert torch.equal(shown(scene.cameras[0]).colour, before)
+    assert not torch.equal(training._as_it_is(trainer)(scene.cameras[0]).colour, before)
+
+
+@pytest.mark.thorough
 def test_a_training_that_is_looked_at_learns_the_same(tmp_path: Path):
     write_colmap(tmp_path / "scene", survey(PINHOLE))
     for name, options in (("plain", {}), ("viewed", {"view": True, "port": 0})):

@@ -170,13 +170,15 @@ def _sample(pdf: Float[Tensor, "1 R B"], count: int, generator: torch.Generator 
 class NerfTrainer(Trainer):
     """Trains on rays through random pixels of all training photographs."""
 
+    network: Nerf
+
     def __init__(self, config: NerfConfig, scene: Scene, seed: int, device: torch.device) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = Nerf(config)
         network.cover(scene.cameras[list(scene.train)])
         super().__init__(network.to(device), config.learning_rate, scene, seed, device, {})
-        self.config, self.nerf, self.cameras = config, network, scene.cameras.to(device)
+        self.config, self.cameras = config, scene.cameras.to(device)
 
     @property
     def rays_per_step(self) -> int:
@@ -198,7 +200,7 @@ class NerfTrainer(Trainer):
         rays = Rays.of(self.cameras, which.to(device), uv.to(device))
         background, truth = scene.background_rgb, truth.to(device)
         errors = []
-        for seen in self.nerf(rays, background is None, self.generator, self.precision):
+        for seen in self.network(rays, background is None, self.generator, self.precision):
             colour = seen.colour
             if background is not None:
                 # The background has no exposure: rendering adds it to colours that the gain was applied to.
@@ -208,7 +210,7 @@ class NerfTrainer(Trainer):
         return errors[0] + errors[1], errors[1].detach()
 
     def renderer(self, sampling: Sampling = USUAL_SAMPLING) -> Render:
-        return with_rays(make_render(self.nerf, self.scene, self.device), sampling)
+        return with_rays(make_render(self.network, self.scene, self.device), sampling)
 
 
 def draw_pixels(

@@ -26,6 +26,7 @@ from tidefield.methods import UNTRAINED_DEVICE, untrained
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from tidefield.data.scene import Scene
     from tidefield.evaluation.evaluate import Evaluation
 
 
@@ -61,7 +62,6 @@ class Evaluate:
 
 def evaluate(options: Evaluate, console: Console) -> Evaluation:
     """Run `tidefield evaluate`."""
-    from tidefield.data.load import at_width
     from tidefield.device import choose_device
     from tidefield.evaluation.evaluate import evaluate as evaluate_method
 
@@ -81,7 +81,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         opened = open_trained(source, choose_device(options.device), options.allow_missing, console, sampling)
         with opened as (scene, render, record):
             _refuse_learned(source, scene.held_out)
-            truth = scene if options.width is None else at_width(scene, options.width)
+            truth = _at_width(scene, options.width, console)
             return evaluate_method(render, truth, out or source, configuration=record, **settings)
     if method is not None and options.device not in ("auto", UNTRAINED_DEVICE):
         raise RunError(
@@ -97,8 +97,19 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         render = untrained(method, scene, sampling)
         return evaluate_method(render, scene, out, configuration=record, **settings)
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
-    truth = scene if options.opened_width is None or options.width is None else at_width(scene, options.width)
+    truth = scene if options.opened_width is None else _at_width(scene, options.width, console)
     return evaluate_method(render, truth, out, configuration=record, **settings)
+
+
+def _at_width(scene: Scene, width: int | None, console: Console) -> Scene:
+    """The scene at a width, with progress while photographs are decoded; as it is if None is given."""
+    from tidefield.data.load import at_width
+    from tidefield.progress import ProgressBar
+
+    if width is None:
+        return scene
+    with ProgressBar(console, "Reading photographs") as bar:
+        return at_width(scene, width, bar)
 
 
 def _refuse_learned(folder: Path, held_out: Sequence[str]) -> None:

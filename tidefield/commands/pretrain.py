@@ -124,7 +124,9 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
 
 def _record(options: Pretrain) -> dict[str, Any]:
     """What must not change while a training is continued: its weights tell what they learned from."""
-    real = sorted(scene.resolve().name for scene in options.real)
+    from tidefield.addresses import address_of
+
+    real = sorted(address_of(scene) or str(scene.resolve()) for scene in options.real)
     return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
 
 
@@ -150,6 +152,9 @@ def _require_same(folder: Path, record: dict[str, Any]) -> None:
             f"{folder} holds no training of `tidefield pretrain` (no {PRETRAINING_FILE}): expected one to continue; "
             "name it, or leave --resume out"
         )
+    names = sorted(Path(scene).name for scene in record["real"])
+    if found.get("real") == names:  # all that older ones have
+        record = {**record, "real": names}
     wrong = [f"{name} {found.get(name)}, not {value}" for name, value in record.items() if found.get(name) != value]
     if wrong:
         raise RunError(

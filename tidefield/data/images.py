@@ -115,8 +115,9 @@ class PhotographFile:
         path: the file.
         lens: the camera that took it, for exactly the file's pixels.
         width, height: of the result.
-        has_alpha: whether the file has an opacity channel.
+        has_alpha: whether the file has an opacity channel, which is read as such.
         mask: a picture of the same size, which is black where the photograph is not to be used; None for none.
+        alpha_is_mask: whether the file has an opacity channel, and pixels that are not opaque are not to be used.
     """
 
     path: Path
@@ -125,6 +126,7 @@ class PhotographFile:
     height: int
     has_alpha: bool
     mask: Path | None = None
+    alpha_is_mask: bool = False
 
     def at_width(self, width: int | None) -> PhotographFile:
         """The same file, to be read at a width with its aspect kept; never enlarged, at its own where None is given."""
@@ -133,7 +135,12 @@ class PhotographFile:
 
     @property
     def bytes(self) -> int:
-        return self.width * self.height * (3 + self.has_alpha + (self.mask is not None))
+        return self.width * self.height * (3 + self.has_alpha + self.has_mask)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether some of its pixels are not to be used, by a mask or by its own opacity."""
+        return self.mask is not None or self.alpha_is_mask
 
 
 @quiet_pillow()
@@ -209,6 +216,8 @@ def photographs_key(files: Sequence[PhotographFile], background_rgb: tuple[float
         path, *version = identity(file.path)
         about = {**asdict(file), "path": path}
         del about["mask"]
+        if not file.alpha_is_mask:  # what is in the cache keeps its names
+            del about["alpha_is_mask"]
         parts.append([about, *version])
         if file.mask is not None:
             parts.append(identity(file.mask))
@@ -240,7 +249,7 @@ def _views(
         single = list(planes[3 * pixels :].view(-1, file.height, file.width))
         colours.append(planes[: 3 * pixels].view(file.height, file.width, 3))
         alphas.append(single.pop(0) if file.has_alpha else None)
-        masks.append(single.pop().view(torch.bool) if file.mask is not None else None)
+        masks.append(single.pop().view(torch.bool) if file.has_mask else None)
         start += file.bytes
     masks = masks if any(mask is not None for mask in masks) else ()
     mapped = store.base if isinstance(store.base, mmap.mmap) else None
@@ -270,6 +279,9 @@ def _decoded(
 def _decode(file: PhotographFile, background_rgb: tuple[float, float, float]) -> UInt8[np.ndarray, " bytes"]:
     pixels = decode(file.path)
     mask = None if file.mask is None else read_mask(file.mask, (file.lens.width, file.lens.height), file.path)
+    if file.alpha_is_mask:
+        opaque = pixels[..., 3] == 255
+        pixels, mask = pixels[..., :3], opaque if mask is None else mask & opaque
     if not file.has_alpha:
         pixels = pixels if mask is None else fill_masked(pixels, mask)
         return _planes(rectify(pixels, file.lens, file.width, file.height), mask, file)

@@ -143,17 +143,26 @@ def load_scene(
     pinholes = tuple(_pinhole(file) for file in files)
     background = posed.background_rgb or _WHITE
     photographs = open_photographs(files, background, progress, cache)
+    transparent = [alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas]
+    # An object before a background is cut out in every photograph: others have pixels that are not to be used.
+    cut_out = any(transparent) and (posed.background_rgb is not None or all(transparent[i] for i in train))
+    if any(transparent) and not cut_out:
+        some = [path.name for path, own in zip(posed.paths, transparent, strict=True) if own]
+        _log.info(f"transparent pixels of {list_names(some)} are not used, as if they were masked")
+        files = [
+            replace(file, has_alpha=False, alpha_is_mask=True) if own else file
+            for file, own in zip(files, transparent, strict=True)
+        ]
+        photographs = open_photographs(files, background, progress, cache)
     points = [] if posed.points is None else [getattr(posed.points, field.name) for field in fields(posed.points)]
     read = [T_world_camera, posed.near_far, posed.divided_by, *points]
     hashes = [None if array is None else array_hash(array) for array in read]
     lenses = [asdict(lens) for lens in posed.lenses]
     depends_on = [code_hash(), photographs_key(files, background), lenses, hashes, train, calibrate]
 
-    transparent = any(alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas)
-
     def estimated() -> Arrays:
         cameras, sparse = _estimate(posed, T_world_camera, origin, pinholes, photographs, train, calibrate)
-        return _arrays(cameras, sparse, visual_hull(cameras, photographs, train) if transparent else None)
+        return _arrays(cameras, sparse, visual_hull(cameras, photographs, train) if cut_out else None)
 
     arrays = kept_arrays(f"{key(depends_on)}{ESTIMATES_SUFFIX}", cache or cache_folder(), estimated)
     cameras, sparse, hull = _from_arrays(arrays)
@@ -166,7 +175,7 @@ def load_scene(
         train=train,
         test=test,
         origin_world=torch.from_numpy(origin),
-        background_rgb=posed.background_rgb or (_WHITE if transparent else None),
+        background_rgb=posed.background_rgb or (_WHITE if cut_out else None),
         hull=hull,
         reference=posed.reference,
     )

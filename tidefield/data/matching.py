@@ -373,7 +373,9 @@ def _surface(found: Float[Tensor, "H W"], fit: _Fit) -> tuple[Float[Tensor, "H W
         return found, torch.zeros_like(found)
     for dilation in DILATIONS:
         found = _smoothed_up_to_edges(found, fit.known, EDGE * fit.step, dilation)
-    spread = (_box(found.square(), SPREAD_PX) - _box(found, SPREAD_PX).square()).clamp(min=0).sqrt()
+    # Inverse depths may differ by a thousandth: of the difference of their own squares no digit would be right.
+    away = found - found.mean()
+    spread = (_box(away.square(), SPREAD_PX) - _box(away, SPREAD_PX).square()).clamp(min=0).sqrt()
     return found, HALF_PX * fit.step + SPREADS * spread
 
 

@@ -35,6 +35,8 @@ MOST_NORMALISED_PX = 2048
 """Side up to which photographs are encoded whole for networks with instance norms, whatever memory that takes."""
 OVERLAP_PX = 160
 """Least overlap of neighbouring blocks, so that what a tile shows lies in one of them."""
+TILE_SHARE = 0.2
+"""How far around its middle photographs show a tile of even depth, as a share of the overlap."""
 MEMORY_SHARE, LEAST_BYTES = 0.09, 1_500_000_000
 """Memory for features: this share of the device's, or this much. Views of large photographs need more than the latter:
 what does not fit is encoded again for every view."""
@@ -125,13 +127,21 @@ class FeatureCache:
         self._slots: OrderedDict[Block, int] = OrderedDict()
         self._free = list(range(self.slots))[::-1]
 
-    def views(self, camera: Cameras, neighbours: Neighbours, middle_world: Float[Tensor, "T 3"]) -> Views:
+    def views(
+        self,
+        camera: Cameras,
+        neighbours: Neighbours,
+        middle_world: Float[Tensor, "T 3"],
+        ends_world: Float[Tensor, "T 2 3"] | None = None,
+    ) -> Views:
         """Encode the neighbours of a camera's tiles around what each tile shows, at the size it shows it in.
 
         Args:
             camera: of the tiles.
             neighbours: photographs and their blend weights.
             middle_world: the surface in the middle of each tile.
+            ends_world: where it would be there at the least and at the greatest depth that the tile shows, which
+                photographs see apart; the middle if not given.
 
         Raises:
             CacheFull: these tiles need more blocks than the cache holds.
@@ -141,7 +151,9 @@ class FeatureCache:
         if self._cones:
             levels = self.pyramid.levels(camera, photographs, middle_world)
         rows = self.pyramid.row(photographs, levels).reshape(-1)
-        keys = self._blocks_of(photographs.reshape(-1), levels.reshape(-1), rows, middle_world)
+        ends_world = middle_world[:, None] if ends_world is None else ends_world
+        points = torch.cat([middle_world[:, None], ends_world], dim=1)
+        keys = self._blocks_of(photographs.reshape(-1), levels.reshape(-1), rows, points)
         distinct = dict.fromkeys(keys)
         largest = self.pyramid.cameras.size_px[rows].clamp(max=self._block_px).amax(0).tolist()
         if any(needed > own for needed, own in zip(largest, self._side, strict=True)):
@@ -161,17 +173,32 @@ class FeatureCache:
         photographs: Int[Tensor, " K"],
         levels: Int[Tensor, " K"],
         rows: Int[Tensor, " K"],
-        middle_world: Float[Tensor, "T 3"],
+        points_world: Float[Tensor, "T P 3"],
     ) -> list[Block]:
-        """The block of each view whose middle is nearest to where the view sees the tile's middle."""
-        cameras = self.pyramid.cameras[rows]
-        points = middle_world.repeat_interleave(len(rows) // len(middle_world), 0)
-        uv = cameras.project(points[:, None])[0][:, 0]
-        last = _block_counts(cameras.size_px, self._block_px) - 1
-        free = (cameras.size_px - self._block_px).clamp(min=1)
-        index = torch.minimum(((uv - self._block_px / 2) / free * last).round().clamp(min=0), last.to(uv)).long()
+        """The block of each view whose middle is nearest to where the view sees the tile's middle, the first of its
+        points; where that does not hold them all, the one nearest to the middle of them, as far as it holds the tile's.
+        """
+        cameras, size = self.pyramid.cameras[rows], self.pyramid.cameras.size_px[rows]
+        uv, _ = cameras.project(points_world.repeat_interleave(len(rows) // len(points_world), 0))
+        middle, low, high = uv[:, 0], uv.amin(1), uv.amax(1)
+        index = self._nearest_blocks(size, middle)
+        corner, around, most = self._corners(size, index), TILE_SHARE * OVERLAP_PX, (0.5 - TILE_SHARE) * OVERLAP_PX
+        held = ((low - around).clamp(min=0) >= corner) & (torch.minimum(high + around, size) <= corner + self._block_px)
+        aside = ((low + high) / 2 - middle).clamp(-most, most)
+        index = torch.where(held, index, self._nearest_blocks(size, middle + aside))
         parts = zip(photographs.tolist(), levels.tolist(), index.tolist(), strict=True)
         return [Block(photograph, level, *at) for photograph, level, at in parts]
+
+    def _nearest_blocks(self, size_px: Int[Tensor, "K 2"], uv_px: Float[Tensor, "K 2"]) -> Int[Tensor, "K 2"]:
+        """Columns and rows of the blocks whose middles are nearest to pixels of photographs."""
+        last = _block_counts(size_px, self._block_px) - 1
+        free = (size_px - self._block_px).clamp(min=1)
+        return torch.minimum(((uv_px - self._block_px / 2) / free * last).round().clamp(min=0), last.to(uv_px)).long()
+
+    def _corners(self, size_px: Int[Tensor, "*K 2"], index: Int[Tensor, "*K 2"]) -> Int[Tensor, "*K 2"]:
+        """Upper left corners of blocks, by their columns and rows."""
+        last = (_block_counts(size_px, self._block_px) - 1).clamp(min=1)
+        return ((size_px - self._block_px).clamp(min=0) * index / last).floor().long()
 
     def _encode_all(self, blocks: list[Block]) -> None:
         """Encode blocks, some at a time; one that is cancelled leaves those that are ready."""
@@ -194,8 +221,7 @@ class FeatureCache:
     def _encode(self, block: Block, slot: int, read: Callable[[Block], BlockRead]) -> None:
         (colours, mask), doubled = read(block)
         size = torch.tensor([colours.shape[1], colours.shape[0]])
-        last = (_block_counts(size, self._block_px) - 1).clamp(min=1)
-        corner = ((size - self._block_px).clamp(min=0) * torch.tensor([block.column, block.row]) / last).floor().long()
+        corner = self._corners(size, torch.tensor([block.column, block.row]))
         (left, top), (right, bottom) = corner.tolist(), torch.minimum(corner + self._block_px, size).tolist()
         camera = self.pyramid.camera(block.photograph, block.level).to(self.device)
 

@@ -14,9 +14,10 @@ from functools import partial
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from tidefield.config import USUAL_SAMPLING, Config, Sampling
-from tidefield.data.depth_prior import DepthPrior, surface_prior, unproject_to_surface
+from tidefield.data.depth_prior import STRIDE, DepthPrior, surface_prior, unproject_to_surface
 from tidefield.data.exposure import to_common_exposure
 from tidefield.data.matching import Matcher
 from tidefield.data.neighbours import EXTRA_VIEWS, Neighbours, choose_neighbours
@@ -190,9 +191,12 @@ class Renderer:
         v, u = torch.meshgrid(torch.arange(top, top + rows), torch.arange(left, left + columns), indexing="ij")
         corners = torch.stack([u, v], -1).reshape(-1, 2).float() * TILE_PX
         middles = unproject_to_surface(camera, prior.cells, corners + TILE_PX / 2)
+        side = TILE_PX // STRIDE
+        part = prior.cells[:, side * top : side * (top + rows), side * left : side * (left + columns)]
+        ends = _ends(camera, part, middles)
         views, strategy = self.network.config.views, self.config.train.neighbours
         neighbours = choose_neighbours(camera, prior.cells, corners[0], size, TILE_PX, self.scene, views, strategy)
-        found = self._tiles(camera, prior, corners, neighbours, middles)
+        found = self._tiles(camera, prior, corners, neighbours, middles, ends)
         stacked = found.reshape(rows, columns, TILE_PX, TILE_PX, 6)
         return stacked.transpose(1, 2).reshape(rows * TILE_PX, columns * TILE_PX, 6)
 
@@ -203,15 +207,17 @@ class Renderer:
         corners: Float[Tensor, "T 2"],
         neighbours: Neighbours,
         middle_world: Float[Tensor, "T 3"],
+        ends_world: Float[Tensor, "T 2 3"],
     ) -> Float[Tensor, "T R 6"]:
         try:
-            views = self.cache.views(camera, neighbours, middle_world)
+            views = self.cache.views(camera, neighbours, middle_world, ends_world)
         except CacheFull:
             if len(corners) == 1:
                 raise
             half = len(corners) // 2
             halves = (slice(half), slice(half, None))
-            return torch.cat([self._tiles(camera, prior, corners[s], neighbours[s], middle_world[s]) for s in halves])
+            parts = ((corners[s], neighbours[s], middle_world[s], ends_world[s]) for s in halves)
+            return torch.cat([self._tiles(camera, prior, *part) for part in parts])
         pieces = [
             partial(self._piece, camera, prior, corners[part], views[part])
             for part in (slice(k, k + self.tiles_at_once) for k in range(0, len(corners), self.tiles_at_once))
@@ -238,6 +244,23 @@ class Renderer:
         found = self.network(piece.tiles, views, piece.start, self.scene.background_rgb is None, piece.detail)
         single = torch.stack([found.opacity, found.depth, found.visibility], dim=-1)
         return torch.cat([found.colour, single], dim=-1)
+
+
+def _ends(camera: Cameras, cells: Float[Tensor, "3 h w"], middle_world: Float[Tensor, "T 3"]) -> Float[Tensor, "T 2 3"]:
+    """Where the surface in the middles of tiles would be at the least and at the greatest depth in each.
+
+    Args:
+        camera: of the tiles.
+        cells: of its prior, in the tiles.
+        middle_world: the surface in their middles, row by row.
+    """
+    expected, near, far = cells
+    inverse = torch.where(expected.isnan(), (near + far) / 2, expected)[None]
+    side = TILE_PX // STRIDE
+    ends = [sign * F.max_pool2d(sign * inverse, side, ceil_mode=True).reshape(-1) for sign in (1, -1)]
+    ray = middle_world - camera.position_world
+    share = 1 / (torch.stack(ends, -1) * (ray @ camera.forward_world[0])[:, None])
+    return camera.position_world + ray[:, None] * share[..., None]
 
 
 def in_turn(render: Render, cameras: Cameras) -> Iterator[Rendering]:

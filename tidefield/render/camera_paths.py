@@ -157,7 +157,9 @@ def layout_of(scene: Scene) -> Layout:
         if focus is not None:
             centre, distance = focus, float(np.median(np.linalg.norm(focus - position, axis=1)))
     else:
-        length = max(np.ptp(position @ axis) for axis in np.linalg.eigh(np.cov(position.T))[1].T)
+        length = 0.0
+        if len(position) > 1:
+            length = max(np.ptp(position @ axis) for axis in np.linalg.eigh(np.cov(position.T))[1].T)
         one_heading = float(np.linalg.norm(image_up.mean(0))) > 0.8
         kind = "facing" if one_heading and length < LONG * distance else "survey"
         up = image_up.mean(0) if kind == "facing" else _plane_normal(position, forward)
@@ -179,6 +181,8 @@ def among_cameras(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
     if layout.kind != "around":
         keys = keys.mean(0) + reach * (keys - keys.mean(0))
     position, rotation = _spline(keys, layout.rotation[order])
+    if len(position) == 1:
+        return position.repeat(frames, axis=0), rotation.repeat(frames, axis=0)
     turned = Rotation.from_matrix(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]).magnitude()
     apparent = np.hypot(np.linalg.norm(np.diff(position, axis=0), axis=1) / layout.distance, turned)
     travelled = np.concatenate([[0.0], np.cumsum(apparent)])
@@ -284,6 +288,8 @@ def _level_normal(rotation: Rotations) -> Vector:
 
 def _plane_normal(position: Positions, forward: Vector) -> Vector:
     """Return the normal of the plane of most cameras, against the viewing direction; without a plane, its opposite."""
+    if len(position) < 4:  # three always lie in one
+        return -forward
     variance, axes = np.linalg.eigh(np.cov(position.T))
     kept = position
     for _ in range(3):  # photographs of take-off and landing lie off the plane

@@ -162,18 +162,27 @@ class Trainer(ABC):
         save_checkpoint(folder, self.network, self.optimizer, self.random_state, self.progress)
 
     def step(self, budget: Budget) -> float:
-        """One step of gradient descent; returns the mean squared error of its colours."""
+        """One step of gradient descent; returns the mean squared error of its colours.
+
+        Raises:
+            FloatingPointError: that or the gradient is not finite: the weights are not to be saved.
+        """
         start = time.perf_counter()
         rate = self.rate(budget.share(self.progress.step, self.progress.seconds))
         for group in self.optimizer.param_groups:
             group["lr"] = rate * self.learning_rate * group["share"]
         error = self.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         self.progress.step += 1
         self.draw_ahead()
-        value = error.item()
+        value, length = torch.stack([error, norm]).tolist()  # together: a GPU is waited for once
         self.progress.seconds += time.perf_counter() - start
+        if not (math.isfinite(value) and math.isfinite(length)):
+            raise FloatingPointError(
+                f"the loss is {value} and the norm of its gradient {length} at step {self.progress.step}; this is a "
+                "defect of the program"
+            )
         self.progress.losses = [*self.progress.losses[-99:], value]
         return value
 
@@ -345,10 +354,6 @@ def train(
     with writer, ProgressBar(console, "Training") as bar, _stop_requests() as stopped_by:
         while used() < 1 and not trainer.should_stop(stopped_by() is not None):
             error = trainer.step(budget)
-            if not math.isfinite(error):
-                raise FloatingPointError(
-                    f"the loss is {error} at step {progress.step}; this is a defect of the program"
-                )
             mean = sum(progress.losses) / len(progress.losses)
             rays, psnr = trainer.rays_per_step * progress.step / max(progress.seconds, 1e-9), psnr_from_mse(mean)
             bar(used(), 1, f"step {progress.step}  loss {mean:.5f}  PSNR {psnr:.2f} dB  {rays:,.0f} rays/s")

@@ -73,7 +73,10 @@ def join(device: torch.device) -> torch.device:
 
 
 def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> dict[str, Scene]:
-    """Scenes to validate on: a procedural one of each category, that no stream draws, and the real ones, by name."""
+    """Scenes to validate on: a procedural one of each category, that no stream draws, and the real ones, by name.
+
+    Where an earlier scene has the name of a real one's folder, a number follows it.
+    """
     if not is_main_process():
         dist.barrier()  # the first process makes them
     scenes = {}
@@ -85,7 +88,13 @@ def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> d
         scenes[category] = load_scene(path)
     if is_distributed() and is_main_process():
         dist.barrier()
-    return scenes | {path.resolve().name: load_scene(path, width=VALIDATION_WIDTH) for path in real}
+    for path in sorted(path.resolve() for path in real):  # named alike in whatever order
+        name, number = path.name, 1
+        while name in scenes:
+            number += 1
+            name = f"{path.name}-{number}"
+        scenes[name] = load_scene(path, width=VALIDATION_WIDTH)
+    return scenes
 
 
 class Pretrainer(SceneTrainer):

@@ -157,9 +157,12 @@ def recipe(seed: int, number: int) -> Recipe:
     return Recipe(category, int(random.integers(1 << 31)), views, int(random.choice([224, 288, 352])), flight, misposed)
 
 
+def _take_one_core() -> None:
+    torch.set_num_threads(1)
+
+
 def make(given: Recipe, folder: Path) -> None:
     """Write a recipe's scene; the folder appears when it is complete."""
-    torch.set_num_threads(1)
     half = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(half, ignore_errors=True)
     survey = make_survey(given.category, given.seed, given.views, given.width, given.flight)
@@ -212,7 +215,7 @@ class Stream:
         together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # processes of torchrun on this machine
         self.makers = min(POOL_SIZE, max(1, cores() // (CORES_PER_MAKER * together)))
         # Processes, because making a scene keeps a core busy; spawned, because forking one with threads may hang.
-        self.maker = ProcessPoolExecutor(self.makers, get_context("spawn"), start_worker)
+        self.maker = ProcessPoolExecutor(self.makers, get_context("spawn"), start_worker, (_take_one_core,))
         folder.mkdir(parents=True, exist_ok=True)
         # Of a training that was ended: some may never be drawn.
         self.left = {int(path.name.split("-")[1]) for path in folder.glob(f"{seed}-*") if path.name[-6:].isdigit()}
