@@ -44,7 +44,6 @@ _TRUE_AREA = 0.01
 _NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")
 """How the names begin that programs give to what has none."""
 _IN_FEET = re.compile(r" \(ft\w*\)$")
-"""How names of vertical systems end that have a twin in metres."""
 _ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
 
@@ -92,7 +91,7 @@ class LocalFrame:
         name = _name(products)
         named = _vertical_name(system)
         if named is not None and not products.is_compound:
-            named = _IN_FEET.sub("", named)
+            named = name_in_metres(named)
         heights = vertical_datum or named or "unknown; heights are as they were given"
         frame = cls(0.0, 0.0, 0.0, name, heights)
         longitude, latitude, height = frame._geodetic(_name(system), np.array([origin], dtype=np.float64))[0]
@@ -367,6 +366,11 @@ def _vertical_name(crs: CRS) -> str | None:
     if crs.is_compound:
         return crs.sub_crs_list[1].name
     return f"the ellipsoid of {crs.name}" if crs.is_geographic and len(crs.axis_info) == 3 else None
+
+
+def name_in_metres(vertical: str) -> str:
+    """Return the name of a vertical system's twin in metres, which those in feet have, such as NAVD88 height (ftUS)."""
+    return _IN_FEET.sub("", vertical)
 
 
 def zero_of_heights(crs: CRS) -> str | None:

@@ -8,7 +8,6 @@ some 20 m of a tile the curvature of the Earth and of the projection stay below 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,16 +23,13 @@ from pyproj.exceptions import CRSError
 from tidefield.data.georeference import Georeference
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
-from tidefield.geometry.geodesy import LocalFrame, horizontal, in_metres, parse_crs
+from tidefield.geometry.geodesy import LocalFrame, horizontal, in_metres, name_in_metres, parse_crs
 from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
 LOCAL_WKT = f'LOCAL_CS["{LOCAL_NAME}",UNIT["unknown",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
-_IN_FEET = re.compile(r" \(ft\w*\)$")
-"""How names of vertical systems end that have a twin in metres."""
 OPEN_ZEROS = ("unknown", "mean sea level")
 """How the words for zeros of heights begin that a vertical system may still define."""
-"""Begins the vertical datum of a frame whose heights are as they were given."""
 FINEST = 0.9
 """Finest cells, as a share of the photographs' ground sampling distance: finer ones would show no more."""
 MOST_CELLS = 4_000_000_000
@@ -175,7 +171,7 @@ def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS |
 def _named(datum: str) -> CRS | None:
     """EPSG's vertical system in metres of a name; scenes have heights in metres, whatever their control was in."""
     names = {info.name: info.code for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS)}
-    code = names.get(_IN_FEET.sub("", datum))
+    code = names.get(name_in_metres(datum))
     found = None if code is None else CRS.from_epsg(int(code))
     return found if found is not None and in_metres(found) else None
 
