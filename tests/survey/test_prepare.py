@@ -367,7 +367,7 @@ def test_a_scene_without_georeference_and_rejected_control_show_on_the_terminal(
         assert warnings == (
             ["It is nowhere."]
             if nowhere
-            else [f"1 points and 2 further marks of ground control are left out; why, is in {scene / 'report.html'}"]
+            else [f"ground control: 1 point and 2 single marks left out; why, is in {scene / 'report.html'}"]
         )
 
 

@@ -104,7 +104,8 @@ def prepare(options: Prepare, console: Console) -> None:
         log.warning(located.notes[0])
     points, marks = (sum(item.kind == kind for item in located.left_out) for kind in ("control point", "mark"))
     if points or marks:
-        log.warning(f"{points} points and {marks} further marks of ground control are left out; why, is in {page}")
+        found = [f"{n} {what}{'s'[: n > 1]}" for n, what in ((points, "point"), (marks, "single mark")) if n]
+        log.warning(f"ground control: {' and '.join(found)} left out; why, is in {page}")
     missing = len(survey.photographs) - len(prepared.models[0])
     reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
     console.print(
