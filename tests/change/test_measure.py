@@ -430,15 +430,15 @@ def test_the_error_of_a_shift_on_a_slope_is_what_the_vertical_registration_leave
     assert found.net.systematic_m3 == pytest.approx(math.hypot(own * found.net.area_m2, whole), rel=0.03)
 
 
-@pytest.mark.parametrize(("shift", "told"), [("none", False), ("auto", False), ("auto", True)])
+@pytest.mark.parametrize(("shift", "found_by_pictures"), [("none", False), ("auto", False), ("auto", True)])
 def test_a_stated_error_of_the_shift_counts_on_slopes_unless_a_shift_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift: Literal["none", "auto"], told: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift: Literal["none", "auto"], found_by_pictures: bool
 ):
     earlier, later, _ = pair(tmp_path, 12, 0.0)
     for path in (earlier, later):
         with rasterio.open(path, "r+") as file:
             file.write((file.read(1) + 0.2 * np.arange(240, dtype=np.float32)), 1)  # 0.4 of cells of 0.5 m
-    tells = Shift(0.0, 0.0, 0.01, 50, 50, 0.5) if told else Shift(None, None, math.nan, 50, 3, 0.5)
+    tells = Shift(0.0, 0.0, 0.01, 50, 50, 0.5) if found_by_pictures else Shift(None, None, math.nan, 50, 3, 0.5)
     monkeypatch.setattr("tidefield.change.measure.find_shift", lambda *_: tells)
     surveys = [replace(open_surface(path), orthophoto=path) for path in (earlier, later)]
     found = measure(*surveys, Options(register="vertical", shift=shift, shift_error_m=0.05))
@@ -446,17 +446,17 @@ def test_a_stated_error_of_the_shift_counts_on_slopes_unless_a_shift_is_measured
     # A vertical registration takes out what the error does on the mean slope, which is all of this one.
     slope = Options(register="none", shift="none", datum_error_m=0.0, shift_error_m=0.05)
     assert measure(*surveys, slope).net.systematic_m3 == pytest.approx(0.4 * 0.05 * found.net.area_m2, rel=0.02)
-    assert found.errors.registration.shift_error_m == (0.01 if told else 0.05)
-    assert bare.errors.registration.shift_error_m == (0.01 if told else 0.0)
+    assert found.errors.registration.shift_error_m == (0.01 if found_by_pictures else 0.05)
+    assert bare.errors.registration.shift_error_m == (0.01 if found_by_pictures else 0.0)
     net = measure(*surveys, slope).net
     # What was stated is not widened for little stable ground.
     assert net.datum_m3 == pytest.approx(net.systematic_m3)
-    said = any("0.05 m that was stated" in limit for limit in limits(found))
-    assert said == (not told)
-    assert any("compared where they lie" in limit for limit in limits(bare)) == (not told)
+    mentioned = any("0.05 m that was stated" in limit for limit in limits(found))
+    assert mentioned == (not found_by_pictures)
+    assert any("compared where they lie" in limit for limit in limits(bare)) == (not found_by_pictures)
     remarks = " ".join(found.remarks)
-    assert ("0.05 m that was stated counts on slopes" in remarks) == (shift == "auto" and not told)
-    assert any("(--shift-error)" in remark for remark in bare.remarks) == (shift == "auto" and not told)
+    assert ("0.05 m that was stated counts on slopes" in remarks) == (shift == "auto" and not found_by_pictures)
+    assert any("(--shift-error)" in remark for remark in bare.remarks) == (shift == "auto" and not found_by_pictures)
 
 
 def test_polygons_that_cannot_be_read_are_found_before_heights_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
-from tidefield.change.surfaces import ChangeError, common_grid, open_surface, other_zeros, require_one_zero
-from tidefield.change.write import CHANGE_BANDS
+from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface, other_zeros, require_one_zero
+from tidefield.change.write import CHANGE_BANDS, _multi
 
 
 def plane(rows: int, columns: int, cell: float, west: float = WEST, north: float = NORTH) -> np.ndarray:
@@ -455,3 +456,26 @@ def test_values_beyond_all_heights_are_left_out_before_they_are_interpolated(tmp
         found = read(0, grid.rows)
     assert np.nanmax(np.abs(found)) < 10
     assert any(f"{value:g}" in remark for remark in surface.remarks)
+
+
+@pytest.mark.parametrize("step", [1, 2, 5])
+def test_cells_that_are_left_of_a_grid_stay_where_they_are(step: int):
+    grid = Grid(None, WEST, NORTH, 0.5, 23, 17)
+    thin = grid.thinned(step)
+    assert thin.shape == np.zeros(grid.shape)[::step, ::step].shape
+    middles = [
+        (g.west_m + (np.arange(g.columns) + 0.5) * g.cell_m, g.north_m - (np.arange(g.rows) + 0.5) * g.cell_m)
+        for g in (grid, thin)
+    ]
+    for every, left in zip(*middles, strict=True):
+        np.testing.assert_allclose(left, every[::step])
+
+
+def test_lines_of_a_layer_stay_lines_and_of_all_else_the_polygons_are_kept():
+    line, box = shapely.LineString([(0, 0), (3, 4)]), shapely.box(0, 0, 2, 2)
+    lines = shapely.MultiLineString([line, line])
+    mixed = shapely.GeometryCollection([line, box])
+    found = _multi([line, lines, box, mixed])
+    assert found[:2] == [line, lines]
+    assert [shape.geom_type for shape in found[2:]] == ["MultiPolygon"] * 2
+    assert [shape.area for shape in found[2:]] == [4.0, 4.0]

@@ -183,6 +183,7 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     scale = nmad(some) or float(some.std())
     if scale == 0:
         return UNCORRELATED
+    limit = _CLIP * scale
     sums: dict[int, np.ndarray] = {}
     longest = 0.0
     step = 1
@@ -192,7 +193,7 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
             known = np.isfinite(piece)
             if known.sum() < 100:
                 continue
-            values = np.where(known, np.clip(piece, -_CLIP * scale, _CLIP * scale), 0).astype(np.float64)
+            values = np.where(known, np.clip(piece, -limit, limit), 0).astype(np.float64)
             distance, gamma, pairs = _semivariances(values, known.astype(np.float64), cell_m * step)
             longest = max(longest, float(distance[pairs > 0].max(initial=0)))
             # Distances of few steps are taken from the finer grids only, where there are more pairs.
@@ -219,8 +220,7 @@ def fit_variogram(residuals: Float32[np.ndarray, "rows columns"], cell_m: float)
     lags, gammas, pairs = table[:, 2] / table[:, 0], table[:, 1] / table[:, 0], table[:, 0]
     every = 1 + math.isqrt(residuals.size // 1_000_000)
     # Like the shares of the variogram, of what is left of outliers.
-    clipped = np.clip(some, -_CLIP * scale, _CLIP * scale).std()
-    thinned = np.clip(residuals[::every, ::every], -_CLIP * scale, _CLIP * scale) / np.float32(clipped)
+    thinned = np.clip(residuals[::every, ::every], -limit, limit) / np.float32(np.clip(some, -limit, limit).std())
     fitted = _fitted(lags, gammas, pairs)
     if lags[0] > _RESOLVED_CELLS * cell_m and fitted.nugget > _LEAST_SILL:
         # What seems random may be shared by all that is nearer than what was measured.

@@ -166,8 +166,8 @@ def draw_stable_histogram(change: Change, what: str) -> Markup:
     figure = figure_of(5.0, 2.7)
     axes = figure.add_axes((0.11, 0.2, 0.86, 0.74))
     registration = change.errors.registration
-    reach = max(3 * Z95 / 2 * max(registration.after[2], registration.before[2]), 1e-3)
-    reach = max(reach, 1.2 * abs(registration.before[0]))
+    spread = max(registration.after[2], registration.before[2])
+    reach = max(3 * Z95 / 2 * spread, 1.2 * abs(registration.before[0]), 1e-3)
     edges = np.linspace(-reach, reach, 81)
     for values, colour, label in ((change.stable_before_dz, SOFT, "before"), (after, "#1f5f86", "after")):
         axes.hist(values, edges.tolist(), histtype="step", color=colour, label=label)

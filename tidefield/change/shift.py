@@ -87,8 +87,12 @@ def is_picture(dataset: Any) -> bool:
 def require_picture(path: Path) -> None:
     """Raises: ChangeError when a raster has no red, green and blue."""
     with opened(path) as dataset:
-        if not is_picture(dataset):
-            raise ChangeError(f"{path} is no orthophoto: expected a GeoTIFF with red, green and blue")
+        _require_colours(dataset, path)
+
+
+def _require_colours(dataset: Any, path: Path) -> None:
+    if not is_picture(dataset):
+        raise ChangeError(f"{path} is no orthophoto: expected a GeoTIFF with red, green and blue")
 
 
 def picture_grid(paths: tuple[Path, Path], grid: Grid, side: float = _SIDE) -> Grid:
@@ -109,8 +113,8 @@ def picture_grid(paths: tuple[Path, Path], grid: Grid, side: float = _SIDE) -> G
 
 def _pixel(path: Path, grid: Grid) -> float:
     """The longer side of an orthophoto's pixels on the ground, metres."""
-    require_picture(path)
     with opened(path) as dataset:
+        _require_colours(dataset, path)
         own = max(abs(dataset.transform.a), abs(dataset.transform.e))
         if dataset.crs is None or grid.crs is None:
             return own

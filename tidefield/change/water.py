@@ -166,9 +166,7 @@ def _below(earlier: np.ndarray, later: np.ndarray, level: float, half_m: float, 
 def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: tuple[float, float]) -> Waterline:
     grid = change.grid
     step = 1 + math.isqrt(grid.rows * grid.columns // _MOST_CELLS)
-    thin = Grid(grid.crs, grid.west_m, grid.north_m, grid.cell_m * step, 0, 0)
-    # The middle of the cells that are left lies where it lay.
-    offset = (0.5 - 0.5 * step) * grid.cell_m
+    thin = grid.thinned(step)
     known = np.isfinite(earlier)
     # Heights of water scatter around its level: what is above by no more than a cell's error is wet, too.
     margin = change.detection_m[1] / Z95 / math.sqrt(2)
@@ -176,7 +174,7 @@ def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: t
         _without_specks((h < level + margin) & known, known, grid)
         for h, level in zip((earlier, later), levels, strict=True)
     ]
-    lines = [_edges(w[::step, ::step], known[::step, ::step], thin, offset) for w in wet]
+    lines = [_edges(w[::step, ::step], known[::step, ::step], thin) for w in wet]
     gained, lost = (float((wet[a] & ~wet[b]).sum()) * grid.cell_area_m2 for a, b in ((0, 1), (1, 0)))
     length = float(np.mean([sum(part.length for part in part_of) for part_of in lines]))
     if not all(lines):
@@ -207,9 +205,7 @@ def _without_specks(
     return wet
 
 
-def _edges(
-    wet: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"], grid: Grid, offset_m: float
-) -> Lines:
+def _edges(wet: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows columns"], grid: Grid) -> Lines:
     """Lines between wet and dry cells; the edge of what is known is none."""
     from contourpy import LineType, contour_generator
 
@@ -220,8 +216,8 @@ def _edges(
     share = cv2.GaussianBlur((wet & known).astype(np.float32), (0, 0), _ROUNDED)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), _ROUNDED)
     masked = np.ma.masked_array(share / np.maximum(weight, np.float32(1e-6)), ~sure)
-    east = grid.west_m + offset_m + (np.arange(wet.shape[1]) + 0.5) * grid.cell_m
-    north = grid.north_m - offset_m - (np.arange(wet.shape[0]) + 0.5) * grid.cell_m
+    east = grid.west_m + (np.arange(wet.shape[1]) + 0.5) * grid.cell_m
+    north = grid.north_m - (np.arange(wet.shape[0]) + 0.5) * grid.cell_m
     generator = contour_generator(east, north, masked, line_type=LineType.Separate)
     parts = [np.asarray(line) for line in generator.lines(0.5)]
     lines = [shapely.LineString(shapely.LineString(part).simplify(0.5 * grid.cell_m).coords) for part in parts]

@@ -234,11 +234,7 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
     layers: list[Layer] = [("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
     step = 1 + math.isqrt(change.stable.size // 4_000_000)
     thin = change.stable[::step, ::step]
-    # The middle of the cells that are left lies where it lay.
-    offset = (0.5 - 0.5 * step) * change.grid.cell_m
-    west, north = change.grid.west_m + offset, change.grid.north_m - offset
-    coarse = Grid(change.grid.crs, west, north, change.grid.cell_m * step, thin.shape[1], thin.shape[0])
-    ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), coarse, thin)]
+    ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), change.grid.thinned(step), thin)]
     ground = sorted(ground, key=lambda shape: -shape.area)[:_MOST_POLYGONS_OF_GROUND]
     layers.append(("stable ground", ground, [{"area_m2": shape.area} for shape in ground]))
     layers.append(

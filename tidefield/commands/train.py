@@ -308,7 +308,7 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
 
 
 def _warn_of_whole(root: Path, options: Train) -> None:
-    """Warn where a network that encodes photographs whole may need more memory than there is, which ends it unheard."""
+    """Warn of the memory of a network that encodes photographs whole: where it runs out, nothing else says why."""
     from tidefield.data.load import own_lens, read_posed
     from tidefield.train.stream import WHOLE_WIDTHS
 

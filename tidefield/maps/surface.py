@@ -404,7 +404,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
             height = _likelier(used, grey, factor, east, north, height, expected, gaps, step)
     matching = score = np.zeros_like(height)
     for share, half in SWEEPS:
-        offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
+        offsets = _offsets(step * share, half)
         found, matching, score = _sweep(used, grey, factor, east, north, height, offsets)
         height = _cleaned(found, matching, height, step * share)
     matching = np.nan_to_num(matching, nan=10 * step).astype(np.float32)
@@ -476,7 +476,7 @@ def _likelier(
         step: between heights that are tried.
     """
     share, half = SWEEPS[0]
-    offsets = (step * share * np.arange(-half, half + 1)).astype(np.float32)
+    offsets = _offsets(step * share, half)
     fits = []
     for start in (filled, expected):
         score = _sweep(used, grey, factor, east, north, start, offsets)[2]
@@ -486,6 +486,11 @@ def _likelier(
     better = (gaps & (fits[1] > fits[0] + LIKELIER)).astype(np.float32)
     weight = gaps * cv2.GaussianBlur(better, (0, 0), GAP_CELLS / 2)
     return (filled + weight * (expected - filled)).astype(np.float32)
+
+
+def _offsets(step: float, half: int) -> Float32[np.ndarray, " K"]:
+    """Heights that are tried above and below a surface."""
+    return (step * np.arange(-half, half + 1)).astype(np.float32)
 
 
 def _sweep(
