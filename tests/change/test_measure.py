@@ -350,6 +350,19 @@ def test_a_tilt_is_found(tmp_path: Path):
     assert np.nanstd(found.dz) < 0.03
 
 
+def test_a_change_smaller_than_the_tilt_is_found_where_stable_ground_is_not_given(tmp_path: Path):
+    earlier, later, truth = pair(tmp_path, 9, 0.1)
+    with rasterio.open(later, "r+") as file:
+        tilted = file.read(1) + 0.004 * 0.5 * np.arange(240)[None] - 0.002 * 0.5 * np.arange(200)[:, None]
+        file.write(tilted.astype(np.float32), 1)
+    found = measured(earlier, later, options=Options(register="tilt"))
+    _, gx, gy = found.errors.registration.coefficients
+    assert (gx, gy) == pytest.approx((0.004, 0.002), abs=2e-4)
+    for volume, sign in ((found.cut, -1), (found.fill, 1)):
+        low, high = volume.interval_m3
+        assert low < float((sign * truth).clip(min=0).sum()) * AREA < high
+
+
 def test_after_a_tilt_cells_far_out_share_a_larger_error(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 9, 0.0)
     ring = Region("all", shapely.box(WEST, NORTH - 100, WEST + 120, NORTH))

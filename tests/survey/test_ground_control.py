@@ -278,6 +278,16 @@ def test_many_points_marked_once_adjust_the_model_unless_differential_positions_
         located(accurate, replace(marked_once(with_control(accurate)), photographs=fixed))
 
 
+def test_points_marked_once_that_do_not_fit_the_positions_are_to_be_marked_twice():
+    far = fly(position_m=0.3)
+    moved = with_control(far)
+    assert moved.control is not None
+    points = {name: (x + 20, y, z) for name, (x, y, z) in moved.control.points.items()}
+    survey = replace(moved, control=replace(moved.control, points=points))
+    with pytest.raises(SurveyError, match=r"of no point do two marks fit together: mark each in two photographs"):
+        located(far, marked_once(survey))
+
+
 def test_one_point_without_positions_is_too_few(flight):
     survey = without_positions(with_control(flight, CONTROL[:1]))
     with pytest.raises(SurveyError, match="expected two such points"):

@@ -289,6 +289,12 @@ def test_errors_count_only_what_was_used(tmp_path):
     assert table["tidefield"]["georeference"]["placed_by"] == "GPS of 2 photographs"
 
 
+@pytest.mark.parametrize(("count", "words"), [(1, "1 control point"), (8, "8 control points")])
+def test_control_points_of_one_mark_are_counted_that_have_no_residuals(count, words):
+    found = replace(located(), source="ground control", control_world=np.zeros((count, 3)))
+    assert findings(georeference=found).placed_by == words
+
+
 @pytest.mark.parametrize(("sees_falloff", "after"), [(True, 6.0), (False, 7.0)])
 def test_the_difference_that_was_reached_is_reported_not_that_of_a_falloff_that_was_not_removed(
     tmp_path, sees_falloff, after

@@ -29,6 +29,7 @@ from tidefield.change.registration import (
     centre,
     covariance,
     fit,
+    lowered,
     statistics,
 )
 from tidefield.change.repeats import repeated, rounding_m
@@ -388,7 +389,7 @@ def _settle(
     Args:
         rounding: one sigma of what the rounding of heights does to dz, metres; errors are at least as large.
     """
-    ground = guess = _unchanged(dz, own, rounding) if given is None else given
+    ground = guess = _unchanged(dz, own, grid, model, rounding) if given is None else given
     turns = _TURNS if given is None else 1
     found = None
     for turn in range(turns):
@@ -400,12 +401,8 @@ def _settle(
             )
         coefficients = fit(dz, ground, grid, model, rounding)
         before = statistics(_sampled(dz, ground))
-        bare = Registration(model, coefficients, np.zeros((3, 3)), centre(grid), cells, before, before)
-        # Residuals over stable ground only: everything else is NaN.
-        residual = np.full(grid.shape, np.nan, np.float32)
-        for rows in grid.strips():
-            inside = ground[rows]
-            residual[rows][inside] = (dz[rows] - bare.plane(grid, rows))[inside]
+        residual = lowered(dz, coefficients, grid)
+        residual[~ground] = np.nan
         left = fit(residual, ground, grid, "vertical", rounding)[0] if model == "none" else 0.0
         after = statistics(_sampled(residual, ground))
         if own is not None:
@@ -443,9 +440,7 @@ def _settle(
         )
         if is_last:
             return found, variogram, sigma, ground
-        moved = np.empty_like(dz)
-        for rows in grid.strips():
-            moved[rows] = dz[rows] - found.plane(grid, rows)
+        moved = lowered(dz, coefficients, grid)
         outlines = find_outlines(moved, sigma, found.near(grid), variogram, grid.cell_m, options.windows)
         del moved
         ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
@@ -495,9 +490,26 @@ def _leave_out_repeated(
 
 
 def _unchanged(
+    dz: Float32[np.ndarray, "rows columns"],
+    own: Float32[np.ndarray, "rows columns"] | None,
+    grid: Grid,
+    model: Model,
+    rounding: float,
+) -> Bool[np.ndarray, "rows columns"]:
+    """Ground where no change stands out from what most of it has in common, as a first guess."""
+    if model != "tilt":
+        return _even_part(dz, own, rounding)
+    # A change may be less than what a tilt does at the edges, and moves the plane until it is left out.
+    ground = np.isfinite(dz)
+    for _ in range(_TURNS):
+        ground = _even_part(lowered(dz, fit(dz, ground, grid, model, rounding), grid), own, rounding)
+    return ground
+
+
+def _even_part(
     dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None, rounding: float
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Ground where no window's mean stands out from what most windows have in common, as a first guess."""
+    """Ground where no window's mean stands out from what most windows have in common."""
     known = np.isfinite(dz)
     ground = known
     least = rounding if own is None else rounding / float(np.median(_sampled(own, known)))

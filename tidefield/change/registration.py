@@ -70,8 +70,7 @@ class Registration:
 
     def plane(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """What was subtracted, for some rows of a grid."""
-        x, y = offsets(grid, self.centre_m, rows)
-        return self._lift(x[None], y[:, None]).astype(np.float32)
+        return _plane(self.coefficients, self.centre_m, grid, rows)
 
     def deviation(self, grid: Grid, rows: slice) -> Float32[np.ndarray, "rows columns"]:
         """One sigma of the systematic error of each cell, for some rows of a grid."""
@@ -90,10 +89,8 @@ class Registration:
 
     def lift_at(self, xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, " N"]:
         """What is taken from the later heights at places in the grid's system, metres."""
-        return self._lift(*(xy - self.centre_m).T)
-
-    def _lift(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         c, gx, gy = self.coefficients
+        x, y = (xy - self.centre_m).T
         return c + gx * x + gy * y
 
     def _deviation(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -203,6 +200,24 @@ def covariance(
     if datum_error_m is not None:
         found[0, 0] += datum_error_m**2
     return found
+
+
+def lowered(
+    dz: Float32[np.ndarray, "rows columns"], coefficients: tuple[float, float, float], grid: Grid
+) -> Float32[np.ndarray, "rows columns"]:
+    """dz without the shift or plane that `fit` found."""
+    out = np.empty_like(dz)
+    for rows in grid.strips():
+        out[rows] = dz[rows] - _plane(coefficients, centre(grid), grid, rows)
+    return out
+
+
+def _plane(
+    coefficients: tuple[float, float, float], centre_m: tuple[float, float], grid: Grid, rows: slice
+) -> Float32[np.ndarray, "rows columns"]:
+    c, gx, gy = coefficients
+    x, y = offsets(grid, centre_m, rows)
+    return (c + gx * x[None] + gy * y[:, None]).astype(np.float32)
 
 
 def statistics(values: Float32[np.ndarray, " N"]) -> tuple[float, float, float]:

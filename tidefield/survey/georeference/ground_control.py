@@ -274,10 +274,11 @@ def fit_control(
     similarity = min(candidates, key=lambda one: float((np.minimum(_share(model, marks, one), 1) ** 2).sum()))
     agree = _share(model, marks, similarity) < 1
     if 2 * np.count_nonzero(agree) < len(marks):
+        more = "" if len(source) else "; of no point do two marks fit together: mark each in two photographs or more"
         raise SurveyError(
             f"only {np.count_nonzero(agree)} of the {len(marks)} marks of ground control fit together with the "
             "photographs: expected most of them; check the coordinate reference system, the order of the coordinates, "
-            "the names of the points and what size of photograph the marks were made on"
+            f"the names of the points and what size of photograph the marks were made on{more}"
         )
     source, target = _pairs(model, marks.where(agree))
     sigma = np.full_like(target, _CONTROL_M)

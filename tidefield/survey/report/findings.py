@@ -120,7 +120,8 @@ class Findings:
         located = self.georeference
         gps = f"GPS of {len(located.gps_used.names)} photographs"
         if located.source == "ground control":
-            return f"{len(located.control.names)} control points" + (f", {gps}" if located.gps_used.names else "")
+            count = len(located.control_world)
+            return f"{count} control point{'s'[: count != 1]}" + (f", {gps}" if located.gps_used.names else "")
         return gps if located.source == "GPS" else ""
 
     def comparisons(self) -> tuple[Comparison, ...]:
