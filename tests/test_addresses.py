@@ -242,6 +242,15 @@ def test_a_file_system_without_versions_is_refused(bucket: Path, monkeypatch: py
         pull(copy_of("memory://scene"))
 
 
+def test_a_single_file_that_is_listed_without_its_size_is_copied(bucket: Path, monkeypatch: pytest.MonkeyPatch):
+    memory = MemoryFileSystem()
+    memory.pipe("/alone.tif", b"heights")
+    monkeypatch.setattr(MemoryFileSystem, "find", lambda self, root, detail: {root: {}})
+    path = copy_of("memory://alone.tif")
+    pull(path)
+    assert path.read_bytes() == b"heights"
+
+
 def test_more_than_the_disk_has_room_for_is_not_copied(bucket: Path, monkeypatch: pytest.MonkeyPatch):
     write(bucket, **{"scene/a.txt": "one"})
     monkeypatch.setattr(addresses.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 2}))

@@ -380,6 +380,7 @@ def _listing(system: Any, root: str, address: str) -> dict[str, _There]:
         found = system.find(root, detail=True)
     files = {}
     for name, info in found.items():
+        info = info or system.info(name)  # some list a single file without what they know of it
         part = name.removeprefix(root).lstrip("/")
         if info["type"] == "file" and not name.endswith("/"):  # S3's folders are empty files
             if part:

@@ -190,7 +190,7 @@ def test_clouds_over_different_zeros_are_refused(tmp_path: Path):
     xyz = square(np.random.default_rng(0), 20.0) + np.array([450_000.0, 5_930_000.0, 2.0])
     one = write_cloud(tmp_path / "a.laz", "EPSG:25832+7837", xyz)
     other = write_cloud(tmp_path / "b.laz", "EPSG:25832+5783", xyz)
-    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
+    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one vertical datum"):
         open_pair(one, other, tmp_path)
 
 
@@ -202,7 +202,7 @@ def test_clouds_over_two_ellipsoids_are_remarked_and_refused_without_registratio
     )
     found = open_pair(one, other, tmp_path)
     assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (other_zeros(found.earlier, found.later) or "")
-    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one zero"):
+    with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one vertical datum"):
         open_pair(one, other, tmp_path, registered=False)
 
 

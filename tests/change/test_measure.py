@@ -58,10 +58,11 @@ def test_heights_over_other_zeros_are_refused_where_nothing_takes_the_difference
     surfaces = [open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]]
     one, other = (replace(surface, datum=datum) for surface, datum in zip(surfaces, ("sea", "take-off"), strict=True))
     asked = Options(register="none", datum_error_m=0.02)
-    with pytest.raises(ChangeError, match=r"other zeros: sea and take-off.*leave --register none out"):
+    with pytest.raises(ChangeError, match=r"different vertical datums: sea and take-off.*leave --register none out"):
         measure(one, other, asked)
-    assert not any("zeros" in remark for remark in measure(one, replace(other, datum="sea"), asked).remarks)
-    assert "heights are over other zeros: sea and take-off; only stable ground" in " ".join(measure(one, other).remarks)
+    assert not any("datums" in remark for remark in measure(one, replace(other, datum="sea"), asked).remarks)
+    remarks = " ".join(measure(one, other).remarks)
+    assert "heights are over different vertical datums: sea and take-off; only stable ground" in remarks
 
 
 def test_a_shift_of_all_heights_is_taken_out_over_stable_ground(tmp_path: Path):

@@ -42,6 +42,23 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray
     return folder / "out", truth
 
 
+def test_levels_are_heights_on_the_earth_in_the_unit_of_the_survey(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    import rasterio
+
+    earlier, later, _ = pair(tmp_path, 0, 0.1)
+    message = fails(capsys, monkeypatch, "change", earlier, later, tmp_path / "out", "--levels", 9500)
+    assert "a level of 9500 was asked for, 9,500 m: expected a height on the Earth" in message
+    for path in (earlier, later):
+        with rasterio.open(path, "r+") as file:
+            file.write(1000 * file.read())
+            file.units = ("mm",)
+    monkeypatch.setattr("tidefield.change.measure.measure", lambda *_, **__: pytest.fail("measured"))
+    with pytest.raises(pytest.fail.Exception, match="measured"):
+        call("change", earlier, later, tmp_path / "out", "--levels", 9500)
+
+
 def test_the_rasters_are_cloud_optimized_and_have_what_their_bands_say(compared: tuple[Path, np.ndarray]):
     import rasterio
     from rio_cogeo.cogeo import cog_validate

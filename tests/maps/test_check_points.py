@@ -167,7 +167,7 @@ def test_heights_over_a_geoid_do_not_check_a_map_over_the_ellipsoid(
     frame = replace(map_frame(scene, None), frame=local, heights=local.vertical_datum, wkt=wkt)
     (tmp_path / "check.txt").write_text(f"{crs}\n1 2 3 peg\n")
     if refused:
-        with pytest.raises(RunError, match="those of the map over the WGS 84 ellipsoid: expected one zero"):
+        with pytest.raises(RunError, match="those of the map over the WGS 84 ellipsoid: expected one vertical datum"):
             read_check_points(tmp_path / "check.txt", scene, frame)
     else:
         assert len(read_check_points(tmp_path / "check.txt", scene, frame)) == 1

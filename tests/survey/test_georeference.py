@@ -299,7 +299,7 @@ def test_heights_over_another_zero_do_not_tilt_the_model(first, accuracies, kept
     model, found = located(flight, over_two_zeros(flight.survey, first, **accuracies))
     assert found.gps.names == tuple(map(name_of, kept))
     assert f"{20 - len(kept)} of 20 positions are not used: their heights are over" in found.notes[0]
-    assert "an unknown zero (ppk.csv)" in found.notes[0]
+    assert "an unknown datum (ppk.csv)" in found.notes[0]
     assert found.frame.vertical_datum.startswith("unknown" if kept[0] else "mean sea level")
     off = off_m(flight, model, found.frame)[:, 2]
     spread_m = np.ptp(flight.centres_world[:, 1])
@@ -349,7 +349,7 @@ def test_two_heights_over_each_of_two_zeros_are_too_few():
     survey = over_two_zeros(fly(lines=1, each=4).survey, 2)
     given = given_positions(survey.photographs)
     assert len(given.names) == 4
-    assert "Only 2 of 4 positions have a height over one zero" in given.notes[0]
+    assert "Only 2 of 4 positions have a height over one vertical datum" in given.notes[0]
 
 
 @pytest.mark.parametrize(("slope_deg", "noted"), [(1.0, False), (3.0, True)])

@@ -195,7 +195,7 @@ def test_heights_of_a_flight_without_rtk_that_was_corrected_are_not_mixed_with_t
     assert given.names == tuple(f"{k:02d}.jpg" for k in range(20))
     assert "10 of 30 positions are not used" in given.notes[0]
     assert (
-        "over an unknown zero (EXIF after the flight), those of the others over an unknown zero (EXIF)"
+        "over an unknown datum (EXIF after the flight), those of the others over an unknown datum (EXIF)"
         in given.notes[0]
     )
 

@@ -151,6 +151,16 @@ def nmad(values: Float[np.ndarray, " N"]) -> float:
     return NMAD * float(np.median(np.abs(values - np.median(values))))
 
 
+def colour_limit(sizes: Float[np.ndarray, " N"], detection_m: float) -> float:
+    """Size of change at the ends of a map's colours, metres: all but the largest 1%, and errors are pale.
+
+    Args:
+        sizes: of change, metres.
+        detection_m: the usual level of detection.
+    """
+    return max(float(np.quantile(sizes, 0.99)) if len(sizes) else 0.0, 2 * detection_m)
+
+
 def deviation95(values: Float[np.ndarray, " N"]) -> float:
     """The deviation that makes 5% of values significant: the 95% quantile of their size over 1.96.
 

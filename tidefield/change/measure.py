@@ -231,7 +231,7 @@ def measure(
         if options.register == "none":
             raise ChangeError(
                 f"{earlier.file} and {later.file} cannot be compared without registration: {zeros}; expected "
-                "one zero; convert one of them first (gdalwarp), leave --register none out, or, if they are one zero, "
+                "one; convert one of them first (gdalwarp), leave --register none out, or, if they are the same one, "
                 "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
             )
         remarks.append(f"{zeros}; only stable ground takes the difference")

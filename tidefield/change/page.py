@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tidefield.change.cover import Cover
+from tidefield.change.errors import colour_limit
 from tidefield.change.figures import (
     HIGHER,
     LOWER,
@@ -52,7 +53,7 @@ def write_page(
         "percent": lambda value: f"{100 * value:.1f}%",
     }
     small = thinned(change)
-    limit = max(float(np.nanquantile(np.abs(small.dz), 0.99)), 2 * change.detection_m[1])
+    limit = colour_limit(np.abs(small.dz[np.isfinite(small.dz)]), change.detection_m[1])
     earlier, later = change.earlier.name, change.later.name
     named = f"between {earlier} and {later}"
     rows = outline_rows(change)

@@ -431,7 +431,7 @@ def other_zeros(earlier: Surface, later: Surface) -> str | None:
     if one is None or other is None or one == other:
         return None
     apart = ", up to two metres apart" if one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID) else ""
-    return f"heights are over other zeros{apart}: {one} and {other}"
+    return f"heights are over different vertical datums{apart}: {one} and {other}"
 
 
 def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:
@@ -581,7 +581,7 @@ def require_one_zero(zeros: Sequence[tuple[Path, str | None]], registered: bool 
         (one, first), (other, second), *_ = heights.items()
         both = one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID)
         raise ChangeError(
-            f"heights of {first.name} are over {one}, those of {second.name} over {other}: expected one zero "
+            f"heights of {first.name} are over {one}, those of {second.name} over {other}: expected one vertical datum "
             f"for both; convert one of them first (gdalwarp -t_srs with a {'3D' if both else 'compound'} system)"
             f"{', or leave --register none out' if both else ''}"
         )

@@ -220,6 +220,12 @@ def _measured(
     registered = options.register != "none"
     pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2, registered)
     earlier, later = pair.earlier, pair.later
+    for level in (*(options.water or ()), *options.levels):
+        if not -12_000 < level * earlier.metres < 9_000:
+            raise RunError(
+                f"a level of {level:g} was asked for, {level * earlier.metres:,.0f} m: expected a height on the Earth, "
+                f"in the unit of {earlier.file}; choose another"
+            )
     if options.orthophotos is not None:
         for path in options.orthophotos:
             require_picture(path)
@@ -384,9 +390,6 @@ def _check(options: Change) -> None:
             raise RunError(f"{name} was given with --series: it belongs to two surveys; leave it out")
     if not 64 <= options.view_width <= 8192:
         raise RunError(f"--view-width {options.view_width} was asked for: expected 64 to 8192 pixels; choose another")
-    for level in (*(options.water or ()), *options.levels):
-        if not -12_000 < level < 9_000:
-            raise RunError(f"a level of {level} m was asked for: expected a height on the Earth; choose another")
     for given_date in options.dates or ():
         try:
             known = date.fromisoformat(given_date).isoformat() == given_date  # it reads other forms, too

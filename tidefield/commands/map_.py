@@ -28,8 +28,8 @@ class Map:
     """Map a survey: true orthophoto, surface model with its standard error, and point cloud, in ODM's folders.
 
     All photographs of the scene are sources, held-out ones too. The orthophoto is rendered straight down by parallel
-    rays; heights are matched at the photographs' own resolution. Cells that fewer than two photographs see are empty.
-    Ctrl-C loses at most the running tiles; the same command continues.
+    rays; heights are matched at the photographs' own resolution, or at that of --gsd if it is coarser. Cells that fewer
+    than two photographs see are empty. Ctrl-C loses at most the running tiles; the same command continues.
     """
 
     source: Annotated[Positional[Path], arg(metavar="RUN|SCENE")]

@@ -48,7 +48,7 @@ class Prepare:
     """Keep every eighth photograph out of poses, points and colours, and place it afterwards: for figures that owe
     nothing to what is held out. Make maps and other products without it."""
     colour: Literal["auto", "on", "off"] = "auto"
-    """Correct exposures and the lens' falloff: where it helps, always, or never."""
+    """Correct exposures: where it helps, always, or never. The lens' falloff is corrected with them, where it helps."""
     features: int = 6000
     """Most features to find in a photograph: 100 to 50000."""
     feature_width: int = 2400

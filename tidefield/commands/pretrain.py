@@ -36,7 +36,7 @@ class Pretrain:
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Folder for the result; must be new, unless --resume is given."""
     real: tuple[Path, ...] = ()
-    """Scenes to learn from, too; only their training photographs are used."""
+    """Scenes whose training photographs are learned from, too. Two held-out ones of each are validated on."""
     preset: Preset = "swift"
     variant: str | None = None
     """Of the preset, as `tidefield ablate` names them, to find out what a part brings."""

@@ -177,7 +177,8 @@ def _require_one_zero(path: Path, crs: str, frame: MapFrame) -> None:
         )
     elif zero != own:
         raise SurveyError(
-            f"its heights are over {zero}, those of the map over {own}: expected one zero; convert the points first"
+            f"its heights are over {zero}, those of the map over {own}: expected one vertical datum; convert the "
+            "points first"
         )
 
 

@@ -154,8 +154,8 @@ def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS |
         if other:
             raise RunError(
                 f"--heights {given} is {crs.name}, but the scene's heights are over {datum}: expected the option only "
-                "where their zero is not known; leave it out, and convert the map's files (gdalwarp -t_srs with a "
-                "compound system)"
+                "where their vertical datum is not known; leave it out, and convert the map's files (gdalwarp -t_srs "
+                "with a compound system)"
             )
         if stated is not None:
             return stated

@@ -101,7 +101,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
             notes.append(
                 f"{len(others)} of {count} positions are not used: their heights are over "
                 f"{' and '.join(sorted(set(others)))}, those of the others over {zero}. To have them used, give all "
-                "positions in one file, with heights over one zero."
+                "positions in one file, with heights over one vertical datum."
             )
     elif len(relative) >= enough:
         located, heights = relative, [photograph.relative_altitude_m for photograph, _ in relative]
@@ -111,9 +111,9 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         datum = "the mean height of flight, since too few photographs have heights"
         if absolute or relative:
             notes.append(
-                f"Only {max(len(absolute), len(relative))} of {count} positions have a height over one zero: all are "
-                "taken to be at one height. To have these heights used, add those of the others, or remove the others' "
-                "positions."
+                f"Only {max(len(absolute), len(relative))} of {count} positions have a height over one vertical datum: "
+                "all are taken to be at one height. To have these heights used, add those of the others, or remove the "
+                "others' positions."
             )
     if without:
         notes.append(f"{without} of {count} positions are not used: they have no height, unlike the others.")
@@ -164,7 +164,7 @@ def _zero(position: Position) -> str:
     if position.datum == "ellipsoid":
         return "the ellipsoid"
     source = position.source.partition(", ")[0].replace("XMP", "EXIF")
-    return f"{'an unknown zero' if position.datum == 'unknown' else position.datum} ({source})"
+    return f"{'an unknown datum' if position.datum == 'unknown' else position.datum} ({source})"
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ def fit_positions(
     if not notes and down.source == _GIMBALS and tilt_deg > _MAX_GIMBAL_TILT_DEG:
         notes = (
             f"The vertical by the cameras' positions is {tilt_deg:.1f} degrees off that of the gimbals: some heights "
-            "may be wrong, or count from another zero.",
+            "may be wrong, or be over another vertical datum.",
         )
     error = similarity(centres) - given
     spread_m = rms_m((given[used] - given[used].mean(0))[:, :2])
