@@ -142,6 +142,7 @@ def test_the_report_shows_the_map_without_the_network(out: Path):
     assert page.count("data:image/png;base64,") == 5
     assert "http://" not in page
     assert "not georeferenced" in page
+    assert "height (units)" in page
     assert "how far this map is from surveyed points is not known" in page
 
 

@@ -1,4 +1,4 @@
-"""Plants gained and lost, from the orthophotos of both surveys after evening their light.
+"""Plants gained and lost, from the orthophotos of both surveys after correcting their exposures.
 
 A place is covered where its mean colour is greener than bare ground's by a margin, unless it lies in a patch that is as
 smooth as bare ground: green films and shallow water have no leaves that shade each other. Bare ground is the lowest of

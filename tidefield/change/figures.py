@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 from markupsafe import Markup
-from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -22,29 +18,14 @@ from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
 from tidefield.change.water import Waterline
+from tidefield.maps.figures import INCHES, INK, RULE, SOFT, Extent, figure_of, map_of, png
 
 LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
 GAINED, LOST = "#1a7a3c", "#b8742a"
-INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
 _SIDE = 1400
 """Longest side of a map, cells."""
-_INCHES = 7.6
-_DPI = 130
 _SUN = np.array([-1, 1, 1.4]) / np.linalg.norm([-1, 1, 1.4])
 """From the north-west."""
-_STYLE: list[Any] = [
-    "default",
-    {
-        "font.size": 9.5,
-        "text.parse_math": False,
-        "text.color": INK,
-        "axes.edgecolor": SOFT,
-        "axes.labelcolor": SOFT,
-        "xtick.color": SOFT,
-        "ytick.color": SOFT,
-        "axes.linewidth": 0.8,
-    },
-]
 
 
 @dataclass(frozen=True)
@@ -102,8 +83,7 @@ def hillshade(heights: Float32[np.ndarray, "rows columns"], cell_m: float) -> Fl
 
 def draw_change(small: Thinned, limit_m: float, what: str) -> Markup:
     """The map of dz over the earlier survey's relief, with the outlines."""
-    figure, axes = _map(small.grid)
-    _relief(axes, small)
+    figure, axes = _map(small)
     dz = small.dz.clip(-limit_m, limit_m)
     alpha = np.where(np.isfinite(dz), 0.15 + 0.8 * np.minimum(np.abs(np.nan_to_num(dz)) / (0.5 * limit_m), 1), 0)
     image = axes.imshow(
@@ -121,8 +101,7 @@ def draw_change(small: Thinned, limit_m: float, what: str) -> Markup:
 
 def draw_stable(small: Thinned, what: str) -> Markup:
     """The map of the ground that shift and errors were measured on."""
-    figure, axes = _map(small.grid)
-    _relief(axes, small)
+    figure, axes = _map(small)
     cover = np.where(small.stable, 1.0, np.nan)
     axes.imshow(cover, cmap=ListedColormap([STABLE]), alpha=0.55, extent=_extent(small.grid), interpolation="nearest")
     axes.legend(handles=[Patch(color=STABLE, alpha=0.55, label="stable ground")], loc="lower left", framealpha=0.9)
@@ -133,8 +112,7 @@ def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
     """The map of plants gained, lost and at both dates over the earlier survey's relief."""
     step = -(-max(cover.grid.shape) // _SIDE)
     classes = cover.classes[::step, ::step]
-    figure, axes = _map(small.grid)
-    _relief(axes, small)
+    figure, axes = _map(small)
     handles = []
     for code, colour, label in ((2, "#b9c8a0", "plants at both dates"), (1, GAINED, "gained"), (-1, LOST, "lost")):
         shown = np.where(classes == code, 1.0, np.nan)
@@ -146,8 +124,7 @@ def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
 
 def draw_waterlines(line: Waterline, small: Thinned, names: tuple[str, str], what: str) -> Markup:
     """Both waterlines over the earlier survey's relief."""
-    figure, axes = _map(small.grid)
-    _relief(axes, small)
+    figure, axes = _map(small)
     for lines, colour, name, level in zip(line.lines, (INK, HIGHER), names, line.levels_m, strict=True):
         for k, part in enumerate(lines):
             x, y = np.asarray(part.coords).T[:2]
@@ -207,7 +184,7 @@ def draw_section(change: Change, row: int, what: str) -> Markup:
     later = earlier + change.dz[row]
     band = Z95 * change.errors.cell_sigma(slice(row, row + 1))[0]
     x = (np.arange(grid.columns) + 0.5) * grid.cell_m
-    figure = figure_of(_INCHES, 2.5)
+    figure = figure_of(INCHES, 2.5)
     axes = figure.add_axes((0.08, 0.22, 0.9, 0.73))
     axes.fill_between(x, later - band, later + band, color=HIGHER, alpha=0.25, linewidth=0)
     axes.plot(x, earlier, color=INK, linewidth=0.9, label=change.earlier.name)
@@ -218,38 +195,14 @@ def draw_section(change: Change, row: int, what: str) -> Markup:
     return png(figure, what)
 
 
-def figure_of(width: float, height: float) -> Figure:
-    """An empty figure in the style of the pages, inches."""
-    with style.context(_STYLE):
-        return Figure(figsize=(width, height), dpi=_DPI)
-
-
-def _map(grid: Grid) -> tuple[Figure, Axes]:
-    aspect = min(1.5, max(0.25, grid.rows / grid.columns))
-    with style.context(_STYLE):
-        figure = Figure(figsize=(_INCHES, _INCHES * 0.86 * aspect + 0.5), dpi=_DPI, layout="constrained")
-        axes = figure.add_subplot()
-    axes.ticklabel_format(useOffset=False, style="plain")
-    axes.locator_params(nbins=5)
-    axes.tick_params(labelsize=8)
-    axes.set_aspect("equal")
+def _map(small: Thinned) -> tuple[Figure, Axes]:
+    """A map of the earlier survey's relief."""
+    figure, axes = map_of(*small.grid.shape)
+    shade = hillshade(small.heights, small.grid.cell_m)
+    axes.imshow(0.45 + 0.5 * shade, cmap="gray", vmin=0, vmax=1, extent=_extent(small.grid), interpolation="nearest")
     return figure, axes
 
 
-def _relief(axes: Axes, small: Thinned) -> None:
-    shade = hillshade(small.heights, small.grid.cell_m)
-    axes.imshow(0.45 + 0.5 * shade, cmap="gray", vmin=0, vmax=1, extent=_extent(small.grid), interpolation="nearest")
-
-
-def _extent(grid: Grid) -> tuple[float, float, float, float]:
+def _extent(grid: Grid) -> Extent:
     west, south, east, north = grid.bounds
     return west, east, south, north
-
-
-def png(figure: Figure, what: str) -> Markup:
-    """An image element with the picture in it."""
-    buffer = io.BytesIO()
-    with style.context(_STYLE):
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(what, data)

@@ -1,4 +1,4 @@
-"""Even the light of two pictures of one place: what is left of their difference is not of exposure or white balance."""
+"""Give two pictures of one place the same exposure and white balance, so that their difference has no part in these."""
 
 from __future__ import annotations
 

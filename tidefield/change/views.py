@@ -197,8 +197,8 @@ def _compared(
     planted = np.zeros(shape, int) if cover is None else _sampled(cover.classes, cover.grid, place, 0).reshape(shape)
     steady = seen & known & (sign == 0) & (planted != 1) & (planted != -1)
     gains = light_gains(one, other, steady if steady.any() else seen)
-    evened = with_light(other, gains)
-    kinds = colour_kinds(one, evened, steady)
+    relit = with_light(other, gains)
+    kinds = colour_kinds(one, relit, steady)
     for where, kind in (
         (planted == -1, LOST),
         (planted == 1, GAINED),
@@ -207,7 +207,7 @@ def _compared(
         (~seen | ~known, UNKNOWN),
     ):
         kinds[where] = kind
-    return View(name, one, evened, kinds)
+    return View(name, one, relit, kinds)
 
 
 def _sampled(values: np.ndarray, grid: Grid, place: Float64[np.ndarray, "P 2"], outside: int) -> np.ndarray:

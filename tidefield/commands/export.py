@@ -22,7 +22,7 @@ class Export:
     """Export a run, or with --zero-shot a scene, as Gaussians (PLY, as in 3D Gaussian splatting).
 
     Every pixel of the training photographs' views becomes a flat Gaussian, unless other views see through it; nothing
-    is optimised. Lost are colours that change with the direction (mirrors of water), what is finer than a pixel of
+    is optimised. Lost are colours that change with the direction (reflections on water), what is finer than a pixel of
     --width, and what no photograph shows. `tidefield render` shows all of it; docs/view.md has figures.
     """
 

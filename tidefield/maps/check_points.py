@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 ENOUGH = 30
 """Fewest check points for a statement of accuracy (ASPRS, Positional Accuracy Standards, edition 2, 2023)."""
 _ELLIPSOID = "ellipsoid"
-_SAME_PEG_M = 0.02
+_SAME_POINT_M = 0.02
 """Two points are not surveyed nearer to each other, and one that is rounded or converted is not farther off."""
 _SAME = 0.001
 """Metres between positions of one point in two files, at most."""
@@ -96,12 +96,12 @@ def all_check_points(
     elif own.is_file():
         found = read_check_points(own, scene, frame)
     fitted, names = [], () if georeference is None else georeference.control.names
-    pegs = np.empty((0, 3)) if georeference is None else georeference.control_world
-    on_map = frame.to_map(pegs - frame.origin_world)[:, :2]
+    control = np.empty((0, 3)) if georeference is None else georeference.control_world
+    on_map = frame.to_map(control - frame.origin_world)[:, :2]
     for point in [] if given is None else read_check_points(given, scene, frame):
         same = (np.abs(point.surveyed - other.surveyed).max() < _SAME * frame.metre for other in found)
         away = np.linalg.norm(on_map - point.surveyed[:2], axis=1)
-        if point.name in names or (away < _SAME_PEG_M * frame.metre).any():
+        if point.name in names or (away < _SAME_POINT_M * frame.metre).any():
             fitted.append(point.name)
         elif not any(same):
             found.append(point)

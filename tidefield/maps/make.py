@@ -512,7 +512,10 @@ def finish_map(job: Job, out: Path, record: dict[str, Any], bar: Callable[[str],
         },
         **found,
     }  # fmt: skip
-    shown = {"orthophoto": ORTHOPHOTO, "hillshade": DSM_HILLSHADE, "sigma": SIGMA, "views": VIEWS, "classes": CLASSES}
+    shown = {
+        "orthophoto": ORTHOPHOTO, "surface": DSM, "hillshade": DSM_HILLSHADE, "sigma": SIGMA, "views": VIEWS,
+        "classes": CLASSES,
+    }  # fmt: skip
     write_report(result, out, shown, job.fill)
     write_json(out / MAP_FILE, result)
     return result
