@@ -1,17 +1,20 @@
 """Processes: what signals end, and what ends with the process that started it."""
 
+import multiprocessing
 import os
 import runpy
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Executor
 from pathlib import Path
 
 import pytest
 
 from tidefield import processes
 from tidefield.compare.run import run_measured
+from tidefield.errors import SceneError
 
 ROOT = Path(__file__).parents[1]
 WORK = """
@@ -157,6 +160,28 @@ def test_a_script_without_a_main_block_starts_workers(tmp_path: Path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr, done.returncode) == ("worked [1, 2]\n", "", 0)
+
+
+def fail_while_busy(pool: Executor) -> None:
+    pool.submit(int).result()
+    pool.submit(time.sleep, 100)
+    raise SceneError("no scene")
+
+
+def test_an_error_ends_the_processes_of_its_pool_and_no_other(monkeypatch: pytest.MonkeyPatch):
+    class Other:
+        killed = False
+
+        def kill(self) -> None:
+            self.killed = True
+
+    other = Other()  # a loader of somebody who calls this program
+    monkeypatch.setattr(multiprocessing, "active_children", lambda: [other])
+    start = time.monotonic()
+    with pytest.raises(SceneError, match="no scene"), processes.worker_processes(1) as pool:
+        fail_while_busy(pool)
+    assert time.monotonic() - start < 60
+    assert not other.killed
 
 
 def test_a_pool_on_windows_has_no_more_processes_than_its_call_can_wait_for(monkeypatch: pytest.MonkeyPatch):

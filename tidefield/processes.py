@@ -170,7 +170,7 @@ def worker_processes(count: int, *initializers: Callable[[], object]) -> Iterato
     try:
         yield pool
     except BaseException:
-        for process in multiprocessing.active_children():
+        for process in list((pool._processes or {}).values()):  # not a caller's other children
             process.kill()  # SIGTERM would print the stack of one that is importing pycolmap
         raise
     finally:

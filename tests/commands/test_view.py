@@ -77,6 +77,25 @@ def test_a_scene_among_maps_and_nothing_at_all_are_one_clear_error(scene: Path, 
         view(View((), port=0, no_browser=True), QUIET)
 
 
+def test_heights_over_other_zeros_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("rasterio")
+    import numpy as np
+    from surveys_of_two_dates import write_surface
+
+    systems = {"a": "EPSG:32630+5773", "b": "EPSG:32630+5773", "c": "EPSG:32630+3855"}
+    for name, crs in systems.items():
+        write_surface(tmp_path / name / "dsm.tif", np.ones((8, 8), np.float32), crs=crs)
+    monkeypatch.setattr(view_command, "serve", lambda *_: None)
+    with caplog.at_level("WARNING", logger="tidefield"):
+        view(View(tuple(tmp_path / name for name in systems), port=0, no_browser=True), QUIET)
+    found = [line for line in caplog.messages if "EGM" in line]
+    assert [line.split(":")[0] for line in found] == ["a and c", "b and c"]
+    assert "EGM96" in found[0]
+    assert "EGM2008" in found[0]
+
+
 def test_a_width_out_of_range_is_one_clear_error(scene: Path):
     refused("--width 9 was asked for: expected 64 to 4096", scene, width=9)
 

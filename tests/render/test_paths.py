@@ -1,5 +1,6 @@
 """Shapes of camera paths: valid rotations, constant speed, no jumps, right viewing directions."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from tidefield.render.camera_paths import (
     SHAPES,
     Shape,
     _plane_normal,
+    _tour,
     among_cameras,
     free_camera,
     layout_of,
@@ -110,6 +112,21 @@ def test_the_tour_turns_at_constant_apparent_speed():
     speed = (turn**2 + travel**2).sqrt()
     assert turn.sum() > 2 * torch.pi * 0.95
     assert speed.max() / speed.mean() < 1.1
+
+
+def test_the_tour_of_many_cameras_needs_little_memory():
+    places = np.random.default_rng(0).random((150, 3))
+    layout = replace(layout_of(oblique()), position=places, rotation=np.tile(np.eye(3), (150, 1, 1)))
+    tracemalloc.start()
+    order = _tour(layout)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert sorted(order) == list(range(150))
+    assert peak < 150 * 150 * 8, "not all distances at once"
+    away = np.linalg.norm(places[:, None] - places, axis=2)
+    assert order[0] == away.sum(1).argmax()
+    for k in range(1, 150):
+        assert away[order[k - 1], order[k]] == away[order[k - 1], order[k:]].min()
 
 
 def test_cameras_named_in_no_order_are_toured_without_long_jumps():

@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 import torch
 from captures import SCENES, TILT, survey
+from rich.console import Console
 
+from tidefield.commands.render import Render, render
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
 from tidefield.geometry.cameras import Cameras
-from tidefield.render.camera_paths import Trajectory, layout_of, make_trajectory, strip
+from tidefield.render.camera_paths import (
+    RANGE_POINTS,
+    Trajectory,
+    layout_of,
+    make_trajectory,
+    orbit,
+    path_cameras,
+    strip,
+)
 
 PATHS = ["cameras", "orbit", "strip"]
 
@@ -92,6 +102,29 @@ def test_the_far_of_oblique_frames_includes_what_they_see():
 def test_an_unknown_path_is_one_clear_error():
     with pytest.raises(TidefieldError, match=r"'spiral'.*cameras, orbit, strip or a \.json"):
         make_trajectory("spiral", survey(), frames=10, width=64, height=48)
+
+
+def test_frames_are_refused_with_a_path_that_has_its_own(tmp_path: Path):
+    options = Render(tmp_path / "run", tmp_path / "out.mp4", path="flights/first.JSON", frames=9)
+    with pytest.raises(TidefieldError, match=r"--frames was given, but first\.JSON has frames of its own"):
+        render(options, Console(quiet=True))
+
+
+def test_a_camera_reads_a_part_of_many_points_only():
+    class Points(torch.Tensor):
+        def double(self) -> torch.Tensor:
+            assert len(self) <= RANGE_POINTS[0]
+            return super().double()
+
+    scene = SCENES["survey"]()
+    assert scene.points is not None
+    many = scene.points.xyz_world.repeat(100, 1).as_subclass(Points)
+    assert len(many) > RANGE_POINTS[0]
+    points = replace(scene.points, xyz_world=many, error_px=torch.zeros(len(many)))
+    crowded = replace(scene, points=points)
+    position, rotation = orbit(layout_of(scene), 1)
+    plain, crowd = (path_cameras(each, position, rotation, 64, 48, np.array([60.0])) for each in (scene, crowded))
+    assert torch.allclose(plain.near_far, crowd.near_far, rtol=0.02)
 
 
 def test_a_named_path_keeps_the_asked_speed():

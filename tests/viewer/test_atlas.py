@@ -263,6 +263,146 @@ def test_lengths_are_those_of_the_ground_in_any_system(tmp_path: Path, crs: str,
     assert atlas.tile(0, "height", 0, 0, 0) is not None
 
 
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:32631"])
+def test_around_a_raster_that_is_turned_into_another_system_there_is_nothing(tmp_path: Path, crs: str):
+    import rasterio
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(-1.0, 51.5)
+    cell = 5e-6 if crs == "EPSG:4326" else 0.5
+    heights = np.full((100, 200), 30, np.float32)
+    masked = write_surface(tmp_path / "masked 2024-01-02" / "dsm.tif", heights, cell, x, y, crs)
+    with rasterio.open(masked, "r+") as file:
+        file.write_mask(np.repeat([True, False], 50)[:, None] & np.ones(200, bool))
+    whole = tmp_path / "whole 2024-01-01"
+    write_surface(whole / "dsm.tif", heights, cell, x, y, crs)
+    write_surface(whole / "ortho.tif", np.full((3, 100, 200), 90, np.uint8), cell, x, y, crs)
+    west, north = Transformer.from_crs("EPSG:4326", "EPSG:32630", always_xy=True).transform(-1.0, 51.5)
+    write_surface(tmp_path / "first 2023-01-01" / "dsm.tif", heights, 1.0, west - 50, north + 20)
+    atlas = Atlas([masked.parent, whole, tmp_path / "first 2023-01-01"])
+    shares = {}
+    for sheet, layer in ((1, "height"), (1, "orthophoto"), (2, "height")):
+        content = atlas.tile(sheet, layer, 0, 0, 0)
+        assert content is not None
+        shown = np.asarray(Image.open(io.BytesIO(content)))
+        seen = shown[..., 3] > 0
+        shares[sheet, layer] = seen.sum()
+        if layer == "height":
+            assert np.allclose(decoded(content)[seen], 30, atol=STEP)
+        else:
+            assert (shown[seen] == (90, 90, 90, 255)).all()
+    assert shares[2, "height"] == pytest.approx(shares[1, "height"] / 2, rel=0.05)
+    assert shares[1, "orthophoto"] == pytest.approx(shares[1, "height"], rel=0.05)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32630", None])
+def test_orthophotos_that_are_turned_or_have_south_up_are_shown_with_north_up(tmp_path: Path, crs: str | None):
+    import rasterio
+    from affine import Affine
+
+    picture = np.zeros((3, 100, 100), np.uint8)
+    picture[0, :50] = 200  # the first rows are red
+    for name, transform, red_at, black_at in (
+        ("south up", Affine(0.5, 0, 500_000, 0, 0.5, 2000), (25, 10), (25, 40)),
+        ("turned", Affine(0, 0.5, 500_000, 0.5, 0, 2000), (10, 25), (40, 25)),
+    ):
+        path = write_surface(tmp_path / name / "ortho.tif", picture, crs=crs)
+        with rasterio.open(path, "r+") as file:
+            file.transform = transform
+        atlas = Atlas([tmp_path / name])
+        content = atlas.tile(0, "orthophoto", 0, 0, 0)
+        assert content is not None
+        shown = np.asarray(Image.open(io.BytesIO(content)))
+        west, _, _, north = atlas.bounds
+        for (east_of, north_of), red in ((red_at, 200), (black_at, 0)):
+            x, y = 500_000 + east_of - west, north - (2000 + north_of)
+            assert shown[int(y * TILE_PX / atlas.side), int(x * TILE_PX / atlas.side)].tolist() == [red, 0, 0, 255]
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_picture_without_a_place_is_refused(tmp_path: Path):
+    write_surface(tmp_path / "ortho.tif", np.zeros((3, 8, 8), np.uint8), size=(1, -1), west=0, north=0, crs=None)
+    with pytest.raises(RunError, match=r"ortho\.tif has no place on a map: expected a georeferenced GeoTIFF"):
+        Atlas([tmp_path])
+
+
+def test_maps_over_another_zero_of_heights_are_not_warped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, crs in (("a", "EPSG:32630"), ("b", "EPSG:32630+5773")):
+        write_surface(tmp_path / name / "dsm.tif", np.ones(SHAPE, np.float32), CELL, crs=crs)
+    monkeypatch.setattr("rasterio.vrt.WarpedVRT", None)
+    atlas = Atlas([tmp_path / "a", tmp_path / "b"])
+    assert [found["height"] for found in atlas.at(*corner(5, 5))] == [1.0, 1.0]
+
+
+def test_a_map_without_a_date_does_not_decide_in_which_system_others_are_shown(tmp_path: Path):
+    for name, crs in (("undated", "EPSG:32631"), ("flat 2024-05-01", "EPSG:32630")):
+        write_surface(tmp_path / name / "dsm.tif", np.ones((8, 8), np.float32), CELL, 5e5, crs=crs)
+    atlas = Atlas([tmp_path / "undated", tmp_path / "flat 2024-05-01"])
+    assert [sheet.date for sheet in atlas.sheets] == ["2024-05-01", None]
+    assert atlas.name == "WGS 84 / UTM zone 30N"
+
+
+@pytest.mark.parametrize("one", [LOCAL_WKT, 'LOCAL_CS["site",UNIT["foot",0.3048]]'])
+def test_two_local_frames_are_refused(tmp_path: Path, one: str):
+    for name, crs in (("a", one), ("b", 'LOCAL_CS["site",UNIT["metre",1]]')):
+        write_surface(tmp_path / name / "dsm.tif", np.ones((8, 8), np.float32), CELL, crs=crs)
+    with pytest.raises(RunError, match=r"a and .*b lie in different local frames: expected maps in one"):
+        Atlas([tmp_path / "a", tmp_path / "b"])
+
+
+def test_sheets_of_one_date_have_labels_of_their_own(tmp_path: Path):
+    names = ("low 2024-05-01", "high 20240501", "low 2025-05-01", "plain")
+    maps = [write_map(tmp_path / name, (1, 2, 3)) for name in names]
+    change = write_change(tmp_path / "change", np.zeros(SHAPE, np.float32))  # whose later survey is of 2024-05-03
+    labels = [sheet["label"] for sheet in Atlas([*maps, change]).describe()["sheets"]]
+    assert labels == ["low 2024-05-01", "2024-05-01 high 20240501", "2024-05-03", "2025-05-01", "plain"]
+
+
+def test_errors_are_pale_in_the_colours_of_a_change(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    dz = rng.normal(0, 0.03, SHAPE).astype(np.float32)
+    dz[:4, :4] = -0.8  # less than 1% of the cells
+    (sheet,) = Atlas([write_change(tmp_path / "change", dz, sigma=0.03)]).describe()["sheets"]
+    change = sheet["layers"][0]
+    assert change["high"] == -change["low"] == pytest.approx(2 * 1.96 * 0.03)
+    assert change["largest"] == pytest.approx(0.8)
+    dz[40:] = -0.8
+    (sheet,) = Atlas([write_change(tmp_path / "change", dz, sigma=0.03)]).describe()["sheets"]
+    assert sheet["layers"][0]["high"] == pytest.approx(0.8)
+
+
+def test_errors_of_heights_are_those_that_change_uses(tmp_path: Path):
+    write_surface(tmp_path / "dtm.tif", np.ones((8, 8), np.float32), CELL)
+    write_surface(tmp_path / "dtm_standard_error.tif", np.full((8, 8), 0.04, np.float32), CELL)
+    assert Atlas([tmp_path]).at(*corner(2, 2))[0]["sigma"] == pytest.approx(0.04)
+
+
+def test_a_polygon_without_values_has_no_volume(tmp_path: Path):
+    heights = np.full(SHAPE, np.nan, np.float32)
+    heights[:, :10] = 1
+    plain = write_map(tmp_path / "map", (1, 2, 3), np.nan_to_num(heights, nan=-9999))
+    atlas = Atlas([plain, write_change(tmp_path / "change", heights)])
+    assert atlas.area(box(20, 10, 40, 20))["sheets"] == [{}, {}]
+
+
+def test_a_shift_error_that_was_stated_is_not_widened_for_little_stable_ground(tmp_path: Path):
+    shared = np.full(SHAPE, math.hypot(0.01, 0.02), np.float32)  # on an even slope
+    folder = write_change(tmp_path / "change", np.full(SHAPE, 0.4, np.float32), 0.03, 0.01, shared=shared)
+    numbers = json.loads((folder / "change.json").read_text())
+    numbers["volumes"] = {"net": {"degrees_of_freedom": 3.0}}
+    numbers["registration"]["model"] = "vertical"
+    factors = []
+    for stated in (False, True):
+        numbers["registration"]["shift_error_stated"] = stated
+        (folder / "change.json").write_text(json.dumps(numbers))
+        net = Atlas([folder]).area(box(10, 10, 40, 20))["sheets"][0]["net"]
+        half = CELL**2 * math.hypot(0.03 * math.sqrt(300), float(shared[0, 0]) * 300)
+        factors.append((net["high_m3"] - net["value_m3"]) / half)
+    assert factors[0] > 3
+    # A fifth of the variance was measured: Satterthwaite's degrees of freedom are 25 times as many.
+    assert factors[1] == pytest.approx(1.99, abs=0.01)
+
+
 def test_errors_are_in_the_unit_of_their_heights(tmp_path: Path):
     import rasterio
 

@@ -204,6 +204,42 @@ def test_pictures_are_made_again_with_another_method():
     assert values == pytest.approx([0.5, 0.25, 0.75])
 
 
+def test_a_picture_of_another_method_is_counted_from_when_that_came():
+    shown = Shown()
+    with serving(grey) as server:
+        server.ask("a", camera(), shown)
+        shown.wait_for(2)
+        server._viewers["a"].since -= 100
+        server.replace_method(grey)
+        shown.wait_for(3)
+    assert shown[2].seconds < PATIENCE
+
+
+def test_a_sharp_picture_of_a_camera_that_has_moved_on_is_not_shown():
+    shown = Shown()
+    with serving(grey) as server:
+        server.ask("a", camera(), shown)
+        shown.wait_for(2)
+        coarse, sharp = shown
+        viewer = server._viewers["a"]
+        for frame in (sharp, coarse):
+            server._show("a", viewer, frame, viewer.serial - 1)
+        assert list(shown) == [coarse, sharp, coarse]
+
+
+def test_pictures_are_made_without_what_cannot_be_prepared(caplog: pytest.LogCaptureFixture):
+    def prepare() -> bool:
+        raise OSError("a photograph is damaged")
+
+    shown = Shown()
+    with serving(grey, prepare=prepare) as server:
+        eventually(lambda: "could not be prepared" in caplog.text)
+        server.ask("a", camera(), shown)
+        shown.wait_for(2)
+    assert [frame.sharp for frame in shown] == [False, True]
+    assert caplog.text.count("OSError: a photograph is damaged") == 1
+
+
 def test_what_makes_coarse_pictures_faster_is_prepared_while_nothing_moves():
     left = [3]
 

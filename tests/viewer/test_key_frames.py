@@ -41,6 +41,15 @@ def test_a_closed_path_ends_next_to_where_it_began_and_is_smooth_there():
     assert steps[-2] > 0
 
 
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_a_closed_path_turns_smoothly_where_it_began(count: int):
+    frames = interpolate(keys()[:count], 1200, closed=True)
+    turns = Rotation.from_matrix(np.stack([frame.rotation for frame in (*frames, *frames[:2])]))
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    assert np.linalg.norm(steps[-1] - steps[-2]) < 0.02 * np.linalg.norm(steps, axis=1).max()
+    assert np.allclose(frames[0].rotation, keys()[0].rotation)
+
+
 def test_one_key_makes_no_path():
     with pytest.raises(TidefieldError, match="has 1 key frames: expected two or more"):
         interpolate(keys()[:1], 10)

@@ -11,6 +11,7 @@ import struct
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -245,6 +246,68 @@ def test_tiles_that_fail_are_asked_for_again_and_those_not_shown_any_more_are_no
         tab.unroute("**/tile/0/height/**")
         tab.get_by_label("Layer", exact=True).select_option("0.height")
         colours(tab, "height")
+        tab.close()
+
+
+def test_a_raster_that_cannot_be_read_is_reported_on_the_page_and_once_in_the_log(
+    tmp_path: Path, browser, caplog: pytest.LogCaptureFixture
+):
+    folder = write_map(tmp_path / "map", (200, 30, 30), np.random.default_rng(0).uniform(0, 9, SHAPE))
+    with page_of(folder) as page:
+        surface = folder / "odm_dem" / "dsm.tif"
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(page.address)
+        colours(tab, "readable")
+        os.truncate(surface, surface.stat().st_size // 2)
+        tab.get_by_label("Layer", exact=True).select_option("0.height")
+        tab.get_by_role("alert").filter(has_text="not a raster").wait_for()
+        colours(tab, "unreadable")  # it is not asked for again and again
+        words = tab.get_by_role("alert").inner_text()
+        tab.close()
+    assert re.search(r"map, Height: map.odm_dem.dsm\.tif is not a raster that can be read", words)
+    assert str(tmp_path) not in words
+    (warning,) = caplog.messages
+    assert str(surface) in warning
+
+
+def test_a_map_that_was_made_again_is_shown_when_the_page_is_loaded_again(tmp_path: Path):
+    folder = write_map(tmp_path / "map", (200, 30, 30))
+    with page_of(folder) as page:
+
+        def asked(path: str) -> Any:
+            with urllib.request.urlopen(f"{page.address}/{path}") as answer:
+                return json.load(answer)
+
+        first = asked("atlas.json")
+        assert asked("atlas.json") == first
+        write_map(tmp_path / "map", (30, 30, 200), np.full((*SHAPE[:1], 2 * SHAPE[1]), 3.0))
+        again = asked("atlas.json")
+        assert again["version"] != first["version"]
+        assert again["bounds"][2] > first["bounds"][2]
+        assert asked("atlas.json") == again
+        (folder / "odm_dem" / "dsm.tif").write_bytes(b"II*\0 half of it")
+        with pytest.raises(urllib.error.HTTPError) as refusal:
+            asked("atlas.json")
+        assert "map/odm_dem/dsm.tif is not a raster" in json.load(refusal.value)["error"].replace("\\", "/")
+
+
+def test_sheets_of_one_date_are_named_apart_and_detection_goes_up_to_the_largest_change(tmp_path: Path, browser):
+    dz = np.random.default_rng(0).normal(0, 0.03, SHAPE).astype(np.float32)
+    dz[:4, :4] = -0.8
+    maps = [write_map(tmp_path / name, (200, 30, 30)) for name in ("low 2024-05-01", "high 2024-05-01")]
+    with page_of(*maps, write_change(tmp_path / "change", dz)) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(f"{page.address}/#left=2.change")
+        names = tab.get_by_label("Layer", exact=True).locator("option").all_inner_texts()
+        assert len(set(names)) == len(names)
+        assert {"low 2024-05-01 Height", "high 2024-05-01 Height", "2024-05-03 Change"} <= set(names)
+        assert tab.locator("#legendends").inner_text().startswith("-0.12 to 0.12 m")
+        tab.get_by_label("Detection").fill("0.8")
+        assert tab.locator("#detectionvalue").inner_text() == "0.800 m"
+        place = tuple(map(round, pixel_of(tab, corner(50, 40))))
+        tab.mouse.move(*place)
+        tab.get_by_text("low 2024-05-01: height").wait_for()
+        assert tuple(colours(tab, "labels")[place[1], place[0]]) == (233, 237, 240)
         tab.close()
 
 

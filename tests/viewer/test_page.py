@@ -5,8 +5,10 @@ import os
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +25,7 @@ from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
 from tidefield.render.camera_paths import make_trajectory
-from tidefield.viewer.frames import FrameServer
+from tidefield.viewer.frames import Frame, FrameServer
 from tidefield.viewer.page import ScenePage, _Client
 from tidefield.viewer.ports import page_address, require_port
 
@@ -165,14 +167,102 @@ def test_a_port_in_use_is_one_clear_error():
             require_port("127.0.0.1", port)
 
 
+def client_of(page: object, **own: object) -> _Client:
+    """What a browser shows, without its controls."""
+    client = _Client.__new__(_Client)
+    locks = {"_asking": threading.Lock(), "_drawing": threading.Lock()}
+    vars(client).update(page=page, _moves=0, _each={}, **locks, **own)
+    return client
+
+
+def test_of_moves_that_wait_only_the_last_is_asked_for(monkeypatch: pytest.MonkeyPatch):
+    reading, may_go, asked = threading.Event(), threading.Event(), []
+
+    def read(_: _Client) -> int:
+        own = client._moves
+        reading.set()
+        assert may_go.wait(20)
+        return own
+
+    monkeypatch.setattr(_Client, "camera", read)
+    browser = SimpleNamespace(client_id=3, camera=SimpleNamespace(image_width=8, image_height=6, position=np.zeros(3)))
+    frames = SimpleNamespace(ask=lambda who, camera, show: asked.append(camera))
+    server = SimpleNamespace(get_clients=lambda: {3: browser})
+    page = SimpleNamespace(frames=frames, server=server, positions=np.zeros((0, 3)))
+    client = client_of(page, client=browser)
+    moves = [threading.Thread(target=client.moved) for _ in range(6)]
+    moves[0].start()
+    assert reading.wait(20)
+    for move in moves[1:]:
+        move.start()
+    while client._moves < len(moves):
+        time.sleep(0.001)
+    may_go.set()
+    for move in moves:
+        move.join(20)
+    assert asked == [1, 6]
+
+
+def test_an_error_is_shown_as_it_is_without_the_scenes_place(tmp_path: Path):
+    scene = SimpleNamespace(root=tmp_path / "flat_2024")
+    client = client_of(SimpleNamespace(scene=scene), status=SimpleNamespace(content=""))
+    words = f"{scene.root / 'DJI_1_.JPG'} cannot be read"
+    client._show(Frame(None, wall().cameras[0], True, 0.0, words))
+    assert client.status.content == r"**No picture:** flat\_2024\/DJI\_1\_\.JPG cannot be read"
+
+
+def test_a_photograph_is_read_for_the_first_browser_only():
+    read = []
+
+    def photograph(index: int) -> torch.Tensor:
+        read.append(index)
+        return torch.zeros(300, 400, 3, dtype=torch.uint8)
+
+    class Photographs:
+        def __getitem__(self, index: int) -> torch.Tensor:
+            return photograph(index)
+
+    page = ScenePage.__new__(ScenePage)
+    vars(page).update(scene=SimpleNamespace(photographs=Photographs()), _thumbnails={})
+    assert page.thumbnail(2).shape == page.thumbnail(2).shape == (75, 100, 3)
+    assert read == [2]
+
+
+def test_names_that_are_not_utf_8_are_offered_and_flown_to(monkeypatch: pytest.MonkeyPatch):
+    scene = wall()
+    odd = b"caf\xe9.jpg".decode("utf-8", "surrogateescape")
+    scene = replace(scene, names=(odd, *scene.names[1:]))
+    flown: list[str] = []
+    monkeypatch.setattr(_Client, "fly_to_photograph", lambda _, name: flown.append(name))
+    with page_of(scene) as page:
+        from viser import GuiApi
+
+        made: dict[str, object] = {}
+        for kind in ("add_dropdown", "add_button"):
+            usual = getattr(GuiApi, kind)
+
+            def add(gui: GuiApi, label: str, *values: object, usual=usual, **options: object) -> object:
+                made[label] = usual(gui, label, *values, **options)
+                return made[label]
+
+            monkeypatch.setattr(GuiApi, kind, add)
+        server = page.server
+        client = SimpleNamespace(gui=server.gui, scene=server.scene, client_id=1, camera=None)
+        _Client(page, client)
+        made["Photograph"].value.encode()
+        (fly,) = made["Fly there"]._impl.update_cb
+        fly(None)
+    assert flown == [odd]
+
+
 @pytest.mark.parametrize("stays", [True, False])
 def test_a_browser_that_leaves_while_its_page_is_set_up_is_no_viewer(stays: bool, monkeypatch: pytest.MonkeyPatch):
     camera = wall().cameras[0]
     monkeypatch.setattr(_Client, "camera", lambda _: camera)
     browser = SimpleNamespace(client_id=3, camera=SimpleNamespace(image_width=8, image_height=6, position=np.zeros(3)))
     frames = FrameServer(lambda one, seen: render_wall(one), render_wall)
-    page, client = SimpleNamespace(frames=frames, server=SimpleNamespace()), _Client.__new__(_Client)
-    vars(client).update(page=page, client=browser, _show=lambda _: None, _positions=np.zeros((0, 3)), _each={})
+    page = SimpleNamespace(frames=frames, server=SimpleNamespace(), positions=np.zeros((0, 3)))
+    client = client_of(page, client=browser, _show=lambda _: None)
     page.server.get_clients = lambda: {3: browser} if stays else {}
     client.moved()
     assert frames.viewers == stays

@@ -16,6 +16,7 @@ from tidefield.config import PRESETS, Budget, NerfConfig
 from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Rendering
 from tidefield.recording import recording_lock
 from tidefield.train.checkpoint import CHECKPOINT_FILE
@@ -70,6 +71,29 @@ def test_nothing_is_recorded_while_a_picture_of_a_training_is_made(monkeypatch: 
     training._as_it_is(trainer)(scene.cameras[0])
     assert locked == [True]
     assert not recording_lock.locked()
+
+
+@pytest.mark.thorough
+def test_what_was_read_of_photographs_is_kept_when_weights_are_renewed(monkeypatch: pytest.MonkeyPatch):
+    scene = textured_wall.scene(textured_wall.cameras(3, 32, 24))
+    trainer = SceneTrainer(SMALL, scene, 0, choose_device("cpu"))
+    trainer._open = trainer._ahead = object()  # large, and the training's
+    copied, usual = [], SceneTrainer.renderer
+    monkeypatch.setattr(SceneTrainer, "renderer", lambda own, sampling: (copied.append(own), usual(own, sampling))[1])
+    kept: list[Renderer] = []
+    before = training._as_it_is(trainer, kept)(scene.cameras[0])
+    matcher, pyramid, features = kept[0].matcher, kept[0].cache.pyramid, kept[0].cache
+    assert matcher is not None
+    with torch.no_grad():
+        for value in trainer.network.parameters():
+            value.mul_(0.5)
+    after = training._as_it_is(trainer, kept)(scene.cameras[0])
+    assert (kept[0].matcher, kept[0].cache.pyramid) == (matcher, pyramid)
+    assert kept[0].cache is not features, "features depend on the weights"
+    assert not torch.equal(after.colour, before.colour)
+    assert torch.equal(after.colour, training._as_it_is(trainer)(scene.cameras[0]).colour)
+    assert None not in (trainer._open, trainer._ahead)
+    assert [(own._open, own._ahead) for own in copied] == [(None, None)] * 2
 
 
 def test_what_is_shown_of_a_nerf_is_a_copy_too():

@@ -82,6 +82,8 @@ def render(options: Render, console: Console) -> None:
     of_paths = next((name for name in ("path", "frames") if getattr(options, name) is not None), None)
     if of_paths is not None and camera is not None:
         raise RunError(f"--{of_paths} belongs to a video: --camera NAME is one view; leave one of them out")
+    if options.frames is not None and options.path is not None and Path(options.path).suffix.lower() == ".json":
+        raise RunError(f"--frames was given, but {Path(options.path).name} has frames of its own; leave it out")
     if options.cluster is not None and camera is not None:
         raise RunError("--cluster shares the frames of a path among machines: --camera NAME is one view; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)

@@ -8,6 +8,7 @@ import threading
 import webbrowser
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -108,13 +109,18 @@ def _view_maps(options: View, console: Console) -> None:
     given = next((name for name, usual in of_scenes.items() if getattr(options, name) != usual), None)
     if given is not None:
         raise RunError(f"--{given.replace('_', '-')} was given with maps: it belongs to runs and scenes; leave it out")
+    from tidefield.change.surfaces import other_zeros
     from tidefield.viewer.atlas import Atlas
     from tidefield.viewer.map_page import MapPage
 
     atlas = Atlas(options.sources)
-    for sheet in atlas.sheets:
-        for remark in sheet.heights.remarks if sheet.heights else ():
-            log.warning(f"{sheet.title}: {remark}")
+    surfaces = [(sheet.title, sheet.heights) for sheet in atlas.sheets if sheet.heights is not None]
+    for title, heights in surfaces:
+        for remark in heights.remarks:
+            log.warning(f"{title}: {remark}")
+    for (title, heights), (other_title, other) in combinations(surfaces, 2):
+        if zeros := other_zeros(heights, other):
+            log.warning(f"{title} and {other_title}: {zeros}; sections and differences between them include that")
     page = MapPage(atlas, options.host, options.port)
     try:
         serve(page.address, options.host, options.no_browser, console)

@@ -346,15 +346,18 @@ def _spline(position: Positions, rotation: Rotations) -> Poses:
 
 def _tour(layout: Layout) -> Int64[np.ndarray, " N"]:
     """Order the cameras as they are named or, where that is a detour, from one end always to the nearest one left."""
-    away = np.linalg.norm(layout.position[:, None] - layout.position[None], axis=2)
-    named = np.arange(len(away))
-    left = np.ones(len(away), dtype=bool)
-    order = [int(away.sum(1).argmax())]
+    position = layout.position
+    named, left = np.arange(len(position)), np.ones(len(position), dtype=bool)
+
+    def away(camera: int) -> Float64[np.ndarray, " N"]:
+        return np.linalg.norm(position - position[camera], axis=1)
+
+    order = [int(np.argmax([away(camera).sum() for camera in range(len(position))]))]
     left[order[0]] = False
     while left.any():
-        order.append(int(np.where(left, away[order[-1]], np.inf).argmin()))
+        order.append(int(np.where(left, away(order[-1]), np.inf).argmin()))
         left[order[-1]] = False
-    length, greedy_length = (away[o[:-1], o[1:]].sum() for o in (named, np.array(order)))
+    length, greedy_length = (np.linalg.norm(np.diff(position[o], axis=0), axis=1).sum() for o in (named, order))
     return np.array(order) if DETOUR * greedy_length < length else named
 
 
@@ -411,9 +414,9 @@ def path_cameras(
 ) -> Cameras:
     """Return cameras of a path at the common exposure; without focal lengths, with the photographs' (the narrower view
     if the aspects differ)."""
-    train = scene.cameras[list(scene.train)]
     count, size = len(position), torch.tensor([width, height])
     if focal_px is None:
+        train = scene.cameras[list(scene.train)]
         focal_px = np.full(count, float((train.focal_px / train.size_px * size).median(0).values.max()))
     pose = np.concatenate([rotation, position[:, :, None]], axis=2)
     lenses = tuple(Lens(width, height, f, f, width / 2, height / 2) for f in focal_px.tolist())
@@ -450,11 +453,11 @@ def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Le
     of the box around it, else that of the photographs.
     """
     ranges = np.full((len(pose), 2), np.nan)
-    xyz = np.zeros((0, 3)) if scene.points is None else scene.points.xyz_world.double().cpu().numpy()
+    points = torch.zeros(0, 3) if scene.points is None else scene.points.xyz_world
     for most in RANGE_POINTS:
         few = np.flatnonzero(np.isnan(ranges[:, 0]))
-        if len(few) and len(xyz):
-            some = Observations(xyz[:: len(xyz) // most + 1])
+        if len(few) and len(points):
+            some = Observations(points[:: len(points) // most + 1].double().cpu().numpy())
             ranges[few] = ranges_of_points(pose[few], tuple(lenses[i] for i in few), some)
     if scene.hull is not None and np.isnan(ranges).all():
         ranges = _ranges_of_hull(scene.hull, pose)

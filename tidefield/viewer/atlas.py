@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import io
 import math
+import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +21,14 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from PIL import Image
 
-from tidefield.change.errors import Variogram, region_error
+from tidefield.change.errors import Z95, Variogram, colour_limit, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import Surface, date_in, is_local, open_surface, system_of_ground
+from tidefield.change.surfaces import PLAIN, Surface, date_in, is_local, open_surface, opened, system_of_ground
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
 from tidefield.geometry.geodesy import in_metres, same_system
 from tidefield.maps.grid import LOCAL_NAME
-from tidefield.maps.rasters import need
 
 TILE_PX = 256
 STEP = 0.0005
@@ -37,10 +38,7 @@ SECTION_POINTS = 600
 MOST_POINTS = 500
 MOST_CELLS = 16_000_000
 """Of the box around a polygon."""
-BAND = 1.96
-"""Standard errors on both sides of a value that hold 95% of normal errors."""
 CHANGE_FILE, CHANGE_RASTER, MAP_FILE = "change.json", "change.tif", "map.json"
-SIGMAS = ("odm_dem/dsm_sigma.tif", "dsm_sigma.tif")
 HILLSHADES = ("odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif")
 
 
@@ -54,6 +52,7 @@ class Layer:
         source, band: the raster, or the surface that it holds.
         kind: "picture" (colours, or grey), or values that the page colours: "height", "error" or "change".
         low, high: ends of the colours; most values are between them. Of pictures: black and white.
+        largest: size of a change, in a small picture of it.
     """
 
     name: str
@@ -63,6 +62,7 @@ class Layer:
     kind: str
     low: float = 0.0
     high: float = 1.0
+    largest: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,19 +115,24 @@ def open_sheet(folder: Path) -> Sheet:
         if not isinstance(numbers, dict) or not {"earlier", "later", "level_of_detection_m"} <= set(numbers):
             raise RunError(f"{folder} has no {CHANGE_FILE} of a change: expected what `tidefield change` wrote")
         dz = folder / CHANGE_RASTER
-        reach = max(abs(v) for v in _usual(dz, 1))
+        sizes = np.abs(_overview(dz, 1))
+        largest = float(sizes.max(initial=0.0))
+        limit = colour_limit(sizes, numbers["level_of_detection_m"].get("median") or 0.0) or 1.0
         layers = (
-            Layer("change", "Change", dz, 1, "change", -reach, reach),
+            Layer("change", "Change", dz, 1, "change", -limit, limit, largest),
             Layer("error", "Error of change", dz, 2, "error", *_usual(dz, 2)),
         )
         return Sheet(folder, name, numbers["later"].get("date"), "change", layers, None, None, numbers)
-    heights, sigma = (path and open_surface(path) for path in (first_of(folder, SURFACES), first_of(folder, SIGMAS)))
+    surface = first_of(folder, SURFACES)
+    heights = surface and open_surface(surface)
+    sigma = open_surface(heights.sigma) if heights is not None and heights.sigma is not None else None
     found: list[Layer] = []
     for kind, title, path in (
         ("orthophoto", "Orthophoto", first_of(folder, ORTHOPHOTOS)),
         ("hillshade", "Hillshade", first_of(folder, HILLSHADES)),
     ):
         if path is not None:
+            _require_place(path)
             found.append(Layer(kind, title, path, 1, "picture", *_black_white(path)))
     if heights is not None and sigma is not None:
         sigma = replace(sigma, metres=heights.metres)  # whatever unit of heights its file states
@@ -164,8 +169,11 @@ class Atlas:
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
-        rasterio = need("rasterio")
-        self.sheets = _with_own_titles(sorted(map(open_sheet, folders), key=lambda sheet: sheet.date or ""))
+        self.folders = tuple(folders)
+        # Those without a date last: the first one's system is everybody's.
+        sheets = sorted(map(open_sheet, folders), key=lambda sheet: (sheet.date is None, sheet.date or ""))
+        self.sheets = _with_own_titles(sheets)
+        self._state = _state(self.sheets)
         self._systems = [_system(sheet) for sheet in self.sheets]
         stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
         self.crs = next((_of_the_ground(sheet, crs) for sheet, crs in stated), None)
@@ -183,8 +191,12 @@ class Atlas:
         if self.side / self.cell > TILE_PX << FINEST_LEVEL:
             raise RunError(f"the folders lie {self.side:,.0f} apart: expected maps of one place; name others, or fewer")
         self.finest = min(FINEST_LEVEL, max(0, math.ceil(math.log2(self.side / self.cell / TILE_PX))) + 1)
-        self._rasterio = rasterio
         self.metre, self.unit, self.name = self._units()
+
+    @property
+    def is_outdated(self) -> bool:
+        """Whether a file that is shown was made again, or is gone."""
+        return _state(self.sheets) != self._state
 
     def describe(self) -> dict[str, Any]:
         """What the page needs to know, without the name of any folder's place."""
@@ -198,16 +210,15 @@ class Atlas:
             "finest": self.finest,
             "tile": TILE_PX,
             "step": STEP,
+            "band": Z95,
             "sheets": [
                 {
                     "title": sheet.title,
-                    "date": sheet.date,
+                    "label": self._label(sheet),
                     "kind": sheet.kind,
-                    "detection": sheet.numbers["level_of_detection_m"].get("median")
-                    if sheet.kind == "change"
-                    else None,
+                    "detection": sheet.detection_m,
                     "layers": [
-                        {"name": one.name, "title": one.title, "kind": one.kind, "low": one.low, "high": one.high}
+                        {name: getattr(one, name) for name in ("name", "title", "kind", "low", "high", "largest")}
                         for one in sheet.layers
                     ],
                 }
@@ -224,7 +235,7 @@ class Atlas:
         west, north = self.bounds[0] + column * side, self.bounds[3] - row * side
         with self._reader(chosen.source) as file:
             bands = _picture_bands(file) if chosen.kind == "picture" else [chosen.band]
-            values, seen = _read(file, bands, west, north, side / TILE_PX, self._rasterio)
+            values, seen = _read(file, bands, west, north, side / TILE_PX)
         if not seen.any():
             return None
         picture = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
@@ -276,7 +287,7 @@ class Atlas:
                 results.append({})
                 continue
             with self._reader(source) as file:
-                box, inside = _cells_in(file, polygon, self._rasterio)
+                box, inside = _cells_in(file, polygon)
                 if not inside.any():
                     results.append({})
                     continue
@@ -289,6 +300,9 @@ class Atlas:
                 errors = [_band(file, band, box) for band in bands if band <= file.count]
             cells = np.count_nonzero(inside)
             inside &= np.isfinite(values)
+            if not inside.any():
+                results.append({})
+                continue
             share = {"share": on * np.count_nonzero(inside) / cells}
             if sheet.kind == "change":
                 volumes = _change_volumes(values, errors, inside, cell, cell_area, sheet.numbers, detection_m)
@@ -333,7 +347,7 @@ class Atlas:
             if sigma is not None:
                 errors = sigma[inside][chosen]
                 known = np.isfinite(errors)
-                half = BAND * float(errors[known].mean() if known.any() else 0.0) * len(errors) * cell_area
+                half = Z95 * float(errors[known].mean() if known.any() else 0.0) * len(errors) * cell_area
                 result[name] |= {"low_m3": value - half, "high_m3": value + half}
         return result
 
@@ -359,13 +373,27 @@ class Atlas:
 
         stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
         systems = [(sheet, CRS.from_wkt(crs.to_wkt())) for sheet, crs in stated]
-        local = [sheet for sheet, crs in systems if is_local(crs)]
+        local = [(sheet, crs) for sheet, crs in systems if is_local(crs)]
         placed = [(sheet, crs) for sheet, crs in systems if not is_local(crs)]
         if local and placed:
             raise RunError(
-                f"{local[0].folder} lies in a local frame, {placed[0][0].folder} in {placed[0][1].name}: expected maps "
-                "in one frame; show them apart, or give the scene of the first a georeference and map it again"
+                f"{local[0][0].folder} lies in a local frame, {placed[0][0].folder} in {placed[0][1].name}: expected "
+                "maps in one frame; show them apart, or give the scene of the first a georeference and map it again"
             )
+        for sheet, crs in local:
+            first, frame = local[0]
+            if crs.name != frame.name or crs != frame:
+                raise RunError(
+                    f"{first.folder} and {sheet.folder} lie in different local frames: expected maps in one; show "
+                    "them apart"
+                )
+
+    def _label(self, sheet: Sheet) -> str:
+        """A sheet's date where no other sheet of its kind has it, otherwise with its title."""
+        alike = sum((other.kind, other.date) == (sheet.kind, sheet.date) for other in self.sheets)
+        if sheet.date is None or (alike > 1 and sheet.date in sheet.title):
+            return sheet.title
+        return sheet.date if alike == 1 else f"{sheet.date} {sheet.title}"
 
     def _layer(self, sheet: int, name: str) -> Layer | None:
         if not 0 <= sheet < len(self.sheets):
@@ -378,10 +406,14 @@ class Atlas:
         from rasterio.vrt import WarpedVRT
 
         with _opened(source) as file:
-            if file.crs == self.crs or file.crs is None:
+            own = file.transform
+            other = file.crs is not None and self.crs is not None and not _same(file.crs.to_wkt(), self.crs.to_wkt())
+            if own.b == own.d == 0 and own.e < 0 and not other:
                 yield file
                 return
-            with WarpedVRT(file, crs=self.crs) as warped:
+            # Without a system GDAL needs one all the same.
+            source_crs, crs = (file.crs, self.crs) if other else (file.crs or PLAIN, file.crs or PLAIN)
+            with WarpedVRT(file, src_crs=source_crs, crs=crs, **_around(file, isinstance(source, Surface))) as warped:
                 yield warped
 
     def _units(self) -> tuple[float, str, str]:
@@ -421,8 +453,10 @@ def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     if is_local(own) or not (own.is_geographic or (own.is_projected and in_metres(own))):
         return crs
     with _opened(sheet.layers[0].source) as file:
-        west, south, east, north = file.bounds
-    metric = system_of_ground(own, ((west + east) / 2, (south + north) / 2), sheet.folder, "gdal_edit.py -a_srs")
+        corner, column, row = file.transform, file.width / 2, file.height / 2
+    x = corner.c + corner.a * column + corner.b * row
+    y = corner.f + corner.d * column + corner.e * row
+    metric = system_of_ground(own, (x, y), sheet.folder, "gdal_edit.py -a_srs")
     return crs if same_system(metric, own) else type(crs).from_wkt(metric.to_wkt())
 
 
@@ -431,27 +465,67 @@ def _system(sheet: Sheet) -> Any:
         return file.crs
 
 
-@contextmanager
-def _opened(source: Path | Surface) -> Iterator[Any]:
-    if isinstance(source, Surface):
-        with source.in_metres() as file:
-            yield file
-        return
-    rasterio = need("rasterio")
-    try:
-        with rasterio.open(source) as file:
-            yield file
-    except rasterio.errors.RasterioIOError as error:
-        raise RunError(f"{source} cannot be read ({error}): expected a GeoTIFF; make the map again") from error
+def _state(sheets: Sequence[Sheet]) -> list[tuple[int, int] | None]:
+    """Sizes and times of the files that sheets show."""
+    shown = [
+        *(layer.source for sheet in sheets for layer in sheet.layers),
+        *(sheet.folder / name for sheet in sheets for name in (CHANGE_FILE, MAP_FILE)),
+    ]
+    state: list[tuple[int, int] | None] = []
+    for source in shown:
+        try:
+            found = os.stat(source.path if isinstance(source, Surface) else source)
+            state.append((found.st_size, found.st_mtime_ns))
+        except OSError:
+            state.append(None)
+    return state
 
 
-def _usual(source: Path | Surface, band: int) -> tuple[float, float]:
-    """The 2nd and 98th percentile of a raster's values, from a small picture of it."""
+@cache
+def _same(one: str, other: str) -> bool:
+    """Whether two systems, as WKT, differ in nothing but their heights."""
+    from pyproj import CRS
+
+    return one == other or same_system(CRS.from_wkt(one), CRS.from_wkt(other))
+
+
+def _around(file: Any, heights: bool) -> dict[str, Any]:
+    """Options of a warp that leave what is around a turned raster empty, which is 0 otherwise, a height or black."""
+    from rasterio.enums import MaskFlags
+
+    if any(MaskFlags.alpha in flags for flags in file.mask_flag_enums):
+        return {}
+    if heights or file.dtypes[0].startswith("float"):
+        return {"nodata": math.nan, "dtype": "float32"}
+    return {"add_alpha": True} if file.nodata is None else {}
+
+
+def _require_place(path: Path) -> None:
+    """Raises: RunError when a picture has no corners on a map."""
+    with opened(path) as file:
+        if file.transform.is_identity:
+            raise RunError(
+                f"{path} has no place on a map: expected a georeferenced GeoTIFF; state its corners (gdal_edit.py "
+                "-a_ullr)"
+            )
+
+
+def _opened(source: Path | Surface) -> AbstractContextManager[Any]:
+    return source.in_metres() if isinstance(source, Surface) else opened(source)
+
+
+def _overview(source: Path | Surface, band: int) -> Float64[np.ndarray, " N"]:
+    """The values of a raster, from a small picture of it."""
     with _opened(source) as file:
         step = max(1.0, max(file.shape) / 512)
         shape = tuple(max(1, round(side / step)) for side in file.shape)
         values = file.read(band, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
-    known = values[np.isfinite(values)]
+    return values[np.isfinite(values)]
+
+
+def _usual(source: Path | Surface, band: int) -> tuple[float, float]:
+    """The 2nd and 98th percentile of a raster's values, from a small picture of it."""
+    known = _overview(source, band)
     if not len(known):
         return 0.0, 1.0
     low, high = np.percentile(known, [2, 98]).tolist()
@@ -460,7 +534,7 @@ def _usual(source: Path | Surface, band: int) -> tuple[float, float]:
 
 def _picture_bands(file: Any) -> list[int]:
     """The bands of a picture: red, green and blue, or grey."""
-    return [1, 2, 3] if file.count >= 3 else [1]
+    return [1, 2, 3] if sum(kind.name != "alpha" for kind in file.colorinterp) >= 3 else [1]
 
 
 def _black_white(path: Path) -> tuple[float, float]:
@@ -477,9 +551,11 @@ def _black_white(path: Path) -> tuple[float, float]:
 
 
 def _read(
-    file: Any, bands: list[int], west: float, north: float, resolution: float, rasterio: Any
+    file: Any, bands: list[int], west: float, north: float, resolution: float
 ) -> tuple[np.ndarray, Bool[np.ndarray, "P P"]]:
     """Bands of a tile, and where they are known."""
+    from rasterio.windows import Window
+
     values = np.zeros((len(bands), TILE_PX, TILE_PX), np.float32)
     seen = np.zeros((TILE_PX, TILE_PX), bool)
     box = file.bounds
@@ -494,29 +570,29 @@ def _read(
         columns = np.floor((np.arange(c0, c1) + 0.5 - left) * across).astype(int)
         rows = np.floor((np.arange(r0, r1) + 0.5 - top) * down).astype(int)
         columns, rows = (np.clip(x, 0, n - 1) for x, n in ((columns, file.width), (rows, file.height)))
-        window = rasterio.windows.Window(columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1)
-        part, known = _known(file, bands, window, None, rasterio)
+        window = Window(columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1)  # type: ignore[call-arg]
+        part, known = _known(file, bands, window, None)
         nearest = np.ix_(rows - rows[0], columns - columns[0])
         values[:, r0:r1, c0:c1] = np.where(known, part, 0)[:, nearest[0], nearest[1]]
         seen[r0:r1, c0:c1] = known[nearest]
         return values, seen
     col, row = max(0.0, (c0 - left) * across), max(0.0, (r0 - top) * down)
-    window = rasterio.windows.Window(
-        col, row, min(file.width - col, (c1 - c0) * across), min(file.height - row, (r1 - r0) * down)
-    )
-    part, known = _known(file, bands, window, (r1 - r0, c1 - c0), rasterio)
+    width, height = min(file.width - col, (c1 - c0) * across), min(file.height - row, (r1 - r0) * down)
+    window = Window(col, row, width, height)  # type: ignore[call-arg]
+    part, known = _known(file, bands, window, (r1 - r0, c1 - c0))
     values[:, r0:r1, c0:c1] = np.where(known, part, 0)
     seen[r0:r1, c0:c1] = known
     return values, seen
 
 
 def _known(
-    file: Any, bands: list[int], window: Any, shape: tuple[int, int] | None, rasterio: Any
+    file: Any, bands: list[int], window: Any, shape: tuple[int, int] | None
 ) -> tuple[np.ndarray, Bool[np.ndarray, "h w"]]:
     """Bands of a window, averaged to a shape, and where they are known."""
-    average = rasterio.enums.Resampling.average
+    from rasterio.enums import Resampling
+
     out = None if shape is None else (len(bands), *shape)
-    part = file.read(bands, window=window, out_shape=out, resampling=average, masked=True)
+    part = file.read(bands, window=window, out_shape=out, resampling=Resampling.average, masked=True)
     known = file.dataset_mask(window=window, out_shape=shape or part.shape[1:]) > 0
     known &= ~np.ma.getmaskarray(part).any(axis=0)
     if part.dtype.kind == "f":
@@ -559,9 +635,10 @@ def _band(file: Any, band: int, window: Any) -> Float64[np.ndarray, "h w"]:
     return file.read(band, window=window, masked=True).astype(np.float64).filled(np.nan)
 
 
-def _cells_in(file: Any, polygon: Any, rasterio: Any) -> tuple[Any, Bool[np.ndarray, "h w"]]:
+def _cells_in(file: Any, polygon: Any) -> tuple[Any, Bool[np.ndarray, "h w"]]:
     """The window of a raster around a polygon, and which of its cells have their centres inside."""
     from rasterio.features import geometry_mask
+    from rasterio.windows import Window
 
     west, south, east, north = polygon.bounds
     (c0, r0), (c1, r1) = _cells(file, np.array([[west, north], [east, south]]))
@@ -570,7 +647,7 @@ def _cells_in(file: Any, polygon: Any, rasterio: Any) -> tuple[Any, Bool[np.ndar
     width, height = max(0, columns[1] - columns[0]), max(0, rows[1] - rows[0])
     if width * height > MOST_CELLS:
         raise RunError(f"the polygon covers {width} x {height} cells: expected {MOST_CELLS:,} or fewer; draw a smaller")
-    window = rasterio.windows.Window(columns[0], rows[0], width, height)
+    window = Window(columns[0], rows[0], width, height)  # type: ignore[call-arg]
     if not width or not height:
         return window, np.zeros((0, 0), bool)
     transform = _corner_at(file.transform, window)
@@ -602,7 +679,12 @@ def _change_volumes(
         shared = np.full_like(sigma, numbers.get("registration", {}).get("systematic_m", 0.0))
     measured = numbers.get("variogram", {})
     variogram = Variogram(tuple(measured.get("sill_shares", ())), tuple(measured.get("ranges_m", ())))
-    datum = float(numbers.get("registration", {}).get("datum_error_m", 0.0))
+    registration = numbers.get("registration", {})
+    stated = float(registration.get("datum_error_m", 0.0)) * np.count_nonzero(inside)
+    # Beyond a tilt, whose error is another in each cell, the part of the shift is not found.
+    if registration.get("shift_error_stated") and registration.get("model") != "tilt":
+        own = float(registration.get("systematic_m", 0.0))
+        stated = math.hypot(stated, float(np.sqrt(np.maximum(shared[inside] ** 2 - own**2, 0)).sum()))
     freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
     result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
     error = region_error(sigma.astype(np.float32), inside, variogram, cell_m)
@@ -614,7 +696,7 @@ def _change_volumes(
         float(shared[inside].sum()) * cell_area,
         area,
         degrees_of_freedom=freedom,
-        datum_m3=datum * area,
+        datum_m3=stated * cell_area,
     )
     low, high = net.interval_m3
     result["net"] = {"value_m3": net.value_m3, "low_m3": low, "high_m3": high}

@@ -63,11 +63,14 @@ class _Viewer:
     camera: Cameras
     serial: int = 0
     asked: float = 0.0
+    since: float = 0.0
+    """When it asked, or the method was replaced: pictures are counted from then."""
     wants_coarse: bool = True
     wants_sharp: bool = True
     last_coarse: float = 0.0
     last_sharp: float = 0.0
     seen: ColouredPoints | None = field(default=None, repr=False)
+    showing: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
 
 class FrameServer:
@@ -107,7 +110,8 @@ class FrameServer:
         """
         with self._changed:
             viewer = self._viewers.setdefault(who, _Viewer(show, camera))
-            viewer.show, viewer.camera, viewer.serial, viewer.asked = show, camera, viewer.serial + 1, time.monotonic()
+            viewer.show, viewer.camera, viewer.serial = show, camera, viewer.serial + 1
+            viewer.asked = viewer.since = time.monotonic()
             viewer.wants_coarse = viewer.wants_sharp = True
             self._changed.notify_all()
 
@@ -122,7 +126,7 @@ class FrameServer:
         with self._changed:
             self._render = render
             for viewer in self._viewers.values():
-                viewer.wants_sharp = True
+                viewer.wants_sharp, viewer.since = True, time.monotonic()
             self._changed.notify_all()
 
     @property
@@ -154,7 +158,11 @@ class FrameServer:
                     return
                 waiting = self._waiting_for_coarse()
             if not waiting:
-                self._may_prepare = self._prepare()
+                try:
+                    self._may_prepare = self._prepare()
+                except Exception:  # pictures are made without
+                    log.exception("coarse pictures could not be prepared")
+                    self._may_prepare, self._prepare = False, lambda: False
                 continue
             with self._changed:
                 waiting = self._waiting_for_coarse()
@@ -163,12 +171,12 @@ class FrameServer:
                 who = min(waiting, key=lambda one: self._viewers[one].last_coarse)
                 viewer = self._viewers[who]
                 viewer.wants_coarse, self._making_coarse = False, True
-                camera, asked, seen = viewer.camera, viewer.asked, viewer.seen
+                serial, camera, since, seen = viewer.serial, viewer.camera, viewer.since, viewer.seen
             try:
                 height = max(1, round(camera.height * COARSE_PX / camera.width))
                 small = camera.resized(COARSE_PX, height) if camera.width > COARSE_PX else camera
-                frame = self._made(lambda small=small, seen=seen: self._coarse(small, seen), small, False, asked)
-                self._show(who, viewer, frame)
+                frame = self._made(lambda small=small, seen=seen: self._coarse(small, seen), small, False, since)
+                self._show(who, viewer, frame, serial)
             finally:
                 with self._changed:
                     self._making_coarse, self._may_prepare = False, True
@@ -186,7 +194,7 @@ class FrameServer:
                     return
                 who, viewer = found
                 viewer.wants_sharp, self._making_sharp = False, True
-                serial, camera, asked, render = viewer.serial, viewer.camera, viewer.asked, self._render
+                serial, camera, since, render = viewer.serial, viewer.camera, viewer.since, self._render
 
             def check(who: Hashable = who, viewer: _Viewer = viewer, serial: int = serial) -> None:
                 """Cancel what is not wanted any more, and let coarse pictures go first."""
@@ -201,7 +209,7 @@ class FrameServer:
             try:
                 with interruptible(check):
                     check()
-                    frame = self._made(lambda render=render, camera=camera: render(camera), camera, True, asked)
+                    frame = self._made(lambda render=render, camera=camera: render(camera), camera, True, since)
                 check()
             except Cancelled:
                 continue
@@ -210,7 +218,7 @@ class FrameServer:
             if frame.rendering is not None:
                 viewer.seen = points_of(frame.rendering, camera)
             viewer.last_sharp = time.monotonic()
-            self._show(who, viewer, frame)
+            self._show(who, viewer, frame, serial)
 
     def _waiting_for_coarse(self) -> list[Hashable]:
         return [who for who, viewer in self._viewers.items() if viewer.wants_coarse]
@@ -230,7 +238,7 @@ class FrameServer:
         waiting = [viewer.asked for viewer in self._viewers.values() if viewer.wants_sharp]
         return max(0.01, min(waiting) + self._rest - time.monotonic()) if waiting else None
 
-    def _made(self, make: Callable[[], Rendering], camera: Cameras, sharp: bool, asked: float) -> Frame:
+    def _made(self, make: Callable[[], Rendering], camera: Cameras, sharp: bool, since: float) -> Frame:
         rendering, error = None, None
         try:
             rendering = make()
@@ -242,10 +250,13 @@ class FrameServer:
             if not self._closed:  # otherwise what it renders with may be gone already
                 log.exception("a view could not be rendered")
             error = DEFECT
-        return Frame(rendering, camera, sharp, time.monotonic() - asked, error)
+        return Frame(rendering, camera, sharp, time.monotonic() - since, error)
 
-    def _show(self, who: Hashable, viewer: _Viewer, frame: Frame) -> None:
-        if self._viewers.get(who) is viewer:
+    def _show(self, who: Hashable, viewer: _Viewer, frame: Frame, serial: int) -> None:
+        with viewer.showing:
+            # A coarse picture of a camera that has moved on since is the newest that there is, a sharp one is not.
+            if self._viewers.get(who) is not viewer or (frame.sharp and viewer.serial != serial):
+                return
             try:
                 viewer.show(frame)
             except Exception:  # the others' pictures go on

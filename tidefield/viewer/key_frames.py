@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from tidefield.errors import TidefieldError
+from tidefield.viewer.words import code
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 FRAMES_PER_SECOND = 24.0
 WIDTH, HEIGHT = 1280, 720
 PREVIEW_FRAMES_PER_SECOND = 12.0
+WRAPPED = 6
+"""Key frames of a closed path that its orientations pass through again before its start and after its end."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,16 @@ def interpolate(keys: Sequence[KeyFrame], count: int, closed: bool = False) -> l
     """
     if len(keys) < 2:
         raise TidefieldError(f"the path has {len(keys)} key frames: expected two or more; add some")
+    first, last = (-WRAPPED, len(keys) + WRAPPED) if closed else (0, len(keys) - 1)
+    turns = range(first, last + 1)
+    rotations = Rotation.from_matrix(np.stack([keys[k % len(keys)].rotation for k in turns]))
     keys = [*keys, keys[0]] if closed else list(keys)
     knots = np.arange(len(keys), dtype=np.float64)
     at = np.linspace(0, knots[-1], count, endpoint=not closed)
     ends = "periodic" if closed else "natural"
     position = CubicSpline(knots, np.stack([key.position_world for key in keys]), bc_type=ends)(at)
     fov = CubicSpline(knots, np.array([key.fov for key in keys]), bc_type=ends)(at)
-    rotation = RotationSpline(knots, Rotation.from_matrix(np.stack([key.rotation for key in keys])))(at).as_matrix()
+    rotation = RotationSpline(turns, rotations)(at).as_matrix()
     narrowest, widest = math.radians(0.1), math.radians(170)
     return [
         KeyFrame(p, r, float(np.clip(f, narrowest, widest))) for p, r, f in zip(position, rotation, fov, strict=True)
@@ -178,4 +184,4 @@ class PathEditor:
         content = json.dumps(path, allow_nan=False).encode()
         self.client.send_file_download("camera_path.json", content, save_immediately=True)
         command = render_command(self._source)
-        self._text.content = f"{len(frames)} frames saved. Render them: `{command}`"
+        self._text.content = f"{len(frames)} frames saved. Render them: {code(command)}"

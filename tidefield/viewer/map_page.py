@@ -21,6 +21,7 @@ from jaxtyping import Float64
 from tidefield.errors import RunError, TidefieldError
 from tidefield.viewer.atlas import MOST_POINTS, Atlas
 from tidefield.viewer.ports import LOCAL_HOSTS, page_address, require_port
+from tidefield.viewer.words import without_folders
 
 log = logging.getLogger(__name__)
 
@@ -63,9 +64,23 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, atlas: Atlas, host: str, port: int) -> None:
         self.address_family = require_port(host, port)
         super().__init__((host, port), _Handler)
-        self.atlas, self.local = atlas, host in LOCAL_HOSTS
-        # Other maps have the same addresses: browsers keep the tiles of each server apart by this.
+        self.local = host in LOCAL_HOSTS
+        self._renewing = threading.Lock()
+        self._show(atlas)
+
+    def _show(self, atlas: Atlas) -> None:
+        self.atlas = atlas
+        # Other maps have the same addresses: browsers keep the tiles of each server, and of a map that was made again,
+        # apart by this.
         self.version = secrets.token_hex(8)
+        self.unreadable: set[tuple[str, ...]] = set()
+
+    def renewed(self) -> tuple[Atlas, str]:
+        """What is shown, read again where files have changed, and its version."""
+        with self._renewing:
+            if self.atlas.is_outdated:
+                self._show(Atlas(self.atlas.folders))
+            return self.atlas, self.version
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log what has ended a connection; Python would print it on the terminal, whatever was asked for."""
@@ -95,7 +110,7 @@ class _Handler(BaseHTTPRequestHandler):
             parts = _split(self.path)
             self._answer(parts.path, parse_qs(parts.query))
         except TidefieldError as error:
-            self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
+            self._json({"error": without_folders(str(error), self._own.atlas.folders)}, HTTPStatus.BAD_REQUEST)
         except (ConnectionError, TimeoutError):
             self.close_connection = True  # the browser has moved on
         except Exception:
@@ -107,7 +122,8 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "/":
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", PAGE.read_bytes())
         elif path == "/atlas.json":
-            self._json({**atlas.describe(), "version": self._own.version})
+            atlas, version = self._own.renewed()
+            self._json({**atlas.describe(), "version": version})
         elif path == "/at":
             (point,) = _points(query, 1, 1)
             self._json(atlas.at(*point.tolist()))
@@ -118,7 +134,13 @@ class _Handler(BaseHTTPRequestHandler):
             self._json(atlas.area(_points(query, 3, MOST_POINTS), max(0.0, detection)))
         elif found := _TILE.fullmatch(path):
             sheet, layer, level, column, row = found.groups()
-            content = atlas.tile(int(sheet), layer, int(level), int(column), int(row))
+            try:
+                content = atlas.tile(int(sheet), layer, int(level), int(column), int(row))
+            except TidefieldError as error:
+                if (sheet, layer) not in self._own.unreadable:  # which has many tiles
+                    self._own.unreadable.add((sheet, layer))
+                    log.warning(str(error))
+                raise
             if content is None:
                 self._send(HTTPStatus.NO_CONTENT, "image/png", b"")
             else:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -15,8 +16,8 @@ from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from tidefield.data.scene import Scene
@@ -29,6 +30,7 @@ from tidefield.viewer.frames import Frame, FrameServer
 from tidefield.viewer.key_frames import KeyFrame, PathEditor
 from tidefield.viewer.ports import page_address, require_port
 from tidefield.viewer.preview import Preview
+from tidefield.viewer.words import plain, shown, without_folders
 
 if TYPE_CHECKING:
     from viser import CameraFrustumHandle, ClientHandle, ViserServer
@@ -92,10 +94,16 @@ class ScenePage:
         self.scene, self.source, self.width = scene, source or (name,), width
         layout = layout_of(scene)
         self.scale = SHOWN_DISTANCE / layout.distance
+        self.positions = self.scale * scene.cameras.position_world.double().cpu().numpy()
+        apart = np.array([self.scale])
+        if len(self.positions) > 1:
+            apart = KDTree(self.positions).query(self.positions, k=2)[0][:, 1]
+        self.frustum_size = FRUSTUM_SIZE * float(np.median(apart))
+        self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         preview = Preview(scene)
         self.frames = FrameServer(preview, render, preview.prepare)
         with redirect_stdout(StringIO()):  # viser's own table of addresses
-            self.server: ViserServer = viser.ViserServer(host=host, port=port, label=name, verbose=False)
+            self.server: ViserServer = viser.ViserServer(host=host, port=port, label=shown(name), verbose=False)
         # Its button would send the page through a server of viser's makers.
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
         self.server.scene.set_up_direction(layout.up)
@@ -119,6 +127,14 @@ class ScenePage:
         with redirect_stdout(StringIO()):
             self.server.stop()
 
+    def thumbnail(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """A small picture of a photograph, which is read for the first browser only."""
+        if index not in self._thumbnails:
+            picture = self.scene.photographs[index]
+            every = max(1, picture.shape[1] // THUMBNAIL_PX)
+            self._thumbnails[index] = np.ascontiguousarray(picture[::every, ::every].cpu().numpy())
+        return self._thumbnails[index]
+
     def _picture_up(self, forward: Any, up: Any) -> Float64[np.ndarray, "3"]:
         """What is up in the first picture: away from the ground, or for a camera that looks down, along its top."""
         if abs(float(np.dot(forward, up))) < 0.95:
@@ -138,6 +154,7 @@ class _Client:
 
     def __init__(self, page: ScenePage, client: ClientHandle) -> None:
         self.page, self.client, self.last = page, client, None
+        self._moves, self._asking, self._drawing = 0, threading.Lock(), threading.Lock()
         gui, scene = client.gui, page.scene
         tabs = gui.add_tab_group()
         with tabs.add_tab("View"):
@@ -146,9 +163,10 @@ class _Client:
             self.layer.on_update(lambda _: self._show_last())
             photographs = gui.add_checkbox("Photographs", True)
             points = gui.add_checkbox("Sparse points", False, disabled=scene.points is None)
-            choice = gui.add_dropdown("Photograph", scene.names)
+            names = {shown(name): name for name in scene.names}
+            choice = gui.add_dropdown("Photograph", tuple(names))
             fly = gui.add_button("Fly there")
-            fly.on_click(lambda _: self.fly_to_photograph(choice.value))
+            fly.on_click(lambda _: self.fly_to_photograph(names[choice.value]))
             link = gui.add_button("Address of this view")
             link.on_click(lambda _: self._show_address())
             self.link = gui.add_markdown("")
@@ -175,27 +193,36 @@ class _Client:
         """Have the picture of where the camera is now made."""
         if not (self.client.camera.image_width and self.client.camera.image_height):
             return  # a window of no size
-        self.page.frames.ask(self.client.client_id, self.camera(), self._show)
+        self._moves += 1
+        own = self._moves
+        with self._asking:  # viser calls from many threads: the last camera that is read is the last that is asked for
+            if own != self._moves:
+                return  # a newer move waits
+            self.page.frames.ask(self.client.client_id, self.camera(), self._show)
         if self.client.client_id not in self.page.server.get_clients():  # it left before it asked
             self.page.frames.leave(self.client.client_id)
             return
-        away = np.linalg.norm(self._positions - self.client.camera.position, axis=1)
+        away = np.linalg.norm(self.page.positions - self.client.camera.position, axis=1)
         for i, handle in self._each.items():  # one around the camera would hide the picture
-            if handle.visible != bool(away[i] > self._too_near):
-                handle.visible = bool(away[i] > self._too_near)
+            if handle.visible != bool(away[i] > 3 * self.page.frustum_size):
+                handle.visible = bool(away[i] > 3 * self.page.frustum_size)
 
     def _show(self, frame: Frame) -> None:
         if frame.error is not None:
-            self.status.content = f"**No picture:** {frame.error}"
+            words = without_folders(frame.error, [self.page.scene.root])
+            self.status.content = f"**No picture:** {plain(words)}"
             return
         self.last = frame
         self._show_last()
 
     def _show_last(self) -> None:
-        frame = self.last
-        if frame is None or frame.rendering is None:
-            return
+        with self._drawing:  # the last that is drawn is the last frame, too
+            if self.last is not None:
+                self._draw(self.last)
+
+    def _draw(self, frame: Frame) -> None:
         rendering = frame.rendering
+        assert rendering is not None, "frames with errors are none to draw"
         picture = colour_picture(rendering)
         if self.layer.value == "Depth":
             near, far = depth_range(rendering)
@@ -209,20 +236,13 @@ class _Client:
         self.status.content = f"{frame.camera.width} x {frame.camera.height}, {state}, {frame.seconds:.2f} s"
 
     def _add_photographs(self) -> None:
-        scene, scale = self.page.scene, self.page.scale
+        scene, size = self.page.scene, self.page.frustum_size
         self.frustums = self.client.scene.add_frame("/photographs", show_axes=False)
         self._each: dict[int, CameraFrustumHandle] = {}
-        self._positions = scale * scene.cameras.position_world.double().numpy()
         train = set(scene.train)
         step = -(-len(scene.names) // MOST_FRUSTUMS)
-        spread = scene.cameras.position_world.double()
-        near = torch.cdist(spread, spread).fill_diagonal_(torch.inf).amin(1).median() if len(spread) > 1 else 1.0
-        size = FRUSTUM_SIZE * scale * float(near)
-        self._too_near = 3 * size
         for i in range(0, len(scene.names), step):
             camera, name = scene.cameras[i], scene.names[i]
-            picture = scene.photographs[i]
-            every = max(1, picture.shape[1] // THUMBNAIL_PX)
             handle = self.client.scene.add_camera_frustum(
                 f"/photographs/{i}",
                 fov=2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1])),
@@ -230,10 +250,10 @@ class _Client:
                 scale=size,
                 thickness=0.02 * size,
                 color=(30, 110, 200) if i in train else (220, 120, 20),
-                image=np.ascontiguousarray(picture[::every, ::every].cpu().numpy()),
+                image=self.page.thumbnail(i),
                 jpeg_quality=70,
                 wxyz=_wxyz(camera),
-                position=scale * camera.position_world[0].double().numpy(),
+                position=self.page.positions[i],
                 cast_shadow=False,
                 receive_shadow=False,
             )

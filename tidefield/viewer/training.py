@@ -7,12 +7,15 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from tidefield.geometry.cameras import Cameras
+from tidefield.model.cache import FeatureCache
+from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
 from tidefield.recording import recording_lock
 from tidefield.viewer.frames import SAMPLING
 from tidefield.viewer.page import ScenePage
 
 if TYPE_CHECKING:
+    from tidefield.model.network import Network
     from tidefield.train.loop import Trainer
 
 REFRESH_SECONDS = 20.0
@@ -32,14 +35,15 @@ class TrainingPage:
     """
 
     def __init__(self, trainer: Trainer, name: str, host: str, port: int) -> None:
-        self.page = ScenePage(trainer.scene, _as_it_is(trainer), name, host, port)
+        self._kept: list[Renderer] = []
+        self.page = ScenePage(trainer.scene, _as_it_is(trainer, self._kept), name, host, port)
         self._shown = time.monotonic()
 
     def __call__(self, trainer: Trainer, used: float) -> None:
         """Show the network as it is now, if somebody looks and it is time."""
         if not self.page.frames.viewers or time.monotonic() - self._shown < REFRESH_SECONDS:
             return
-        self.page.frames.replace_method(_as_it_is(trainer))
+        self.page.frames.replace_method(_as_it_is(trainer, self._kept))
         self._shown = time.monotonic()
 
     def __enter__(self) -> TrainingPage:
@@ -49,16 +53,39 @@ class TrainingPage:
         self.page.close()
 
 
-def _as_it_is(trainer: Trainer) -> Render:
-    """A copy of what is trained, as a method; its renderer is made when the first picture is."""
+def _as_it_is(trainer: Trainer, kept: list[Renderer] | None = None) -> Render:
+    """A copy of what is trained, as a method; its renderer is made when the first picture is.
+
+    Args:
+        kept: the renderer of the copy before, which goes on with this one's network; the first one is put there.
+    """
+    from tidefield.train.loop import SceneTrainer
+
     still = copy.copy(trainer)
     still.network = copy.deepcopy(trainer.network).eval()
+    if isinstance(still, SceneTrainer):
+        still._open = still._ahead = None  # which the training would not give back otherwise
+    earlier: list[Renderer] = [] if kept is None else kept
     made: list[Render] = []
 
     def render(camera: Cameras) -> Rendering:
         with recording_lock:  # the training goes on in another thread
-            if not made:
+            if not made and earlier and isinstance(still, SceneTrainer):
+                _renew(earlier[0], still.network)
+                made.append(earlier[0])
+            elif not made:
                 made.append(still.renderer(SAMPLING))
+                earlier.extend(one for one in made if isinstance(one, Renderer))
             return made[0](camera)
 
     return render
+
+
+def _renew(renderer: Renderer, network: Network) -> None:
+    """Have a renderer use another network; what it has read and compared of photographs depends on none."""
+    pyramid = renderer.cache.pyramid
+    del renderer.cache  # its memory first
+    renderer._recorded = None
+    renderer.network = network
+    renderer.cache = FeatureCache(network, renderer.scene, renderer.device, SAMPLING.cones)
+    renderer.cache.pyramid = pyramid
