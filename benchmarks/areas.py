@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.records import store
 from tidefield.compare.run import Runner, run_measured, tidefield
 from tidefield.compare.tables import Table
 from tidefield.config import PRESETS, Budget
@@ -25,9 +26,8 @@ from tidefield.data.areas import cut
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.evaluation.metrics import psnr_from_mse
-from tidefield.files import read_json, write_json
+from tidefield.files import read_json
 from tidefield.geometry.cameras import Cameras
-from tidefield.machine import describe
 from tidefield.model.rendering import Render
 from tidefield.synthetic.flat import TidalFlat
 from tidefield.synthetic.large import LargeFlight, make_large_flight, planned_flight, write_large_scene
@@ -79,19 +79,21 @@ def measure_areas(
         folder = work / f"run_{count}_{width}"
         words = ["train", scene, folder, "--steps", steps, "--device", "cpu", "--overwrite", "--quiet"]
         usage = run(tidefield(*words), {})
-        record["memory"][str(count)] = {"seconds": usage.seconds, "peak_memory_bytes": usage.peak_memory_bytes}
-        _store(record, runs)
+        new = record["memory"][str(count)] = {"seconds": usage.seconds, "peak_memory_bytes": usage.peak_memory_bytes}
+        _store(record, new, runs)
     smallest = plans[min(plans)]
     for name in ("at once", "by areas"):
         if name not in record["compared"]:
             say(f"{min(plans)} photographs: {name}")
-            record["compared"][name] = compare(_scene(smallest, work), smallest, name == "by areas", compared_steps)
-            _store(record, runs)
+            new = compare(_scene(smallest, work), smallest, name == "by areas", compared_steps)
+            record["compared"][name] = new
+            _store(record, new, runs)
     return record
 
 
-def _store(record: dict[str, Any], runs: Path) -> None:
-    write_json(runs / AREAS_FILE, {**record, **describe(), "command": "python -m benchmarks areas"})
+def _store(record: dict[str, Any], new: dict[str, Any], runs: Path) -> None:
+    figures = [*record["memory"].values(), *record["compared"].values()]
+    store(runs / AREAS_FILE, record, new, figures, "python -m benchmarks areas")
 
 
 def _scene(plan: LargeFlight, work: Path) -> Path:

@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.maps import errors
+from benchmarks.records import store
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen, surface_depth, surface_points
-from tidefield.files import completed_folder, read_json, write_json
-from tidefield.machine import describe
+from tidefield.files import completed_folder, read_json
 from tidefield.model.rendering import Render
 from tidefield.synthetic.write import VEGETATION
 
@@ -76,7 +76,7 @@ def measure_depth(
         scene = load_scene(folder)
         record["figures"][name] = compare_depths(scene, open_scene(scene))
         command = f"python -m benchmarks depth --width {width} --views {views} --seed {seed}"
-        write_json(runs / DEPTH_FILE, {**record, **describe(), "command": command})
+        store(runs / DEPTH_FILE, record, record["figures"][name], record["figures"].values(), command)
     return record
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Bool
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.records import NETWORK, distinct_names, network_of, require_same, store
 from tidefield.baselines.splats import read_splats, render_splats
 from tidefield.commands.common import ZeroShot, open_source
 from tidefield.compare.tables import Table
@@ -28,8 +29,7 @@ from tidefield.data.load import at_width
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import Image8, flip_map, psnr, ssim_map
-from tidefield.files import read_json, write_json
-from tidefield.machine import describe
+from tidefield.files import read_json
 from tidefield.model.rendering import Render, to_8_bit
 from tidefield.render.consistency import PASSES, choose_points
 from tidefield.render.gaussians import SurfaceView, fuse, render_surfaces, write_gaussians
@@ -62,12 +62,20 @@ def measure_gaussians(
         say: reports progress.
 
     Raises:
-        RunError: a source holds no photograph out.
+        RunError: a source holds no photograph out, two have one name, or a figure that is kept is of other weights.
     """
     record = read_json(runs / GAUSSIANS_FILE) or {"figures": {}}
-    for source in sources:
-        name = source.resolve().name
-        missing = [width for width in widths if f"{name}, {width} px" not in record["figures"]]
+    for name, source in distinct_names(sources).items():
+        network, missing = {NETWORK: network_of(source)}, []
+        for width in widths:
+            kept = record["figures"].get(f"{name}, {width} px")
+            if kept is None:
+                missing.append(width)
+                continue
+            # Earlier versions stored the weights of scenes only, and those that a run had started from.
+            is_scene = kept["method"].get("run") is None
+            method = {NETWORK: kept["method"]["weights"]} if is_scene else {}
+            require_same(runs / GAUSSIANS_FILE, f"{name}, {width} px", method | kept["method"], network)
         if not missing:
             continue
         zero = ZeroShot(zero_shot=not (source / RUN_FILE).exists())
@@ -78,10 +86,10 @@ def measure_gaussians(
             for width in missing:
                 say(f"{name}, {width} px")
                 found = compare_ways(scene, render, width, device)
-                method = {key: about.get(key) for key in ("preset", "weights", "run")}
-                record["figures"][f"{name}, {width} px"] = {"ways": found, "method": method}
+                method = {key: about.get(key) for key in ("preset", "weights", "run")} | network
+                new = record["figures"][f"{name}, {width} px"] = {"ways": found, "method": method}
                 command = "python -m benchmarks gaussians SCENE|RUN..."
-                write_json(runs / GAUSSIANS_FILE, {**record, **describe(), "command": command})
+                store(runs / GAUSSIANS_FILE, record, new, record["figures"].values(), command)
     return record
 
 

@@ -11,11 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
+from benchmarks.records import store
 from benchmarks.surveys import photographs_of
 from tidefield.compare.run import Runner, tidefield
 from tidefield.compare.tables import NOTHING, Table
-from tidefield.files import read_json, write_json
-from tidefield.machine import describe
+from tidefield.files import read_json
 from tidefield.survey.sfm.mapping import Mapper
 
 MAPPERS_FILE = "mappers.json"
@@ -53,7 +53,8 @@ def measure_mappers(
             report = read_json(scene / "report.json")
             assert report is not None, "prepare writes it"
             measured[mapper] = {**asdict(usage), **_facts(report)}
-            write_json(runs / MAPPERS_FILE, {**record, **describe(), "command": "python -m benchmarks mappers"})
+            figures = [one for of in record["surveys"].values() for one in of.values()]
+            store(runs / MAPPERS_FILE, record, measured[mapper], figures, "python -m benchmarks mappers")
     return record
 
 

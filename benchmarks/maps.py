@@ -15,11 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks.records import store
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.files import completed_folder, read_json, write_json
-from tidefield.machine import describe
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, map_frame
 from tidefield.maps.make import CLASSES, DSM, DTM, MAP_FILE, ORTHOPHOTO, SIGMA
@@ -64,7 +64,7 @@ def measure_maps(
         say(f"{name}: baselines")
         record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
         command = f"python -m benchmarks maps --width {width} --views {views} --half {half_m:g}"
-        write_json(runs / MAPS_FILE, {**record, **describe(), "command": command})
+        store(runs / MAPS_FILE, record, record["figures"][name], record["figures"].values(), command)
     return record
 
 

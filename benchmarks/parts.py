@@ -13,13 +13,13 @@ from typing import Any
 
 import torch
 
+from benchmarks.records import distinct_names, store
 from tidefield.compare.tables import Table
 from tidefield.config import Config, config_from_json
 from tidefield.data.load import load_scene
 from tidefield.errors import RunError
 from tidefield.evaluation.evaluate import evaluate
-from tidefield.files import read_json, write_json
-from tidefield.machine import describe
+from tidefield.files import read_json
 from tidefield.methods import zero_shot
 from tidefield.progress import make_console
 from tidefield.train.checkpoint import read_weights_file, weights_sha256
@@ -47,8 +47,9 @@ def measure_parts(
         say: reports progress.
 
     Raises:
-        RunError: a file is damaged, or holds no weights of a preset.
+        RunError: a file is damaged, or holds no weights of a preset, or two scenes have one name.
     """
+    named = distinct_names(scenes)
     record, quiet = read_json(runs / PARTS_FILE) or {"files": {}, "figures": {}}, make_console(quiet=True)
     for file in files:
         header, _ = read_weights_file(file)
@@ -61,17 +62,19 @@ def measure_parts(
             "preset": config.preset,
             "without": list(config.network.without),
         }
-        for folder in scenes:
-            name = f"{folder.resolve().name}, {width} px"
-            if own not in record["figures"].setdefault(name, {}):
-                say(f"{name}: {file}")
-                scene = load_scene(folder, width=width)
-                render, _ = zero_shot(config, file, scene, device)
-                with TemporaryDirectory() as temporary:
-                    mean = evaluate(render, scene, Path(temporary) / "out", configuration={}, console=quiet).mean
-                record["figures"][name][own] = {metric: mean[f"{metric}_seen_cc"] for metric in METRICS}
+        for name, folder in named.items():
+            place = record["figures"].setdefault(f"{name}, {width} px", {})
+            if own in place:
+                continue
+            say(f"{name}, {width} px: {file}")
+            scene = load_scene(folder, width=width)
+            render, _ = zero_shot(config, file, scene, device)
+            with TemporaryDirectory() as temporary:
+                mean = evaluate(render, scene, Path(temporary) / "out", configuration={}, console=quiet).mean
+            place[own] = {metric: mean[f"{metric}_seen_cc"] for metric in METRICS}
+            figures = [one for of in record["figures"].values() for one in of.values()]
             command = "python -m benchmarks parts WEIGHTS... --scenes SCENE..."
-            write_json(runs / PARTS_FILE, {**record, **describe(), "command": command})
+            store(runs / PARTS_FILE, record, place[own], figures, command)
     return record
 
 

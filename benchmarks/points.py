@@ -15,17 +15,21 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.records import NETWORK, distinct_names, network_of, require_same, store
 from tidefield.compare.tables import Table
-from tidefield.data.load import read_posed
+from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
+from tidefield.data.load import own_lens, read_posed
 from tidefield.data.readers.colmap import find_colmap
-from tidefield.files import completed_folder, read_json, write_json
-from tidefield.machine import describe
+from tidefield.files import completed_folder, read_json
+from tidefield.geometry.lenses import colmap_parameters
 from tidefield.survey.sfm.features import set_up_pycolmap
 
 POINTS_FILE = "points.json"
 WAYS = ("with", "without")
 METRICS = ("psnr_seen_cc", "ssim_seen_cc", "flip_seen_cc")
 MODELS = ("sparse/0", "sparse")
+TRANSFORMS_FILE = "transforms.json"
+"""Its split counts, next to a COLMAP model."""
 
 
 def measure_points(
@@ -47,10 +51,13 @@ def measure_points(
         device: to render on.
         run: runs a command of Tidefield's, given without "tidefield".
         say: reports progress.
+
+    Raises:
+        RunError: two scenes have one name, or a figure that is kept is of other weights.
     """
     record = read_json(runs / POINTS_FILE) or {"figures": {}}
-    for scene in scenes:
-        name = scene.resolve().name
+    for name, scene in distinct_names(scenes).items():
+        network = {NETWORK: network_of(scene)}
         folders = {"with": scene, "without": work / name}
         if find_colmap(scene, *MODELS) is None:
             folders["with"] = work / f"{name}_colmap"
@@ -65,6 +72,7 @@ def measure_points(
             for way in WAYS:
                 place = record["figures"].setdefault(name, {}).setdefault(str(width), {})
                 if way in place:
+                    require_same(runs / POINTS_FILE, f"{name}, {width} px, {way} points", place[way], network)
                     continue
                 say(f"{name}, {width} px, {way} points")
                 with TemporaryDirectory() as temporary:
@@ -73,14 +81,16 @@ def measure_points(
                     run([*words, "--device", device])
                     found = read_json(out / "evaluation.json")
                 place[way] = {metric: found["mean"][metric] for metric in METRICS}
-                write_json(
-                    runs / POINTS_FILE, {**record, **describe(), "command": "python -m benchmarks points SCENE..."}
-                )
+                place[way] |= {**network, "held_out": found["split"]["test"]}
+                held_out = {tuple(place[way]["held_out"]) for way in place}
+                assert len(held_out) == 1, f"{name} with and without points holds out other photographs: {held_out}"
+                figures = [one for of in record["figures"].values() for ways in of.values() for one in ways.values()]
+                store(runs / POINTS_FILE, record, place[way], figures, "python -m benchmarks points SCENE...")
     return record
 
 
 def write_without_points(scene: Path, folder: Path) -> None:
-    """Copy a COLMAP scene without its points."""
+    """Copy a COLMAP scene without its points: photographs, masks, split and gains stay."""
     import pycolmap
 
     model_folder = find_colmap(scene, *MODELS)
@@ -88,7 +98,12 @@ def write_without_points(scene: Path, folder: Path) -> None:
     model = pycolmap.Reconstruction(model_folder)
     for point in list(model.point3D_ids()):
         model.delete_point3D(point)
-    shutil.copytree(scene / "images", folder / "images")
+    for part in ("images", "masks"):
+        if (scene / part).is_dir():
+            shutil.copytree(scene / part, folder / part)
+    for file in (HOLDOUT_FILE, TRANSFORMS_FILE):
+        if (scene / file).is_file():
+            shutil.copy(scene / file, folder / file)
     (folder / "sparse" / "0").mkdir(parents=True)
     model.write_binary(folder / "sparse" / "0")
 
@@ -109,6 +124,9 @@ def write_colmap(scene: Path, folder: Path) -> None:
             rgba = picture.convert("RGBA")
         white = Image.new("RGBA", rgba.size, "white")
         Image.alpha_composite(white, rgba).convert("RGB").save(folder / "images" / name)
+        if posed.masks and (mask := posed.masks[i]) is not None:
+            (folder / "masks").mkdir(exist_ok=True)
+            shutil.copy(mask, folder / "masks" / f"{name}.png")
     with TemporaryDirectory() as temporary:
         database = Path(temporary) / "database.db"
         pycolmap.extract_features(
@@ -120,11 +138,11 @@ def write_colmap(scene: Path, folder: Path) -> None:
             keypoints = {name: db.read_keypoints(image.image_id)[:, :2] for name, image in images.items()}
             cameras = {}
             for name, i in zip(names, used, strict=True):
-                lens = posed.lenses[i]
-                parameters = [lens.fx, lens.fy, lens.cx, lens.cy]
+                lens, _ = own_lens(posed.paths[i], posed.lenses[i])
+                parameters = colmap_parameters(lens, lens.colmap_model)
                 size = {"width": lens.width, "height": lens.height}
                 number = images[name].camera_id
-                cameras[name] = pycolmap.Camera(camera_id=number, model="PINHOLE", params=parameters, **size)
+                cameras[name] = pycolmap.Camera(camera_id=number, model=lens.colmap_model, params=parameters, **size)
                 db.update_camera(cameras[name])
         model = pycolmap.Reconstruction()
         for name, i in zip(names, used, strict=True):

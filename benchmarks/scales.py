@@ -9,15 +9,15 @@ from typing import Any
 
 import torch
 
+from benchmarks.records import NETWORK, distinct_names, network_of, require_same, stamp
 from benchmarks.table import circumstances
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.pictures import decode
-from tidefield.errors import RunError
+from tidefield.device import choose_device
 from tidefield.evaluation.metrics import Image8
 from tidefield.evaluation.panels import Panel, side_by_side
 from tidefield.files import completed_file, read_json, write_json, write_text
-from tidefield.machine import describe
 from tidefield.train.checkpoint import RUN_FILE, read_run
 
 SCALES_FILE = "scales.json"
@@ -60,14 +60,15 @@ def measure_scales(
         By source, its figures by width and way, how it was opened, and where and when it was measured last.
 
     Raises:
-        RunError: two sources have one name.
+        RunError: two sources have one name, or figures that are kept are of other weights, or were measured at another
+            width or on another device.
     """
-    named = {source.resolve().name: source for source in sources}
-    if len(named) < len(sources):
-        raise RunError(f"two of {', '.join(map(str, sources))} have one name: expected different ones; rename a folder")
-    record = read_json(runs / SCALES_FILE) or {}
-    for name, source in named.items():
-        measured = record.setdefault(name, {"figures": {}})
+    record, device = read_json(runs / SCALES_FILE) or {}, str(choose_device(device))
+    for name, source in distinct_names(sources).items():
+        is_run = (source / RUN_FILE).exists()
+        asked = {NETWORK: network_of(source), "opened_px": None if is_run else width, "device": device}
+        measured = record.setdefault(name, {"figures": {}, **asked})
+        require_same(runs / SCALES_FILE, name, measured, asked)
         shown: dict[str, Image8] = {}
         for picture in widths:
             for way, options in WAYS.items():
@@ -78,7 +79,7 @@ def measure_scales(
                 say(f"{name}, {picture} px, {way}")
                 with TemporaryDirectory() as folder:
                     out = Path(folder) / "out"
-                    of = [] if (source / RUN_FILE).exists() else ["--zero-shot", "--opened-width", str(width)]
+                    of = [] if is_run else ["--zero-shot", "--opened-width", str(width)]
                     run(["evaluate", str(source), str(out), *of, "--width", str(picture), *options, "--device", device])
                     found = read_json(out / "evaluation.json")
                     if detail:
@@ -93,7 +94,8 @@ def measure_scales(
                 )
                 place[way] = {metric: found["mean"][metric] for metric in METRICS}
                 place[way] |= {"seconds": found["seconds_per_frame"], "protocol": found["protocol"]}
-                measured |= describe() | {"command": "python -m benchmarks scales RUN|SCENE..."}
+                figures = [one for ways in measured["figures"].values() for one in ways.values()]
+                stamp(measured, place[way], figures, "python -m benchmarks scales RUN|SCENE...")
                 write_json(runs / SCALES_FILE, record)
         if pictures is not None:
             _write_detail(source, shown, pictures / f"scales-{name}.png")

@@ -31,6 +31,7 @@ def write_rays(scene: str, out: str) -> None:
             "origins": rays.origins.tolist(),
             "directions": rays.directions.tolist(),
             "points": outputs.metadata["points3D_xyz"].tolist(),
+            "colours": outputs.metadata["points3D_rgb"].tolist(),
             "masks": [str(mask) for mask in outputs.mask_filenames or ()],
             "scale": outputs.dataparser_scale,
             "transform": outputs.dataparser_transform.tolist(),

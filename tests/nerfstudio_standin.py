@@ -112,9 +112,6 @@ class Trainer:
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         (self.checkpoint_dir / f"step-{step:09d}.ckpt").touch()
 
-    def get_train_rays_per_batch(self) -> int:
-        return self.config.pipeline.datamanager.train_num_rays_per_batch
-
     def get_outputs_for_camera(self, camera: Any) -> dict[str, Tensor]:
         """Colour, distance and opacity of what lies on the wall, between near and far."""
         assert self.is_evaluating

@@ -13,6 +13,7 @@ from tidefield.config import Budget, NerfConfig
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
 from tidefield.parallel import interruptible
+from tidefield.train.checkpoint import load_network
 
 CPU = torch.device("cpu")
 SMALL = NerfConfig(coarse=8, fine=8, depth=4, width=32, position_octaves=6, rays=128, learning_rate=5e-3)
@@ -199,3 +200,48 @@ def test_masked_pixels_are_not_drawn(scene: Scene):
     assert 100 < len(which) == kept.sum() < 500
     for drawn, all_of_them in zip((which, uv, colour), everything[:3], strict=True):
         assert torch.equal(drawn, all_of_them[kept])
+
+
+def overexposed(scene: Scene) -> Scene:
+    """White photographs, whose gain in the corners is a third of that in the middle of some."""
+    shading = torch.zeros(5, 15, 3)
+    shading[1, 3:] = -2.0
+    cameras = replace(wall.with_gains(scene.cameras), shading=shading)
+    white = tuple(torch.full_like(photograph, 255) for photograph in scene.photographs.colours)
+    return replace(scene, cameras=cameras, photographs=replace(scene.photographs, colours=white))
+
+
+class White(Mlp):
+    """As bright as a network may be."""
+
+    def forward(self, xyz, direction):
+        return torch.full(xyz.shape[:2], 1e3), torch.ones_like(xyz)
+
+
+def test_what_a_dark_photograph_overexposes_is_within_reach(scene: Scene, tmp_path: Path):
+    white = overexposed(scene)
+    learner = NerfTrainer(SMALL, white, 0, CPU)
+    gains = torch.stack([white.cameras[i].gain_of_rows().amin((0, 1)) for i in white.train])
+    assert gains.min() < 0.5
+    torch.testing.assert_close(learner.network.headroom, gains.amin(0))
+    learner.network.coarse = learner.network.fine = White(SMALL)
+    for index in white.train:
+        assert learner.renderer()(white.cameras[index]).colour.min() > 0.999
+    # A held-out photograph's gain, however small, changes nothing.
+    dark = replace(white.cameras, gain=white.cameras.gain.index_fill(0, torch.tensor([2]), 0.01))
+    other = NerfTrainer(SMALL, replace(white, cameras=dark), 0, CPU)
+    torch.testing.assert_close(other.network.headroom, learner.network.headroom)
+
+
+def test_a_checkpoint_has_its_headroom_and_an_older_one_none(scene: Scene, tmp_path: Path):
+    learner = NerfTrainer(SMALL, overexposed(scene), 0, CPU)
+    learner.save(tmp_path)
+    again = NerfTrainer(SMALL, scene, 0, CPU)
+    assert (again.network.headroom == 1).all()
+    load_network(tmp_path, again.network)
+    torch.testing.assert_close(again.network.headroom, learner.network.headroom)
+    del learner.network._buffers["headroom"]
+    learner.save(tmp_path)
+    load_network(tmp_path, again.network)
+    assert (again.network.headroom == 1).all()
+    again.resume(tmp_path)

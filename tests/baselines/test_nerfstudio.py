@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from pickle import UnpicklingError
-from subprocess import CompletedProcess
+from subprocess import PIPE, CompletedProcess
 from types import ModuleType, SimpleNamespace
 
 import nerfstudio_standin
@@ -19,16 +19,17 @@ from rich.console import Console
 from torch.torch_version import TorchVersion
 
 from tidefield.baselines.nerfstudio import driver, environment, worker
-from tidefield.config import Budget
+from tidefield.config import Budget, Sampling
 from tidefield.data.hull import Hull
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, make_curve
+from tidefield.evaluation.evaluate import _timed
 from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras, pixel_grid
-from tidefield.model.rendering import Rendering
+from tidefield.model.rendering import Rendering, with_rays
 
 CPU = torch.device("cpu")
 FAKE = """
@@ -54,7 +55,7 @@ if kind == "train":
             for name, camera in zip(more["curve"], job["curve_cameras"]):
                 picture(camera, out / name)
         answer(step=step, seconds=10.0 * step, **more)
-    answer(step=3, seconds=30.0, done=True, checkpoint="a/step-3.ckpt")
+    answer(step=3, seconds=30.0, done=True, checkpoint="a/step-3.ckpt", tiny_cuda_nn=False)
 else:
     assert job["checkpoint"] == "a/step-3.ckpt"
     answer(ready=True)
@@ -123,9 +124,13 @@ def test_training_and_rendering_go_through_the_worker(scene: Scene, tmp_path: Pa
             view = render(scene.cameras[index])
             grey = (0.5 / factor * scene.cameras.gain[index]).clamp(0, 1)
             torch.testing.assert_close(view.colour, grey.expand(36, 48, 3))
+        for rays in (1, 2):
+            seconds = _timed(with_rays(render, Sampling(rays_per_side=rays)), scene, 0)[1]
+            assert seconds == 0.1, "the way from nerfstudio's process is not counted"
     assert "nerfstudio says something" in (run / "nerfstudio.log").read_text()
     assert not (run / "rendering.npz").exists()
     assert driver.progress_of(run).step == 3
+    assert json.loads((run / "job.json").read_text())["tiny_cuda_nn"] is False
     write_json(run / "job.json", {**job, "method": "splatfacto"})
     with pytest.raises(RunError, match="splatfacto was asked for on cpu: expected CUDA"), driver.renderer(run, CPU):
         pass
@@ -148,9 +153,8 @@ def test_the_time_that_a_worker_renders_the_curve_in_is_not_that_of_training(
             for callback in trainer.callbacks:
                 callback(step)
 
-    rays = SimpleNamespace(get_train_rays_per_batch=lambda: 1024)
     trainer = SimpleNamespace(callbacks=[], train=train, save_checkpoint=lambda step: None, checkpoint_dir=tmp_path)
-    trainer.pipeline = SimpleNamespace(train=lambda: None, datamanager=rays)
+    trainer.pipeline = SimpleNamespace(train=lambda: None)
     (tmp_path / "step-1.ckpt").touch()
     callbacks = ModuleType("nerfstudio.engine.callbacks")
     callbacks.TrainingCallback = lambda _, function: function  # type: ignore[attr-defined]
@@ -162,7 +166,7 @@ def test_the_time_that_a_worker_renders_the_curve_in_is_not_that_of_training(
     monkeypatch.setattr(worker, "ModelCamera", lambda *_: SimpleNamespace(render=lambda path: pass_time(100.0)))
     monkeypatch.setattr(worker, "answer", lambda **values: said.append(values))
     job = {"curve_cameras": [{}, {}], "curve_seconds": [3.0], "seconds": 10.0, "out": str(tmp_path)}
-    worker.train(job)
+    worker.train(job | {"method": "nerfacto", "device": "cpu"})
     assert [one["seconds"] for one in said] == [*map(float, range(1, 11)), 10.0]
     assert [one["step"] for one in said] == [*range(1, 11), 10]
     assert [one["step"] for one in said if "curve" in one] == [3]
@@ -575,3 +579,86 @@ def test_masks_are_exported_for_all_photographs_or_none(scene: Scene, tmp_path: 
     assert [frame["mask_path"] for frame in frames] == [f"masks/{i:05d}.png" for i in range(5)]
     again = load_scene(tmp_path / "data")
     assert all(torch.equal(again.photographs.used(i), masked.photographs.used(i)) for i in range(5))
+
+
+def shaded(scene: Scene) -> Scene:
+    """White photographs, a third as bright in their corners; a held-out one is far darker."""
+    cameras = replace(scene.cameras, shading=torch.zeros(5, 15, 3))
+    assert cameras.shading is not None
+    cameras.shading[:, 3:] = -2.0
+    cameras.gain[0] = 0.01
+    white = tuple(torch.full_like(photograph, 255) for photograph in scene.photographs.colours)
+    return replace(scene, cameras=cameras, photographs=replace(scene.photographs, colours=white))
+
+
+def test_no_training_photograph_clips_at_the_common_exposure(scene: Scene, tmp_path: Path):
+    own = shaded(scene)
+    factor = driver.export(own, tmp_path).factor
+    assert 0.05 < factor.min() < 0.2, "of the training photographs, with their shading"
+    for index in own.train:
+        with Image.open(tmp_path / "images" / f"{index:05d}.png") as picture:
+            pixels = torch.from_numpy(np.array(picture)).float()
+        shown = pixels / factor * own.cameras[index].gain_of_rows()
+        assert (shown - 255).abs().max() <= 0.51 / float(factor.min()) * 1.3
+
+
+def test_an_export_that_was_interrupted_is_deleted(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(scene: Scene, folder: Path) -> None:
+        (folder / "images").mkdir(parents=True)
+        (folder / "images" / "00000.png").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(driver, "export", interrupted)
+    monkeypatch.setattr(driver, "require", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        driver.train("nerfacto", scene, tmp_path, Budget(steps=3), 0, CPU, None, lambda step, seconds: None)
+    with pytest.raises(RunError, match="not been trained to its end"):
+        driver.progress_of(tmp_path)
+    driver.delete_training(tmp_path)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_the_worker_gets_no_modules_of_our_python(tmp_path: Path, fake: None, monkeypatch: pytest.MonkeyPatch):
+    driver.WORKER.write_text("import json, os\nprint(json.dumps({**os.environ}), flush=True)\ninput()")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("OURS", "is kept")
+    with driver._worker(["train"], tmp_path / "log", CPU) as running:
+        found = running.answer()
+    assert "PYTHONPATH" not in found
+    assert found["OURS"] == "is kept"
+    printed = environment._run([sys.executable, "-c", "import os; print(*os.environ)"], stdout=PIPE, text=True).stdout
+    assert "PYTHONPATH" not in printed.split()
+
+
+def test_layers_of_tiny_cuda_nn_are_those_of_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    job = {"method": "nerfacto", "factor": [1.0] * 3, "trained": [3, 30.0], "checkpoint": "a", "tiny_cuda_nn": True}
+    write_json(tmp_path / "job.json", job)
+    with (
+        pytest.raises(RunError, match=r"trained with tiny-cuda-nn.* got cpu; render it"),
+        driver.renderer(tmp_path, CPU),
+    ):
+        pass
+    with pytest.raises(SystemExit, match="trained with tiny-cuda-nn, which is not in nerfstudio's environment"):
+        worker.uses_tiny_cuda_nn(job | {"device": "cuda"})
+    monkeypatch.setitem(sys.modules, "tinycudann", ModuleType("tinycudann"))
+    monkeypatch.setattr(worker.torch.cuda, "is_available", lambda: True)
+    asked = {"method": "nerfacto", "device": "cuda:0"}
+    assert worker.uses_tiny_cuda_nn(asked)
+    assert not worker.uses_tiny_cuda_nn(asked | {"tiny_cuda_nn": False}), "weights of PyTorch's layers do not fit"
+    assert not worker.uses_tiny_cuda_nn(asked | {"device": "cpu"})
+    assert not worker.uses_tiny_cuda_nn(asked | {"method": "splatfacto"})
+
+
+def test_an_interrupted_deletion_leaves_no_complete_installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(*_, **__) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr(environment, "_NEWEST_PYTHON", sys.version_info[:2])
+    environment.home().mkdir(parents=True)
+    environment._complete().touch()
+    monkeypatch.setattr(environment.shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        environment.install(True, Console(quiet=True))
+    with pytest.raises(RunError, match="is not installed"):
+        environment.python()

@@ -273,7 +273,7 @@ def test_a_damaged_job_is_named(job: str, run: Path):
 
 def test_points_have_the_exposure_of_the_photographs(scene: Scene):
     assert scene.points is not None
-    factor, first = exposure_factor(scene, scene.train), scene.train[0]
+    factor, first = exposure_factor(scene.cameras[list(scene.train)]), scene.train[0]
     mine = scene.points.camera_index == first
     u, v = scene.points.uv_px[mine].floor().long().unbind(-1)
     inside = (u >= 0) & (v >= 0) & (u < 48) & (v < 36)

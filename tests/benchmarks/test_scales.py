@@ -7,11 +7,13 @@ import pytest
 from PIL import Image
 
 from benchmarks.scales import METRICS, SCALES_FILE, SHOWN, WAYS, measure_scales, write_page
+from tidefield.errors import RunError
 from tidefield.files import read_json, write_json
 from tidefield.synthetic import make_survey, write_survey
 
 
-def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
+def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("benchmarks.scales.choose_device", lambda name: name)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "run.json").write_text("{}")
     commands: list[list[str]] = []
@@ -32,6 +34,9 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path):
     assert len(commands) == 2 * 2 * len(WAYS)
     assert ("--zero-shot" in commands[0], "--zero-shot" in commands[-1]) == (False, True)
     assert commands[1][-4:] == ["--rays-per-pixel", "4", "--device", "cpu"]
+    for words, expected in (((200, "cpu"), "scene with opened_px 400: expected 200"), ((400, "cuda"), "device cpu")):
+        with pytest.raises(RunError, match=expected):
+            measure_scales(sources[::-1], tmp_path, (100,), *words, run, lambda _: None)
     record = read_json(tmp_path / SCALES_FILE)
     record["run"]["machine"]["processor"] = "another"
     write_json(tmp_path / SCALES_FILE, record)

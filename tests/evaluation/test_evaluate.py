@@ -15,6 +15,7 @@ from tidefield.data.holdout import Holdout
 from tidefield.errors import RunError
 from tidefield.evaluation import evaluate as module
 from tidefield.evaluation.evaluate import evaluate
+from tidefield.evaluation.lpips import Lpips
 from tidefield.evaluation.metrics import METRICS, PSNR_LIMIT_DB, SUFFIXES
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
@@ -194,6 +195,29 @@ def test_means_are_over_the_photographs_that_have_a_value(tmp_path):
     assert "psnr_seen" in unseen["reasons"]
     assert report["mean"]["psnr_seen"] == seen["psnr_seen"]
     assert report["mean"]["psnr"] == pytest.approx((seen["psnr"] + unseen["psnr"]) / 2)
+
+
+class Half(Lpips):
+    """Finds the same distance everywhere."""
+
+    def __init__(self) -> None:
+        self.sha256 = "7be5be79"
+
+    def __call__(self, image, truth, masks):
+        return [0.5] * len(masks)
+
+
+def test_lpips_is_measured_of_all_photographs_or_of_none(tmp_path, monkeypatch):
+    own = wall.cameras(4, 48, 36)
+    larger = replace(own, size_px=torch.tensor([[48, 36], [48, 36], [48, 36], [64, 48]]))
+    scene = wall.scene(larger, test=(1, 3))
+    monkeypatch.setattr(module, "load_lpips", lambda: {"lpips_alex": Half(), "lpips_vgg": "no"})
+    for memory_px, expected in ((64 * 48, 0.5), (64 * 48 - 1, None)):
+        monkeypatch.setattr("tidefield.evaluation.lpips.memory_bytes", lambda px=memory_px: 2 * 150 * px)
+        report = evaluate(perfect, scene, tmp_path / str(memory_px), configuration={}, console=quiet()).report
+        assert [row["lpips_alex"] for row in report["per_photograph"].values()] == [expected, expected]
+        assert report["mean"]["reasons"]["lpips_vgg"] == "no", "the first reason"
+    assert report["mean"]["reasons"]["lpips_alex"].startswith("LPIPS of 64 x 48 pixels takes")
 
 
 def test_an_evaluation_is_only_overwritten_on_request(scene, tmp_path):

@@ -98,7 +98,7 @@ def test_the_data_parser_has_the_rays_of_the_lenses(tmp_path: Path, wide: bool):
     write_colmap(tmp_path / "scene", truth)
     model = pycolmap.Reconstruction(tmp_path / "scene" / "sparse" / "0")
     for point in model.points3D.values():
-        point.xyz = point.xyz + 0.3
+        point.xyz, point.color = point.xyz + 0.3, np.array([1, 2, 3], np.uint8)
     model.write_binary(tmp_path / "scene" / "sparse" / "0")
     mask = tmp_path / "scene" / "masks" / f"{sorted(truth.names)[1]}.png"
     mask.parent.mkdir(parents=True)
@@ -124,6 +124,8 @@ def test_the_data_parser_has_the_rays_of_the_lenses(tmp_path: Path, wide: bool):
         own = replace(posed.points, xyz_world=posed.points.xyz_world - middle)
         expected = triangulate_again(own, pose, posed.lenses, train)
         np.testing.assert_allclose(values["points"], scale * expected.xyz_world, atol=1e-4)
+        assert len(values["colours"]) == len(values["points"])
+        assert [1, 2, 3] not in values["colours"], "of all photographs, the held-out ones included"
         off, _ = KDTree(truth.ground - middle).query(expected.xyz_world)
         assert off.max() < 0.05, "where all photographs put them is forgotten"
     reach = np.abs(posed.T_world_camera[:, :, 3] - middle).max()

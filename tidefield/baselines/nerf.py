@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tidefield.baselines.export import exposure_factor
 from tidefield.config import USUAL_SAMPLING, NerfConfig, Sampling
 from tidefield.data.scene import Scene
 from tidefield.device import mixed_precision
@@ -83,7 +84,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Seen:
-    """What one pass sees along rays; what lies behind the scene is not in the colour."""
+    """What one pass sees along rays, at the common exposure; what lies behind the scene is not in the colour."""
 
     colour: Float[Tensor, "R 3"]
     depth: Float[Tensor, " R"]
@@ -92,10 +93,15 @@ class Seen:
 
 
 class Nerf(nn.Module):
-    """The coarse and the fine network. The scene's place is set once by `cover` and stored with the weights."""
+    """The coarse and the fine network. The scene's place and exposure are set once by `cover`, stored with the weights.
+
+    Colours of the networks, at most 1, divided by `headroom` are at the common exposure, where what a photograph of
+    small gain shows is brighter than 1.
+    """
 
     centre_world: Tensor
     radius: Tensor
+    headroom: Tensor
 
     def __init__(self, config: NerfConfig) -> None:
         super().__init__()
@@ -103,9 +109,10 @@ class Nerf(nn.Module):
         self.coarse, self.fine = Mlp(config), Mlp(config)
         self.register_buffer("centre_world", torch.zeros(3))
         self.register_buffer("radius", torch.ones(()))
+        self.register_buffer("headroom", torch.ones(3))
 
     def cover(self, cameras: Cameras) -> None:
-        """Bring all that cameras may see into [-1, 1]."""
+        """Bring all that cameras may see into [-1, 1], and all that their photographs may show within reach."""
         corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
         ends = cameras.directions_world(corners * cameras.size_px[:, None])
         points = cameras.position_world[:, None, None] + ends[:, :, None] * cameras.near_far[:, None, :, None]
@@ -113,6 +120,7 @@ class Nerf(nn.Module):
         low, high = points.amin(0), points.amax(0)
         self.centre_world.copy_((low + high) / 2)
         self.radius.copy_((high - low).max() / 2)
+        self.headroom.copy_(exposure_factor(cameras))
 
     def forward(
         self,
@@ -157,7 +165,7 @@ class Nerf(nn.Module):
         last = torch.full_like(far, torch.inf) if opaque else far - z[:, -1:]
         delta = torch.cat([z.diff(dim=-1), last], dim=-1) * length / self.radius
         w = weights(F.relu(density), delta)
-        return Seen(composite(w, colour), (w * z).sum(-1), w.sum(-1), w)
+        return Seen(composite(w, colour) / self.headroom, (w * z).sum(-1), w.sum(-1), w)
 
 
 def _sample(pdf: Float[Tensor, "1 R B"], count: int, generator: torch.Generator | None) -> Float[Tensor, "R M"]:

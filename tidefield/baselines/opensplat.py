@@ -320,7 +320,7 @@ def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:
             "more; leave opensplat out, or take a scene with points, such as a COLMAP model"
         )
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    factor, files, lenses = exposure_factor(scene, scene.train), [], []
+    factor, files, lenses = exposure_factor(scene.cameras[list(scene.train)]), [], []
     for number, index in enumerate(scene.train):
         camera = with_half_pixels(scene.cameras[index])
         (left, top), (width, height) = _centred_crop(camera, scene.names[index])

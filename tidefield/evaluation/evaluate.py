@@ -5,6 +5,7 @@ A method is only a function `render(camera) -> Rendering` here, so every method 
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import time
@@ -25,7 +26,8 @@ from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips, prepare_torchvision
+from tidefield.evaluation import EVALUATION_FILE
+from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips, prepare_torchvision, too_large
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
@@ -33,7 +35,7 @@ from tidefield.machine import commit
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar, make_console
 
-EVALUATION_FILE, FOLDERS = "evaluation.json", ("renderings", "pictures")
+FOLDERS = ("renderings", "pictures")
 NAMES = [metric + suffix for suffix in SUFFIXES for metric in METRICS]
 _COLUMNS = {"": "all", "_seen": "doubly seen", "_cc": "all, colour fit", "_seen_cc": "doubly seen, colour fit"}
 
@@ -90,7 +92,12 @@ def evaluate(
         if unusable := prepare_torchvision():
             raise RunError(f"--download-lpips was given, but {unusable}: expected what can use the weights; install it")
         download_lpips_weights()
-    networks = load_lpips()
+    # For all photographs or for none: a mean over the smaller ones only would depend on the memory of the machine.
+    width, height = max(scene.cameras.size_px[list(scene.test)].tolist(), key=math.prod)
+    networks = {
+        metric: network if isinstance(network, str) else too_large(metric, width, height) or network
+        for metric, network in load_lpips().items()
+    }
     with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
             rendering, seconds = _timed(render, scene, index)
@@ -144,14 +151,14 @@ def delete_evaluation(out: Path, names: Sequence[str]) -> None:
 
 
 def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
-    """Render the view of one photograph's camera, and measure the seconds."""
+    """Render the view of one photograph's camera; also the seconds, without the way from a process of the method's."""
     camera = scene.cameras[index]
     start = time.perf_counter()
     with torch.no_grad():
         rendering = render(camera)
     if rendering.colour.is_cuda:
         torch.cuda.synchronize(rendering.colour.device)
-    seconds = time.perf_counter() - start
+    seconds = time.perf_counter() - start if rendering.seconds is None else rendering.seconds
     expected, got = (camera.height, camera.width, 3), tuple(rendering.colour.shape)
     assert got == expected, f"a rendering of {got} for a camera of {expected}"
     if not (rendering.colour.isfinite().all() and rendering.depth.isfinite().all()):

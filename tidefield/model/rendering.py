@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -22,11 +22,13 @@ class Rendering:
         colour: in [0, 1], display-referred like the photographs, at the camera's gain.
         depth: expected z-depth (along the camera's +z), world units.
         opacity: share of the light that the scene stops, in [0, 1].
+        seconds: of a method in a process of its own, the time that it took there; None where the caller measures it.
     """
 
     colour: Float[Tensor, "H W 3"]
     depth: Float[Tensor, "H W"]
     opacity: Float[Tensor, "H W"]
+    seconds: float | None = field(default=None, kw_only=True)
 
 
 def to_8_bit(colour: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
@@ -76,4 +78,4 @@ def render_with_rays(render: Render, camera: Cameras, side: int) -> Rendering:
     inverse, opacity = 1 / view.depth, view.opacity
     whole, opacity, covered = F.avg_pool2d(torch.stack([inverse, opacity, opacity * inverse])[None], side)[0]
     inverse = torch.where(opacity > 0, covered / opacity.clamp(min=torch.finfo(opacity.dtype).tiny), whole)
-    return Rendering(colour=colour, depth=1 / inverse, opacity=opacity)
+    return Rendering(colour=colour, depth=1 / inverse, opacity=opacity, seconds=view.seconds)

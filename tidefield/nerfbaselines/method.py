@@ -29,7 +29,7 @@ from tidefield.files import read_json, write_json
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render
 from tidefield.render.camera_paths import free_camera
-from tidefield.train.checkpoint import given_or_shipped
+from tidefield.train.checkpoint import given_or_shipped, require_checkpoint
 from tidefield.train.loop import SceneTrainer
 
 SCENE, SETTINGS_FILE = "scene", "settings.json"
@@ -43,7 +43,7 @@ class TidefieldMethod(Method):
     """Trains on the photographs of a dataset from the installed weights on, or continues from a checkpoint.
 
     Raises:
-        RunError: there is neither, or a setting is unknown.
+        RunError: there is neither, a setting is unknown, or other than that of the checkpoint.
     """
 
     def __init__(
@@ -53,18 +53,29 @@ class TidefieldMethod(Method):
         train_dataset: Dataset | None = None,
         config_overrides: dict[str, Any] | None = None,
     ) -> None:
-        self.checkpoint, self._temporary = checkpoint, TemporaryDirectory()
-        self.folder = Path(self._temporary.name if checkpoint is None else checkpoint)
+        self.checkpoint = checkpoint
         if checkpoint is not None:
-            self.settings = _settings(read_json(self.folder / SETTINGS_FILE) or {})
+            self.folder = Path(checkpoint)
+            require_checkpoint(self.folder)
+            stored = read_json(self.folder / SETTINGS_FILE) or {}
+            self.settings = _settings(stored)
+            asked = _settings({**stored, **(config_overrides or {})})
+            if other := [f"{name}={asked[name]}" for name in SETTINGS if asked[name] != self.settings[name]]:
+                raise RunError(
+                    f"--set {' '.join(other)} was given with the checkpoint {checkpoint}: expected its own settings, "
+                    f"{', '.join(f'{name}={value}' for name, value in self.settings.items())}; leave --set out, or "
+                    "train without a checkpoint"
+                )
         else:
             if train_dataset is None:
                 raise RunError("neither a checkpoint nor a dataset was given: expected one of them; name one")
             self.settings = _settings(config_overrides or {})
+            self._temporary = TemporaryDirectory()
+            self.folder = Path(self._temporary.name)
             write_scene(train_dataset, self.folder / SCENE)
         self.scene = load_scene(self.folder / SCENE, hold_out=False)
         preset, seed = str(self.settings["preset"]), int(self.settings["seed"])
-        weights = given_or_shipped(None, preset)
+        weights = given_or_shipped(None, preset) if checkpoint is None else None
         self.trainer = SceneTrainer(PRESETS[preset], self.scene, seed, choose_device("auto"), weights)
         if checkpoint is not None:
             self.trainer.resume(self.folder)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -26,9 +26,10 @@ from PIL import Image
 from tidefield.data.cache import cache_folder
 from tidefield.data.georeference import find_georeference
 from tidefield.data.load import own_lens, read_posed
+from tidefield.data.pictures import decode
+from tidefield.data.readers.posed import Observations, PosedPhotographs
 from tidefield.data.triangulate import triangulate_again
 from tidefield.files import completed_file, write_json
-from tidefield.geometry.cameras import Cameras
 from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 
 PHOTOGRAPH = "photograph"
@@ -66,12 +67,14 @@ class SceneParserConfig(DataParserConfig):
     auto_scale_poses: bool = True
     """Scale positions to at most 1, as nerfstudio's own parser does; otherwise they are in metres around the middle of
     the cameras."""
+    load_3D_points: bool = True
+    """Read the sparse points, with which splatfacto starts; their colours are read from the photographs."""
 
 
 class SceneParser(DataParser):
     """Reads poses, lenses, masks, the split and the sparse points of a scene; photographs are left where they are.
 
-    Points are placed by the training photographs alone, as for our own methods.
+    Points are placed and coloured by the training photographs alone, as for our own methods.
     """
 
     config: SceneParserConfig
@@ -82,9 +85,12 @@ class SceneParser(DataParser):
         train, test = posed.train_and_test
         chosen = train if split == "train" else test
         pose, origin = posed.centred
-        points = posed.points and replace(posed.points, xyz_world=posed.points.xyz_world - origin)
-        if points is not None and len(points.uv_px):
-            points = triangulate_again(points, pose, posed.lenses, train)
+        points = posed.points if split == "train" and self.config.load_3D_points else None
+        if points is not None:
+            points = replace(points, xyz_world=points.xyz_world - origin)
+            if len(points.uv_px):
+                points = triangulate_again(points, pose, posed.lenses, train)
+                points = replace(points, rgb=_colours(points, posed, train))
         radius = float(np.abs(pose[:, :, 3]).max()) or 1.0
         scale = 1 / radius if self.config.auto_scale_poses else 1.0
         pose[:, :, 3] *= scale
@@ -113,6 +119,23 @@ class SceneParser(DataParser):
             georeference=None if frame is None else frame.to_json(),
             origin=tuple(origin.tolist()),
         )
+
+
+def _colours(points: Observations, posed: PosedPhotographs, train: Sequence[int]) -> UInt8[np.ndarray, "P 3"]:
+    """Sample each point's colour in the first training photograph that shows it; grey where none does.
+
+    A model's own colours are means over all photographs, the held-out ones included.
+    """
+    rgb = np.full((len(points.xyz_world), 3), 128, dtype=np.uint8)
+    rows = points.by_photograph(len(posed.names))
+    for index in reversed(train):
+        photograph, lens = decode(posed.paths[index])[..., :3], posed.lenses[index]
+        height, width = photograph.shape[:2]
+        u, v = np.floor(points.uv_px[rows[index]] * (width / lens.width, height / lens.height)).T
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        at = v[inside].astype(int), u[inside].astype(int)
+        rgb[points.point_index[rows[index]][inside]] = photograph[at]
+    return rgb
 
 
 def _white(lens: LensModel) -> Path:
@@ -159,12 +182,6 @@ def to_nerfstudio(
         camera_type=torch.tensor(kinds),
         metadata={PHOTOGRAPH: torch.tensor(photographs)[:, None]},
     )
-
-
-def pinholes(cameras: Cameras) -> list[Lens]:
-    """The lenses of undistorted photographs."""
-    columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
-    return [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
 
 
 PARSER = DataParserSpecification(SceneParserConfig(), "Scenes of Tidefield, with the way back into their coordinates")

@@ -27,6 +27,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from tidefield.baselines.export import pinholes
 from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
@@ -35,7 +36,7 @@ from tidefield.evaluation.metrics import psnr, psnr_from_mse
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, to_8_bit
-from tidefield.nerfstudio.data import PHOTOGRAPH, SceneOutputs, SceneParserConfig, pinholes, to_nerfstudio
+from tidefield.nerfstudio.data import PHOTOGRAPH, SceneOutputs, SceneParserConfig, to_nerfstudio
 from tidefield.recording import moved
 from tidefield.render.camera_paths import free_camera
 from tidefield.train.checkpoint import given_or_shipped
@@ -57,9 +58,10 @@ class SceneDataset(InputDataset):
     Args:
         outputs: of the data parser.
         width: of the photographs in pixels; None for their own.
+        is_trained: a checkpoint is read into the model once it is made.
     """
 
-    def __init__(self, outputs: SceneOutputs, width: int | None) -> None:
+    def __init__(self, outputs: SceneOutputs, width: int | None, is_trained: bool) -> None:
         super().__init__(outputs)
         self.scene = open_scene(outputs.metadata["root"], width)
         assert outputs.cameras.metadata is not None
@@ -68,7 +70,7 @@ class SceneDataset(InputDataset):
         pose = own.T_world_camera.double().numpy()
         pose[:, :, 3] *= outputs.dataparser_scale
         self.cameras = to_nerfstudio(pose, pinholes(own), self.photographs)
-        self.metadata = {"scene": self.scene, "scale": outputs.dataparser_scale}
+        self.metadata = {"scene": self.scene, "scale": outputs.dataparser_scale, "is_trained": is_trained}
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         photographs, index = self.scene.photographs, self.photographs[image_idx]
@@ -83,7 +85,7 @@ class SceneDataManagerConfig(FullImageDatamanagerConfig):
     """Photographs as Tidefield reads them."""
 
     _target: type = field(default_factory=lambda: SceneDataManager)
-    dataparser: SceneParserConfig = field(default_factory=SceneParserConfig)
+    dataparser: SceneParserConfig = field(default_factory=lambda: SceneParserConfig(load_3D_points=False))
     width: int | None = None
     """Width of the photographs in pixels; their own if not given."""
 
@@ -93,12 +95,18 @@ class SceneDataManager(FullImageDatamanager):
 
     config: SceneDataManagerConfig
     train_dataparser_outputs: SceneOutputs
+    rays_per_batch = 0
+    """Of the model's trainer, which sets it."""
 
     def create_train_dataset(self) -> SceneDataset:
-        return SceneDataset(self.train_dataparser_outputs, self.config.width)
+        return self._dataset(self.train_dataparser_outputs)
 
     def create_eval_dataset(self) -> SceneDataset:
-        return SceneDataset(self.dataparser.get_dataparser_outputs(split=self.test_split), self.config.width)
+        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
+
+    def _dataset(self, outputs: SceneOutputs) -> SceneDataset:
+        # nerfstudio trains in the mode "val"; in others it reads a checkpoint.
+        return SceneDataset(outputs, self.config.width, self.test_mode != "val")
 
     @cached_property
     def train_cameras(self) -> NerfstudioCameras:  # type: ignore[override]
@@ -108,8 +116,7 @@ class SceneDataManager(FullImageDatamanager):
         return self.train_cameras[:1], {}
 
     def get_train_rays_per_batch(self) -> int:
-        train = PRESETS["swift"].train
-        return train.tiles * train.tile_px**2
+        return self.rays_per_batch
 
 
 @dataclass
@@ -134,13 +141,14 @@ class TidefieldModel(Model):
     config: TidefieldModelConfig
 
     def __init__(self, config: TidefieldModelConfig, metadata: dict[str, Any], device: Any, **given: Any) -> None:
-        self._given = metadata["scene"], float(metadata["scale"]), torch.device(device)
+        is_trained = bool(metadata.get("is_trained"))
+        self._given = metadata["scene"], float(metadata["scale"]), torch.device(device), is_trained
         super().__init__(config, **given)
 
     def populate_modules(self) -> None:
-        self.scene, self.scale, device = self._given
+        self.scene, self.scale, device, is_trained = self._given
         preset, weights = self.config.preset, None
-        if not self.config.from_scratch:
+        if not (self.config.from_scratch or is_trained):
             weights = given_or_shipped(self.config.weights, preset)
         self.trainer = SceneTrainer(PRESETS[preset], self.scene, self.config.seed, device, weights)
         self.network = self.trainer.network
@@ -157,8 +165,11 @@ class TidefieldModel(Model):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         optimizers, trainer = training_callback_attributes.optimizers, training_callback_attributes.trainer
+        pipeline = training_callback_attributes.pipeline
         assert optimizers is not None
         assert trainer is not None
+        assert pipeline is not None
+        pipeline.datamanager.rays_per_batch = self.trainer.rays_per_step
 
         def set_rate(step: int) -> None:
             self.trainer.progress.step = step

@@ -224,6 +224,8 @@ def _read_checkpoint(folder: Path) -> tuple[TrainingProgress, dict[str, Tensor]]
         raise RunError(
             f"{path} is of another run than {RUN_FILE}: expected two files of one run; restore the right one"
         )
+    if "network.radius" in tensors:  # of classical NeRF; earlier ones reached to 1
+        tensors.setdefault("network.headroom", torch.ones(3))
     values = {name: from_json(kind, header.get(name), f"{path}: {name}") for name, kind in _PROGRESS.items()}
     return TrainingProgress(**{**values, "losses": list(values["losses"])}), tensors
 

@@ -12,7 +12,7 @@ import logging
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from tidefield.baselines.export import point_colours
+from tidefield.baselines.export import at_common_exposure, exposure_factor, pinholes, point_colours
 from tidefield.baselines.job_file import JOB_FILE, failure, read_job
-from tidefield.baselines.nerfstudio.environment import WORKER, python
+from tidefield.baselines.nerfstudio.environment import WORKER, python, without_our_python
 from tidefield.config import Budget, Range, from_json
 from tidefield.data.pictures import write_mask
 from tidefield.data.readers.transforms import write_transforms_file
@@ -34,7 +34,6 @@ from tidefield.errors import RunError
 from tidefield.evaluation.curves import SHARES, QualityCurve
 from tidefield.files import delete_files, write_json
 from tidefield.geometry.cameras import Cameras
-from tidefield.geometry.lenses import Lens
 from tidefield.model.rendering import Render, Rendering
 from tidefield.processes import end_with_parent
 from tidefield.train.checkpoint import TrainingProgress
@@ -106,6 +105,7 @@ def train(
         RunError: nerfstudio is not installed, the method does not run on the device, or nerfstudio fails.
     """
     require(method, device)
+    write_json(folder / JOB_FILE, {"method": method})  # from now on `delete_training` finds what is written
     colours = export(scene, folder / DATA)
     seconds = None if budget.minutes is None else 60 * budget.minutes
     job = {
@@ -132,7 +132,8 @@ def train(
             progress(last["step"], last["seconds"])
     if not last.get("done"):
         raise failure("nerfstudio", folder / LOG_FILE, "train and render")
-    write_json(folder / JOB_FILE, {**job, "checkpoint": last["checkpoint"], "trained": [last["step"], last["seconds"]]})
+    job |= {name: last[name] for name in ("checkpoint", "tiny_cuda_nn") if name in last}
+    write_json(folder / JOB_FILE, {**job, "trained": [last["step"], last["seconds"]]})
     return progress_of(folder)
 
 
@@ -166,9 +167,14 @@ def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
     Raises:
         RunError: nerfstudio is not installed, or fails, or the method does not run on the device.
     """
-    _, colours, method = _read_job(folder)
-    if method == "splatfacto":
-        require(method, device)
+    _, colours, job = _read_job(folder)
+    if job.get("method") == "splatfacto":
+        require("splatfacto", device)
+    if job.get("tiny_cuda_nn") and device.type != "cuda":
+        raise RunError(
+            f"{folder} was trained with tiny-cuda-nn, whose layers run on CUDA alone: expected --device cuda, got "
+            f"{device}; render it there, or train it again on {device} with --overwrite"
+        )
     with ExitStack() as stack:
         own = Path(stack.enter_context(TemporaryDirectory()))
         file = own / "rendering.npz"
@@ -176,8 +182,8 @@ def renderer(folder: Path, device: torch.device) -> Iterator[Render]:
         worker.answer()  # once it has loaded
 
         def render(camera: Cameras) -> Rendering:
-            worker.ask({**camera_to_json(camera), "file": str(file)})
-            return read_rendering(file, camera, colours)
+            answer = worker.ask({**camera_to_json(camera), "file": str(file)})
+            return replace(read_rendering(file, camera, colours), seconds=float(answer["seconds"]))
 
         yield render
 
@@ -230,7 +236,7 @@ def _worker(words: Sequence[str | Path | torch.device], log_file: Path, device: 
             stdout=subprocess.PIPE,
             stderr=said,
             text=True,
-            env=environment_of(device) | KEEP_LARGE_ALLOCATIONS,
+            env=without_our_python(environment_of(device)) | KEEP_LARGE_ALLOCATIONS,
             preexec_fn=end_with_parent,
         )
         try:
@@ -248,39 +254,35 @@ def _worker(words: Sequence[str | Path | torch.device], log_file: Path, device: 
                 process.wait()
 
 
-def _read_job(folder: Path) -> tuple[tuple[int, float], Colours, str | None]:
-    """Steps and seconds of a training that is complete, the colours of its scene, and its method."""
+def _read_job(folder: Path) -> tuple[tuple[int, float], Colours, dict[str, Any]]:
+    """Steps and seconds of a training that is complete, the colours of its scene, and the whole job."""
     path = folder / JOB_FILE
     job = read_job(path, "a checkpoint")
     # Of version 0.1, which exported no alpha, there is none.
     background = job.get("background") and from_json(_BACKGROUND, job["background"], f"{path}: background")
-    return job["trained"], Colours(torch.tensor(job["factor"]), background), job.get("method")
+    return job["trained"], Colours(torch.tensor(job["factor"]), background), job
 
 
 def export(scene: Scene, folder: Path) -> Colours:
     """Write photographs and masks (PNG, undistorted, at the scene's size), transforms.json and the sparse points.
 
-    Photographs are at the common exposure, as all other methods see them, times a factor that avoids clipping. Those of
-    a scene with alpha have it, and colours that are not multiplied by it, as nerfstudio reads them.
+    Photographs are at the common exposure, as all other methods see them, times a factor that keeps those for training
+    from clipping. Those of a scene with alpha have it, and colours that are not multiplied by it, as nerfstudio reads
+    them.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     cameras, files = scene.cameras, [f"images/{index:05d}.png" for index in range(len(scene.names))]
-    colours = Colours(cameras.gain.amin(0).clamp(max=1.0), scene.background_rgb)
+    colours = Colours(exposure_factor(cameras[list(scene.train)]), scene.background_rgb)
     for index, file in enumerate(files):
-        colour, alpha = _straight(scene, index)
-        colour = colour / cameras[index].gain_of_rows() * colours.factor
-        pixels = torch.cat([colour, *([] if scene.background_rgb is None else [255 * alpha])], dim=-1)
-        Image.fromarray(pixels.round().clamp(0, 255).to(torch.uint8).numpy()).save(folder / file)
+        Image.fromarray(at_common_exposure(scene, index, colours.factor, with_alpha=True)).save(folder / file)
     masks = [f"masks/{index:05d}.png" for index in range(len(files)) if scene.photographs.masks]
     for index, mask in enumerate(masks):
         write_mask(folder / mask, scene.photographs.used(index).numpy())
-    columns = torch.cat([cameras.size_px, cameras.focal_px, cameras.principal_px], dim=1).tolist()
-    lenses = [Lens(round(w), round(h), fx=fx, fy=fy, cx=cx, cy=cy) for w, h, fx, fy, cx, cy in columns]
     points = scene.points
     write_transforms_file(
         folder,
         files,
-        lenses,
+        pinholes(cameras),
         cameras.T_world_camera[:, :3].double().numpy(),
         (scene.train, scene.test),
         np.zeros((0, 3)) if points is None else points.xyz_world.double().numpy(),
@@ -289,16 +291,6 @@ def export(scene: Scene, folder: Path) -> Colours:
         overwrite=True,
     )
     return colours
-
-
-def _straight(scene: Scene, index: int) -> tuple[Float[torch.Tensor, "H W 3"], Float[torch.Tensor, "H W 1"]]:
-    """Colours of a photograph, 0 to 255, before they were composited, and alpha, 0 to 1; black where that is 0."""
-    colour, alpha = scene.photographs[index].float(), scene.photographs.alpha(index)
-    if alpha is None or scene.background_rgb is None:
-        return colour, torch.ones_like(colour[..., :1])
-    opacity = alpha[..., None].float() / 255
-    own = colour - (1 - opacity) * 255 * torch.tensor(scene.background_rgb)
-    return torch.where(opacity > 0, own / opacity.clamp(min=1 / 255), 0.0), opacity
 
 
 def object_limits(scene: Scene) -> dict[str, Any] | None:

@@ -8,8 +8,10 @@ import shutil
 import subprocess
 import sys
 import venv
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -88,6 +90,11 @@ def python() -> Path:
     return _interpreter()
 
 
+def without_our_python(given: Mapping[str, str]) -> dict[str, str]:
+    """Variables of a process for one of that environment: those that name modules of our Python mean nothing there."""
+    return {name: value for name, value in given.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+
+
 def install(overwrite: bool, console: Console) -> None:
     """Make the environment: nerfstudio with the PyTorch that we run on, so that speeds compare.
 
@@ -114,6 +121,8 @@ def install(overwrite: bool, console: Console) -> None:
         "neither.",
         soft_wrap=True,
     )
+    with writing_to(folder):
+        _complete().unlink(missing_ok=True)  # first: what is left of an interrupted deletion is not complete
     shutil.rmtree(folder, ignore_errors=True)
     stage(1, "an empty environment")
     with writing_to(folder):
@@ -124,7 +133,7 @@ def install(overwrite: bool, console: Console) -> None:
     stage(3, f"torchvision and nerfstudio {VERSION}")
     _pip(["--no-deps", vision, f"nerfstudio=={VERSION}"], console)
     stage(4, "a test that nerfstudio starts")
-    checked = subprocess.run([str(_interpreter()), str(WORKER), "check"], capture_output=True, text=True, check=False)
+    checked = _run([str(_interpreter()), str(WORKER), "check"], capture_output=True, text=True)
     if checked.returncode:
         why = checked.stderr.strip().splitlines()[-1:] or ["no message"]
         raise RunError(
@@ -136,11 +145,15 @@ def install(overwrite: bool, console: Console) -> None:
 def _pip(words: list[str], console: Console) -> None:
     """Install packages; what pip prints meanwhile is the progress."""
     command = [str(_interpreter()), "-m", "pip", "install", "--disable-pip-version-check", *["--quiet"] * console.quiet]
-    if subprocess.run([*command, *words], check=False).returncode:
+    if _run([*command, *words]).returncode:
         raise RunError(
             f"pip could not install what nerfstudio needs into {home()}: expected it to; read what it says above, and "
             "run the same command again"
         )
+
+
+def _run(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, check=False, env=without_our_python(os.environ), **options)
 
 
 def _vision(torch: str) -> str:

@@ -83,7 +83,7 @@ def make_trainer(job: dict[str, Any], checkpoint: Path | None = None) -> Any:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     config = method_configs[job["method"]]
-    configure(config, job, has_tiny_cuda_nn())
+    configure(config, job, uses_tiny_cuda_nn(job))
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(**parser_options(job))
     if checkpoint is not None:
         config.load_checkpoint = checkpoint
@@ -154,12 +154,26 @@ def parser_options(job: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
-def has_tiny_cuda_nn() -> bool:
+def uses_tiny_cuda_nn(job: dict[str, Any]) -> bool:
+    """Whether Nerfacto's layers are tiny-cuda-nn's: where it is installed, on CUDA, or those of a checkpoint are.
+
+    Jobs of earlier versions do not state the latter.
+    """
+    if job["method"] != "nerfacto":
+        return False
     try:
         import tinycudann  # noqa: F401
+
+        is_there = job["device"].startswith("cuda") and torch.cuda.is_available()
     except (ImportError, OSError):
-        return False
-    return torch.cuda.is_available()
+        is_there = False
+    trained_with = job.get("tiny_cuda_nn", is_there)
+    if trained_with and not is_there:
+        sys.exit(
+            "this checkpoint was trained with tiny-cuda-nn, which is not in nerfstudio's environment, or finds no GPU: "
+            "expected it as in training; install it there, or train again"
+        )
+    return trained_with
 
 
 def train(job: dict[str, Any]) -> None:
@@ -196,7 +210,7 @@ def train(job: dict[str, Any]) -> None:
         step=last + 1,
         seconds=time.perf_counter() - started - paused,
         done=True,
-        rays=trainer.pipeline.datamanager.get_train_rays_per_batch(),
+        tiny_cuda_nn=uses_tiny_cuda_nn(job),
         checkpoint=str(sorted(trainer.checkpoint_dir.glob("step-*.ckpt"))[-1].relative_to(job["out"])),
     )
 
@@ -256,8 +270,8 @@ class ModelCamera:
         with torch.no_grad():
             outputs = self.model.get_outputs_for_camera(self.camera)
         colour = outputs["rgb"].float().cpu().numpy()
-        seconds = time.perf_counter() - start
         depth, opacity = (outputs[name][..., 0].float().cpu().numpy() for name in ("depth", "accumulation"))
+        seconds = time.perf_counter() - start
         along_ray = not hasattr(self.model, "gauss_params")  # splats give z-depth, rays the distance
         depth = z_depth(depth, self.scale, self.length if along_ray else None)
         path.parent.mkdir(parents=True, exist_ok=True)
