@@ -12,6 +12,7 @@ from benchmarks import parts as paper_parts
 from benchmarks.frames import FRAMES_FILE
 from benchmarks.memory import MEMORY_FILE
 from tidefield.compare.ablation import ablation_tables, summarise
+from tidefield.compare.circumstances import code_and_machines, machines, short, when
 from tidefield.compare.results import Result, Results, read_figures
 from tidefield.compare.run import WHOLE
 from tidefield.compare.tables import (
@@ -33,6 +34,7 @@ from tidefield.compare.tables import (
     scene_marks,
     shown,
     trainings,
+    untrained_limits,
 )
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import METRICS
@@ -215,7 +217,7 @@ def _dated(record: Mapping[str, Any] | None, tables: Callable[[Mapping[str, Any]
     """Tables of a benchmark, after the code that they were measured with: others on the page have newer code."""
     if record is None:
         return ["Not measured."]
-    commit = (record["commit"] or "unknown")[:7]
+    commit = short(record["commit"] or "unknown")
     made = f"Measured {record['date']} at commit {commit}: compare its columns with each other."
     return [made, *(table.markdown() for table in tables(record))]
 
@@ -235,7 +237,7 @@ def _quality(compared: Results) -> list[str]:
         *age([*compared.by.values()]),
         "Means over the held-out photographs. Every method had the same photographs, split, resolution and minutes of "
         "training; bold is the best.",
-        *_code_and_machines(results),
+        *code_and_machines(results),
         *notes(results, marks),
         *(marked(table, marks).markdown() for table in tables),
         *([papers.markdown()] if papers else []),
@@ -283,7 +285,9 @@ def marks_of(results: Results, learned: Collection[str]) -> tuple[Mark, ...]:
 def notes(results: Results, marks: Sequence[Mark]) -> list[str]:
     """What a reader must know of some methods and scenes, as sentences."""
     trained = "\n".join(f"- {line}" for line in trainings(results))
-    limits = [*nerfacto_limits(results), *opensplat_limits(results)]
+    devices = {result.process.get("settings", {}).get("device") for result in results.by.values()}
+    others = [untrained_limits(results, device) for device in sorted(devices - {None})]
+    limits = [*(line for lines in others for line in lines), *nerfacto_limits(results), *opensplat_limits(results)]
     return [*limits, *([trained] if trained else []), *legend(results.scenes, marks)]
 
 
@@ -313,43 +317,6 @@ def _poses(results: Results) -> list[str]:
     return [f"{sentence}{', '.join(scenes)}." for sentence, scenes in groups.items() if scenes]
 
 
-def _code_and_machines(results: Results) -> list[str]:
-    """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
-    commits = _groups({k: str(of)[:7] for k, one in results.by.items() if (of := one.evaluation.get("commit"))})
-    machines = _groups(
-        {k: step["machine"]["processor"] for k, one in results.by.items() if (step := one.process.get("evaluate"))}
-    )
-
-    def each(groups: Mapping[str, str]) -> str:
-        return "; ".join(f"{label} ({of})" for label, of in groups.items())
-
-    sentences = [f"Measured at commit {commit}." for commit in commits]
-    if len(commits) > 1:
-        sentences = [f"Measured at different commits, whose code and settings differ: {each(commits)}."]
-    if len(machines) > 1:
-        sentences.append(
-            f"Measured on different machines, on which a minute does not bring the same: {each(machines)}."
-        )
-    return sentences
-
-
-def _groups(labels: Mapping[tuple[str, str], str]) -> dict[str, str]:
-    """What has each label, from labels of scenes and methods: columns, or scenes of a column that has several."""
-    measured = sorted((label, method, scene) for (scene, method), label in labels.items())
-
-    def scenes(label: str, method: str) -> str:
-        own = [scene for *of, scene in measured if of == [label, method]]
-        return "" if len(own) == sum(other == method for _, other, _ in measured) else f" of {', '.join(own)}"
-
-    groups = {}
-    for label in dict.fromkeys(label for label, _, _ in measured):
-        columns: dict[str, list[str]] = {}
-        for method in sorted({method for of, method, _ in measured if of == label}):
-            columns.setdefault(scenes(label, method), []).append(method)
-        groups[label] = "; ".join(", ".join(methods) + of for of, methods in columns.items())
-    return groups
-
-
 def _widths(sized: Mapping[int, Results]) -> list[str]:
     """Tables of quality and costs, of one width after another."""
     suffix = SHOWN_REGIONS[-1]
@@ -366,7 +333,7 @@ def _widths(sized: Mapping[int, Results]) -> list[str]:
         costs = cost_table(results)
         parts += [
             f"### {width} px",
-            *_code_and_machines(results),
+            *code_and_machines(results),
             *_poses(results),
             *notes(results, marks),
             *(marked(replace(table, title=f"{width} px: {table.title}"), marks).markdown() for table in tables),
@@ -384,7 +351,7 @@ def _on_gpu(gpu: OnGpu) -> list[str]:
     tables = [*(marked(table, marks) for table in quality), *costs, *views]
     return [
         *([f"Photographs of {gpu.width} px. {gpu.remark}"] if quality else []),
-        *(_code_and_machines(gpu.compared)),
+        *code_and_machines(gpu.compared),
         *(_poses(gpu.compared)),
         *(notes(gpu.compared, marks) if quality else []),
         *(replace(table, title=f"On a GPU: {table.title}").markdown() for table in tables),
@@ -463,27 +430,8 @@ def _records(
 
 def circumstances(records: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
     """Machines, dates and versions of measurements, by their names."""
-    machines: dict[str, dict[str, None]] = {}
-    dates = sorted({record["date"] for _, record in records})
-    for name, record in records:
-        machine = record["machine"]
-        text = (
-            f"{machine['processor']}, {machine['cores']} core{'s' * (machine['cores'] > 1)}, "
-            f"{machine['memory_bytes'] / 2**30:.0f} GiB; {machine['system']}, Python {machine['python']}, "
-            f"torch {machine['torch']}" + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
-        )
-        machines.setdefault(text, {})[name] = None
-    versions = sorted({record["version"] for _, record in records})
-    measured = " to ".join(dict.fromkeys([dates[0], dates[-1]])) if dates else "at an unknown date"
-    several = len(machines) > 1
-    return [
-        *(
-            f"Machine: {': '.join([text, ', '.join(names)] if several else [text])}."
-            for text, names in machines.items()
-        ),
-        f"Measured {measured} with Tidefield {', '.join(versions) or 'of unknown version'}; "
-        f"written {describe()['date']}.",
-    ]
+    measured = when(records)
+    return [*machines(records), f"{measured[0].upper()}{measured[1:]}; written {describe()['date']}."]
 
 
 def _speed(speed: Mapping[str, Any] | None) -> list[str]:

@@ -41,7 +41,7 @@ class Children:
         self.words.append(words)
         if len(self.words) == self.fails_at:
             raise RunError("it broke")
-        untrained = words[0] == "evaluate" and "--method" in words
+        untrained = words[0] == "evaluate" and not {"--method", "--zero-shot"}.isdisjoint(words)
         folder = Path(words[2] if words[0] == "train" or untrained else words[1])
         folder.mkdir(parents=True, exist_ok=True)
         if words[0] == "train":

@@ -56,6 +56,17 @@ def test_features_have_a_share_of_the_memory_and_workers_of_one_core_a_part_of_i
         assert memory_for_features(torch.device("cpu")) == expected
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a script that the system runs")
+def test_gpus_are_those_of_the_driver_where_torch_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert machine.describe()["machine"]["gpus"] == [], "without a driver"
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho NVIDIA H200\necho NVIDIA H200\n")
+    program.chmod(0o755)
+    assert machine.describe()["machine"]["gpus"] == ["NVIDIA H200", "NVIDIA H200"]
+
+
 KEPT = """
 import numpy as np
 from tidefield.machine import release_memory, tune_process

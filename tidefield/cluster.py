@@ -188,18 +188,6 @@ def _made(ray: Any, reference: Any, item: object) -> Any:
         ) from error
 
 
-def done_on_cluster(
-    ray: Any,
-    key: str,
-    prepare: Callable[[], AbstractContextManager[Work]],
-    items: Sequence[Item],
-    share: Share = Share(),
-) -> Iterator[Item]:
-    """`on_cluster` for work that leaves files: yields each item when it is done."""
-    for item, _ in on_cluster(ray, key, prepare, items, share):
-        yield item
-
-
 _OPEN = ExitStack()
 _READY: dict[str, Work] = {}
 """What this worker has prepared, by the key of the job; of the running job only."""

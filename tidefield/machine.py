@@ -99,9 +99,15 @@ def describe() -> dict[str, Any]:
 
 
 def _gpus() -> list[str]:
-    """The CUDA devices; none where torch has not been imported, as nothing was computed on one then."""
+    """The CUDA devices; those that NVIDIA's driver lists where only children have imported torch."""
     torch = sys.modules.get("torch")
-    return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch else []
+    if torch is not None:
+        return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):  # there is no such driver
+        return []
 
 
 def commit() -> str | None:

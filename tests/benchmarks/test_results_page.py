@@ -11,6 +11,7 @@ import torch
 from benchmarks import card, table
 from benchmarks.table import by_length, length_tables
 from tidefield import machine as this_machine
+from tidefield.compare.circumstances import code_and_machines
 from tidefield.compare.results import read_figures
 from tidefield.config import PAPER, SWIFT
 from tidefield.errors import RunError
@@ -113,7 +114,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
         "A frame of 4000 x 3000 px from 12 photographs of that size, decoding and encoding included (swift, cpu): "
         "6.50 GB, 70 s.",
         "Photographs of 640 px. On one card.",
-        "Within the budget Nerfacto made 1,234 to 1,234 steps, 4.1% to 4.1% of its default of 30,000.",
+        "Within the budget Nerfacto made 1,234 steps, 4.1% of its default of 30,000.",
         "| caliterra ² | **36.00** | 33.00 |",
         "### On a GPU: Zero-shot views of 1920 x 1080 px, swift, cuda:0",
         "    large frames",
@@ -128,7 +129,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
         "- The column `paper` began with random weights and was trained for 1,234 steps.",
         "- The column `zero-shot` has trained weights as they are, without a step on the scene.",
         "| IBRNet (Wang et al., CVPR 2021) | LLFF | 25.13 | 26.73 | 1.60 |",
-        "- without a mark (another): the shipped weights and their recipe do not know it.",
+        "- without a mark (another): no scene of this name taught the shipped weights or chose their recipe.",
     ):
         assert line in text.splitlines(), line
     assert "### LPIPS, AlexNet" not in text
@@ -189,10 +190,44 @@ def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
     record = read_json(file) or {}
     record["results"][0]["process"]["evaluate"]["machine"]["processor"] = "A Slow One"
     write_json(file, record)
-    own = this_machine.describe()["machine"]["processor"]
-    slower = f"A Slow One (tidefield of fern); {own} (sparse-depth; tidefield of lego)"
+    machine = this_machine.describe()["machine"]
+    count = f"{machine['cores']} core{'s' * (machine['cores'] > 1)}"
+    own = ", ".join([machine["processor"], count, *machine["gpus"]])
+    both = f"{own} for training and A Slow One, {own.partition(', ')[2]} for evaluation (tidefield of fern)"
+    slower = "; ".join(sorted([f"{own} (sparse-depth; tidefield of lego)", both]))
     rest = " on which a minute does not bring the same: "
     assert f"{rest}{slower}.\n" in page("scene", "lego")
+
+
+def test_machines_differ_by_cores_and_gpus_and_changed_sources_keep_their_mark(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    for scene in ("fern", "lego", "swindale"):
+        keep_result(file, scene, "tidefield", 24.0)
+    record = read_json(file) or {}
+    machine = {**this_machine.describe()["machine"], "processor": "P", "cores": 16, "gpus": ["H200"]}
+    others = ({}, {"gpus": ["H100"]}, {"cores": 2})
+    for result, evaluated in zip(record["results"], others, strict=True):
+        result["evaluation"]["commit"] = "1234567890+"
+        result["process"]["train"]["machine"] = machine
+        result["process"]["evaluate"]["machine"] = machine | evaluated
+    write_json(file, record)
+    commits, machines = code_and_machines(read_figures([file], table.SCENES, names()))
+    assert commits == "Measured at commit 1234567+."
+    assert machines.partition("the same: ")[2].split("; ") == [
+        "P, 16 cores, H200 (tidefield of fern)",
+        "P, 16 cores, H200 for training and P, 16 cores, H100 for evaluation (tidefield of lego)",
+        "P, 16 cores, H200 for training and P, 2 cores, H200 for evaluation (tidefield of swindale).",
+    ]
+
+
+def test_a_page_of_a_gpu_says_what_ran_on_the_processor(tmp_path: Path) -> None:
+    for device, expected in (("cpu", False), ("cuda:0", True)):
+        file = tmp_path / f"{device}.json"
+        for method in ("tidefield", "sparse-depth"):
+            keep_result(file, "fern", method, 24.0, device=device)
+        found = table.notes(table.without_empty_columns(read_figures([file], table.SCENES, names())), ())
+        sentence = "Without training, on the processor: sparse-depth. Their times are not those of cuda:0."
+        assert (sentence in found) == expected
 
 
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:

@@ -4,8 +4,11 @@ import csv
 import json
 import shutil
 import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import opensplat_program
@@ -18,21 +21,24 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from tidefield import cli
 from tidefield.commands.ablate import Ablate, ablate
-from tidefield.commands.compare import Compare, make_settings
+from tidefield.commands.compare import Compare, _scenes, _with_failures, make_settings
 from tidefield.commands.compare import compare as compare_command
+from tidefield.commands.train import Train, train
 from tidefield.compare.figures import most_different, side_by_side
 from tidefield.compare.results import Result, Results, figures_of, read_figures, read_results
 from tidefield.compare.run import (
     MIPNERF360,
+    Failure,
     Settings,
+    Unfinished,
     Usage,
     commands,
     compare,
     mipnerf360,
     named,
-    require_one_state,
     tidal_flats,
 )
+from tidefield.compare.sources import require_one_state
 from tidefield.compare.tables import (
     TABLE_2,
     TABLE_3,
@@ -50,6 +56,7 @@ from tidefield.compare.tables import (
 )
 from tidefield.config import PAPER, Budget
 from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
 from tidefield.device import choose_device
 from tidefield.errors import RunError, SceneError, TidefieldError
 from tidefield.files import write_json
@@ -108,6 +115,113 @@ def test_an_interrupted_training_is_repeated_and_a_finished_one_is_not(disk: Pat
     (broken / "run.json").write_text("{}")
     compare({"flats": disk}, ("nerf",), SETTINGS, tmp_path / "out", run, quiet)
     assert run.words[3][-1] == "--overwrite"
+
+
+class Failing(Children):
+    """Like it, but some trainings fail as a child does."""
+
+    def __init__(self, scene: Scene, failing: str, status: int) -> None:
+        super().__init__(scene)
+        self.failing, self.status = failing, status
+
+    def __call__(self, command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        if command[3] == "train" and command[5].endswith(self.failing):
+            raise SystemExit(self.status)
+        return super().__call__(command, environment)
+
+
+def test_other_methods_and_scenes_are_done_after_one_that_fails(disk: Path, tmp_path: Path):
+    out, scenes = tmp_path / "out", {"a": disk, "b": disk}
+    run = Failing(load_scene(disk, width=48), "a/nerfacto", 70)
+    with pytest.raises(Unfinished) as raised:
+        compare(scenes, ("nerfacto", "nearest"), SETTINGS, out, run, quiet)
+    assert raised.value.failures == [Failure("a, nerfacto: train", "it ended with status 70", 70)]
+    assert [words[0] for words in run.words] == ["evaluate", "train", "evaluate", "evaluate"]
+    results = read_results(out, ["a", "b"], ["nerfacto", "nearest"])
+    write_comparison(results, {}, SETTINGS, out)
+    page = (out / "tables.md").read_text()
+    assert "| a | - | 28.00 |" in page
+    assert "Not complete: no results of nerfacto on a." in page.splitlines()
+    write_comparison(replace(results, scenes=("b",)), {}, SETTINGS, out)
+    assert "Not complete" not in (out / "tables.md").read_text()
+
+
+def test_nothing_follows_a_child_that_a_signal_ended(disk: Path, tmp_path: Path):
+    run = Failing(load_scene(disk, width=48), "a/nerfacto", 143)
+    with pytest.raises(SystemExit, match="143"):
+        compare({"a": disk, "b": disk}, ("nerfacto", "nearest"), SETTINGS, tmp_path / "out", run, quiet)
+    assert run.words == []
+
+
+def test_a_comparison_ends_with_the_first_status_after_its_tables(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    here = {"a": ("p", "c"), "b": ("p", "c")}
+    monkeypatch.setattr("tidefield.commands.compare.worker_processes", lambda _: nullcontext(Inline(here)))
+    run = Failing(load_scene(disk, width=48), "nerf", 70)
+    monkeypatch.setattr("tidefield.compare.run.run_measured", lambda command, own: run(command[:-1], own))
+    for name in here:
+        (tmp_path / name).symlink_to(disk)
+    options = Compare((tmp_path / "a", tmp_path / "b"), methods=("nerf", "nearest"), width=48, out=tmp_path / "out")
+    with pytest.raises(SystemExit) as ended:
+        compare_command(replace(options, device="cpu"), Console(quiet=True))
+    assert ended.value.code == 70
+    assert [record.message for record in caplog.records][-3:] == [
+        "a, nerf: train: it ended with status 70",
+        "b, nerf: train: it ended with status 70",
+        "2 failed, the rest is done; the same command repeats what failed",
+    ]
+    assert "| b | - | 28.00 |" in (tmp_path / "out" / "tables.md").read_text()
+    with pytest.raises(SystemExit, match="70"):
+        compare_command(replace(options, methods=("nerf",), device="cpu", out=tmp_path / "none"), Console(quiet=True))
+    assert not (tmp_path / "none" / "tables.md").exists(), "of what nobody has there is no table"
+
+
+class Inline:
+    """Stands in for a worker: `check_scene` finds what is given, and nothing has weights."""
+
+    def __init__(self, scenes: Mapping[str, tuple[str, str]]) -> None:
+        self.scenes, self.called = scenes, []
+
+    def submit(self, function: Callable, *given: object) -> SimpleNamespace:
+        self.called.append(function.__name__)
+        found = self.scenes[given[0].name] if isinstance(given[0], Path) else {}
+        return SimpleNamespace(result=lambda: found)
+
+
+def test_a_worker_of_a_cluster_returns_what_failed():
+    failure = Failure("a, nerfacto: train", "it broke", 2)
+
+    def work(name: str) -> None:
+        if name == "a":
+            raise Unfinished("it broke", [failure])
+
+    with _with_failures(lambda: nullcontext(work)) as tried:
+        assert (tried("a"), tried("b")) == ([failure], ())
+
+
+def test_flats_are_made_by_another_process_than_the_one_that_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    worker, made = Inline({}), {"vegetation": tmp_path}
+    monkeypatch.setattr(worker, "scenes", {"scenes": made})
+    monkeypatch.setattr("tidefield.commands.compare.worker_processes", lambda _: nullcontext(worker))
+    assert _scenes(Compare(protocol="tidalflats", out=tmp_path)) == made
+    assert worker.called == ["tidal_flats"]
+
+
+def test_an_interrupted_training_of_a_comparison_names_its_command(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    found, again = {}, []
+    run = Children(load_scene(disk, width=48))
+    with monkeypatch.context() as patch:
+        patch.setattr(Children, "__call__", lambda self, command, own: found.update(own) or Usage(1.0, 1))
+        compare({"flats": disk}, ("tidefield",), SETTINGS, tmp_path / "out", run, quiet)
+    monkeypatch.setattr("tidefield.commands.train._train", lambda options, console, text: again.append(text))
+    train(Train(disk, tmp_path / "run"), Console(quiet=True))
+    for name, value in found.items():
+        monkeypatch.setenv(name, value)
+    train(Train(disk, tmp_path / "run"), Console(quiet=True))
+    assert again == ["the same command with --resume", "the same command"]
 
 
 def test_results_of_other_settings_are_not_mixed_in(disk: Path, tmp_path: Path):
@@ -179,6 +293,83 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
         assert figure.width == 3 * 320 + 2 * 4
 
 
+def test_tables_have_the_machines_that_measured_and_not_the_one_that_writes(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out = tmp_path / "out"
+    machine = {
+        "processor": "Fast",
+        "cores": 16,
+        "memory_bytes": 1 << 36,
+        "system": "Linux",
+        "python": "3",
+        "torch": "2",
+    }
+    made = {"date": "2026-01-02", "version": "0.1", "machine": {**machine, "gpus": ["H200"]}}
+    for name, gpu, date in (("a", "H200", "2026-01-02"), ("b", "H100", "2026-01-03")):
+        on = {**made, "date": date, "machine": {**machine, "gpus": [gpu]}}
+        monkeypatch.setattr("tidefield.compare.run.describe", lambda on=on: on)
+        compare({name: disk}, ("nearest",), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
+    results = read_results(out, ["a", "b"], ["nearest"])
+    write_comparison(results, {}, SETTINGS, out)
+    lines = (out / "tables.md").read_text().splitlines()
+    assert "On cpu; photographs 48 px wide; measured 2026-01-02 to 2026-01-03 with Tidefield 0.1." in lines
+    assert any(
+        line.endswith(": Fast, 16 cores, H100 (nearest of b); Fast, 16 cores, H200 (nearest of a).") for line in lines
+    )
+    write_comparison(
+        replace(results, scenes=("a",), by={("a", "nearest"): results.by["a", "nearest"]}), {}, SETTINGS, out
+    )
+    page = (out / "tables.md").read_text()
+    assert "Machine: Fast, 16 cores, 64 GiB; Linux, Python 3, torch 2, H200." in page.splitlines()
+    assert "different machines" not in page
+    file = out / "runs" / "a" / "nearest" / "process.json"
+    for damage in ({"cores": "many"}, {"gpus": [1]}, {"processor": None}):
+        write_json(file, {"settings": {}, "evaluate": {**made, "machine": {**machine, **damage}}})
+        with pytest.raises(RunError, match=r"process.json is damaged"):
+            read_results(out, ["a"], ["nearest"])
+
+
+def test_names_do_not_break_tables(disk: Path, tmp_path: Path):
+    run, out = Children(load_scene(disk, width=48)), tmp_path / "out"
+    names = ["mean", "a|b"]
+    compare(dict.fromkeys(names, disk), ("tidefield",), SETTINGS, out, run, quiet)
+    compare({"mean": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    results = read_results(out, names, ["tidefield", "nearest"])
+    (table,) = (t for t in quality_tables(results) if t.title.startswith("PSNR, dB, all pixels ("))
+    assert table.rows == [["mean", "20.00", "28.00"], ["a|b", "20.00", "-"], ["mean", "20.00", "-"]]
+    assert r"| a\|b | 20.00 | - |" in table.markdown()
+    assert r"\textbackslash{}x\textasciicircum{}\textasciitilde{} &" in Table("", ["", ""], [["\\x^~", "1"]]).latex()
+    write_comparison(results, {}, SETTINGS, out)
+    titles = [row for row in csv.reader((out / "tables.csv").read_text().splitlines()) if row and "dB" in row[0]]
+    assert titles[0] == [table.title], "one cell, though it has commas"
+
+
+def test_a_figure_of_what_has_no_results_any_more_is_deleted(disk: Path, tmp_path: Path):
+    run, out = Children(load_scene(disk, width=48)), tmp_path / "out"
+    compare({"a": disk}, ("nearest",), SETTINGS, out, run, quiet)
+    results = read_results(out, ["a", "b"], ["nearest"])
+    (out / "figures").mkdir()
+    (out / "figures" / "b.png").touch()
+    files = write_comparison(results, {"a": disk, "b": tmp_path / "none"}, SETTINGS, out)
+    assert out / "figures" / "a.png" in files
+    assert [file.name for file in (out / "figures").iterdir()] == ["a.png"]
+
+
+def test_published_figures_need_the_protocol_and_weights_are_those_of_what_is_compared(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out, run, asked = tmp_path / "out", Children(load_scene(disk, width=48)), []
+    compare({"room": disk}, ("paper", "zero-shot"), SETTINGS, out, run, quiet)
+    results = read_results(out, ["room"], ["paper"])
+    monkeypatch.setattr("tidefield.train.checkpoint.shipped_weights", asked.append)
+    write_comparison(results, {}, SETTINGS, out)
+    assert "As the paper's" not in (out / "tables.md").read_text(), "a scene may be called room"
+    write_comparison(replace(results, methods=("zero-shot",)), {}, SETTINGS, out, "mipnerf360")
+    assert "As the paper's Table 2" in (out / "tables.md").read_text()
+    assert asked == ["paper", "swift"]
+
+
 @pytest.mark.thorough
 def test_tables_say_what_trained_weights_know_of_a_scene(disk: Path, tmp_path: Path):
     learned = learned_from()
@@ -193,7 +384,7 @@ def test_tables_say_what_trained_weights_know_of_a_scene(disk: Path, tmp_path: P
         "- ¹ vegetation: a category of the synthetic generator; ",
         "- ² swindale: nothing was learned from this scene, but results on it chose the recipe",
         "- ³ turin_lot: the shipped weights learned from this scene's training photographs: ",
-        "- without a mark (mine): the shipped weights and their recipe do not know it.",
+        "- without a mark (mine): no scene of this name taught the shipped weights or chose their recipe.",
         *("| vegetation ¹ | ", "| swindale ² | ", "| turin_lot ³ | ", "| mine | "),
         "The column `tidefield` began with random weights and was trained for 7 steps.",
     ):
@@ -296,19 +487,19 @@ def test_the_limits_of_nerfacto_are_stated_where_it_ran_on_a_cpu(disk: Path, tmp
     compare({"flats": disk}, ("nerfacto", "nearest"), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
     (sentence,) = nerfacto_limits(read_results(out, ["flats"], ["nerfacto", "nearest"]))
     assert "1,024 rays a batch instead of its default of 4,096" in sentence
-    assert "7 to 7 steps, 0.0% to 0.0% of its default of 30,000" in sentence
+    assert "7 steps, 0.0% of its default of 30,000" in sentence
     assert nerfacto_limits(read_results(out, ["flats"], ["nearest"])) == []
     on_a_gpu = Children(load_scene(disk, width=48))
     compare({"flats": disk}, ("nerfacto",), replace(SETTINGS, device="cuda:0"), tmp_path / "gpu", on_a_gpu, quiet)
     (sentence,) = nerfacto_limits(read_results(tmp_path / "gpu", ["flats"], ["nerfacto"]))
-    assert sentence == "Within the budget Nerfacto made 7 to 7 steps, 0.0% to 0.0% of its default of 30,000."
+    assert sentence == "Within the budget Nerfacto made 7 steps, 0.0% of its default of 30,000."
 
 
 def test_the_limits_of_opensplat_are_stated(disk: Path, tmp_path: Path):
     out = tmp_path / "out"
     compare({"flats": disk}, ("opensplat", "nearest"), SETTINGS, out, Children(load_scene(disk, width=48)), quiet)
     (sentence,) = opensplat_limits(read_results(out, ["flats"], ["opensplat", "nearest"]))
-    assert "7 to 7 steps, 0.0% to 0.0% of its default of 30,000" in sentence
+    assert "7 steps, 0.0% of its default of 30,000" in sentence
     assert "the first 3,000 with photographs of a quarter of their size" in sentence
     assert opensplat_limits(read_results(out, ["flats"], ["nearest"])) == []
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import Device, Preset, Verbosity
-from tidefield.commands.compare import make_settings, print_lines, run_all
+from tidefield.commands.compare import end, make_settings, print_lines, run_all
 from tidefield.config import PRESETS, Budget, vary
 from tidefield.errors import RunError
 
@@ -57,5 +57,7 @@ def ablate(options: Ablate, console: Console) -> None:
     # From scratch, all of them: trained weights would belong to one of the variants only.
     settings = make_settings(options.budget, options.width, options.device, options.seed, True, options.preset)
     methods = variants(options.variants, options.preset, options.seeds)
-    results = run_all(named(options.scenes), methods, settings, options.out, console)
-    print_lines(console, write_ablation(results, settings, options.out))
+    results, failures = run_all(named(options.scenes), methods, settings, options.out, console)
+    if results.by:
+        print_lines(console, write_ablation(results, settings, options.out))
+    end(failures, options.out)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,11 +25,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tidefield.compare.results import Results
-    from tidefield.compare.run import Settings, Usage
+    from tidefield.compare.run import Failure, Settings, Usage
 
+log = logging.getLogger(__name__)
 SYNTHETIC_WIDTH = 400
-Elsewhere = Callable[[Callable[[], Any], list[str]], Iterator[str]]
-"""Works on scenes, given by what a worker prepares and their names; yields the name of each that is done."""
+Elsewhere = Callable[[Callable[[], Any], list[str]], Iterator[tuple[str, Any]]]
+"""Works on scenes, given by what a worker prepares and their names; yields the name of each that is done, and what
+failed on it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Compare:
 
 def compare(options: Compare, console: Console) -> None:
     """Run `tidefield compare`."""
-    from tidefield.cluster import connected, done_on_cluster, share_of
+    from tidefield.cluster import connected, on_cluster, share_of
     from tidefield.compare.tables import write_comparison
 
     if not options.methods:
@@ -86,11 +90,13 @@ def compare(options: Compare, console: Console) -> None:
             share = share_of(ray, options.device, "machine")
             auto = "cuda:0" if share.gpus else "cpu"
             settings = replace(settings, device=auto if options.device == "auto" else options.device)
-            elsewhere = partial(done_on_cluster, ray, "compare", share=share)
+            elsewhere = partial(on_cluster, ray, "compare", share=share)
         environment = _require_software(options, settings.device)
         scenes = _scenes(options)
-        results = run_all(scenes, options.methods, settings, options.out, console, environment, elsewhere)
-    print_lines(console, write_comparison(results, scenes, settings, options.out))
+        results, failures = run_all(scenes, options.methods, settings, options.out, console, environment, elsewhere)
+    if results.by:
+        print_lines(console, write_comparison(results, scenes, settings, options.out, options.protocol))
+    end(failures, options.out)
 
 
 def _require_software(options: Compare, device: str) -> dict[str, str]:
@@ -135,8 +141,8 @@ def run_all(
     console: Console,
     variables: Mapping[str, str] = MappingProxyType({}),
     elsewhere: Elsewhere | None = None,
-) -> Results:
-    """Train and evaluate what has not been done yet, and read all results.
+) -> tuple[Results, Sequence[Failure]]:
+    """Train and evaluate what has not been done yet, and read all results; also returns what failed.
 
     Args:
         variables: additional ones of the environment of all processes.
@@ -147,35 +153,79 @@ def run_all(
     from tidefield.compare.run import (
         PROCESS_FILE,
         RUNS,
-        check_scene,
+        Unfinished,
         compare,
-        require_one_state,
         require_same_settings,
         run_measured,
         scene_runner,
     )
+    from tidefield.compare.sources import check_scene, installed_weights, require_one_state, require_same_sources
 
     require_writable(out / PROCESS_FILE, overwrite=True)
     # In a process of its own, because the memory of a scene would be charged to every process that this one starts.
     with worker_processes(1) as pool:
         states = {name: pool.submit(check_scene, scene, settings.width).result() for name, scene in scenes.items()}
-    require_one_state(states, methods, out)
+        weights = pool.submit(installed_weights, methods, settings).result()
+    poses, contents = ({name: state[k] for name, state in states.items()} for k in (0, 1))
+
+    def require_same() -> None:
+        require_one_state(poses, methods, out)
+        require_same_sources(contents, weights, out)
+
+    require_same()
+    failures: list[Failure] = []
     if elsewhere is None:
         quiet = ["--quiet"] if console.quiet else []
 
         def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
             return run_measured([*command, *quiet], {**variables, **environment})
 
-        compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]))
+        try:
+            compare(scenes, methods, settings, out, run, lambda text: print_lines(console, [text]), contents)
+        except Unfinished as error:
+            failures += error.failures
     else:
         require_same_settings(scenes, methods, settings, out)
         found = {name: scene.resolve() for name, scene in scenes.items()}
-        opened = partial(scene_runner, found, methods, settings, out.resolve(), variables)
-        for number, name in enumerate(elsewhere(opened, list(scenes)), start=1):
+        opened = partial(scene_runner, found, methods, settings, out.resolve(), variables, contents)
+        for number, (name, failed) in enumerate(elsewhere(partial(_with_failures, opened), list(scenes)), start=1):
             pull(out / RUNS / name)
-            print_lines(console, [f"{name}: done ({number} of {len(scenes)})"])
-    require_one_state(states, methods, out)
-    return read_results(out, list(scenes), methods)
+            failures += failed
+            print_lines(console, [f"{name}: {'not complete' if failed else 'done'} ({number} of {len(scenes)})"])
+    require_same()
+    return read_results(out, list(scenes), methods), failures
+
+
+@contextmanager
+def _with_failures(
+    opened: Callable[[], AbstractContextManager[Callable[[str], object]]],
+) -> Iterator[Callable[[str], Sequence[Failure]]]:
+    """What `scene_runner` opens, as a function that returns what failed: an error would end the other scenes, too."""
+    from tidefield.compare.run import Unfinished
+
+    with opened() as work:
+
+        def tried(name: str) -> Sequence[Failure]:
+            try:
+                work(name)
+            except Unfinished as error:
+                return error.failures
+            return ()
+
+        yield tried
+
+
+def end(failures: Sequence[Failure], out: Path) -> None:
+    """List what failed, and end with the first one's exit status; nothing if nothing failed."""
+    from tidefield.addresses import push
+
+    if not failures:
+        return
+    for failure in failures:
+        log.error(f"{failure.title}: {failure.reason}")
+    log.error(f"{len(failures)} failed, the rest is done; the same command repeats what failed")
+    push(out)  # copies of addresses are sent by commands that end well
+    sys.exit(failures[0].status)
 
 
 def print_lines(console: Console, lines: Iterable[object]) -> None:
@@ -192,7 +242,10 @@ def _scenes(options: Compare) -> dict[str, Path]:
             raise RunError("--protocol mipnerf360 compares on one data set: expected its folder; name it alone")
         return mipnerf360(options.scenes[0], options.out / "scenes")
     if options.protocol == "tidalflats":
-        return tidal_flats(options.out / "scenes", options.width or SYNTHETIC_WIDTH, options.scenes)
+        # In a process of its own, as the memory that it takes would be charged to what is measured.
+        with worker_processes(1) as pool:
+            width = options.width or SYNTHETIC_WIDTH
+            return pool.submit(tidal_flats, options.out / "scenes", width, options.scenes).result()
     if not options.scenes:
         raise RunError("nothing to compare on: expected scenes, or --protocol; name some")
     return named(options.scenes)

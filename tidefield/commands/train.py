@@ -87,8 +87,9 @@ class Train:
     verbosity: OmitArgPrefixes[Verbosity] = Verbosity()
 
 
-def train(options: Train, console: Console, again: str = AGAIN) -> None:
+def train(options: Train, console: Console, again: str | None = None) -> None:
     """Run `tidefield train`; `again` says what continues a training that is interrupted."""
+    from tidefield.compare.run import AGAIN_VARIABLE
     from tidefield.evaluation.curves import CURVE_FILE
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
@@ -99,7 +100,7 @@ def train(options: Train, console: Console, again: str = AGAIN) -> None:
         raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     with only_writer(folder):
         delete_partials(*(folder / name for name in (RUN_FILE, CHECKPOINT_FILE, CURVE_FILE)))
-        _train(options, console, again)
+        _train(options, console, again or os.environ.get(AGAIN_VARIABLE, AGAIN))
 
 
 def _train(options: Train, console: Console, again: str) -> None:

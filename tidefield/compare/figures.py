@@ -10,11 +10,11 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter
 
 from tidefield.compare.results import Results
-from tidefield.compare.run import EVALUATION_FILE
 from tidefield.data.readers.files import open_picture
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError, SceneError
+from tidefield.evaluation import EVALUATION_FILE
 from tidefield.evaluation.evaluate import picture_names
 from tidefield.evaluation.panels import GAP_PX, PAPER, STRIP_PX, strip
 

@@ -28,6 +28,7 @@ from typing import IO, Any
 
 from tidefield.config import PROTOCOL
 from tidefield.errors import RunError, SceneError
+from tidefield.evaluation import EVALUATION_FILE
 from tidefield.files import completed_folder, only_writer, read_json, write_json
 from tidefield.machine import describe
 from tidefield.methods import METHODS, UNTRAINED_DEVICE
@@ -35,9 +36,14 @@ from tidefield.processes import Ended, end_with_parent
 
 WHOLE = "tidefield"
 """Our network, of which an ablation has variants."""
+AGAIN_VARIABLE = "TIDEFIELD_AGAIN"
+"""The environment variable with what continues a training that is interrupted, where another command has started it."""
+_LAST_FAILURE = 128
+"""Larger exit statuses are those of signals."""
 WRITER_SECONDS = 120.0
 """More than a training needs to save, and a shared folder to release the lock of a machine that died."""
-RUNS, PROCESS_FILE, EVALUATION_FILE, RUN_FILE = "runs", "process.json", "evaluation.json", "run.json"
+RUNS, PROCESS_FILE, RUN_FILE = "runs", "process.json", "run.json"
+STEPS = ("train", "evaluate")
 MIPNERF360 = {
     "bicycle": "images_4",
     "bonsai": "images_2",
@@ -61,6 +67,23 @@ class Usage:
 
 Runner = Callable[[Sequence[str], Mapping[str, str]], Usage]
 """Runs a command to its end, with additional environment variables."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A command of a comparison that failed: on what, why, and the exit status that it gives the comparison."""
+
+    title: str
+    reason: str
+    status: int
+
+
+class Unfinished(RunError):
+    """Some commands failed; everything else is done."""
+
+    def __init__(self, text: str, failures: Sequence[Failure] = ()) -> None:
+        super().__init__(text)
+        self.failures = failures
 
 
 @dataclass(frozen=True)
@@ -177,26 +200,6 @@ def tidefield(*words: object) -> list[str]:
     return [sys.executable, "-m", "tidefield.cli", *map(str, words)]
 
 
-def check_scene(scene: Path, width: int | None) -> str:
-    """Identify the poses and the split of a scene (`poses_key`), without reading its photographs.
-
-    Raises:
-        SceneError: it cannot be compared on.
-    """
-    import torch
-
-    from tidefield.data.load import read_posed, require_width
-    from tidefield.data.scene import poses_key
-
-    require_width(width)
-    posed = read_posed(scene, allow_missing=False)
-    held_out = {posed.names[i] for i in posed.train_and_test[1]}
-    if not held_out:
-        raise SceneError(f"{scene} holds no photograph out: expected at least one to compare with; add photographs")
-    T_world_camera, _ = posed.centred
-    return poses_key(posed.names, torch.from_numpy(T_world_camera).float(), held_out)
-
-
 def run_measured(command: Sequence[str], environment: Mapping[str, str], output: IO[bytes] | None = None) -> Usage:
     """Run a command in a process of its own; it prints to `output`, to ours if that is not given.
 
@@ -234,13 +237,11 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str], output:
 
 def commands(scene: Path, folder: Path, method: str, settings: Settings) -> dict[str, list[str]]:
     """The tidefield commands of a method, or of a variant of our network, on a scene, by name, in their order."""
-    kind, (name, further) = _kind(method), variant_and_seed(method)
-    preset = METHODS[method].preset if method in METHODS else None
+    kind, (name, further) = kind_of(method), variant_and_seed(method)
+    preset = preset_of(method, settings)
     device = ["--device", settings.device]
     width = [] if settings.width is None else ["--width", str(settings.width)]
     start = ["--from-scratch"] if settings.from_scratch else []
-    if method in (WHOLE, "zero-shot"):
-        preset = settings.preset
     if kind == "variant":
         source = ["--preset", settings.preset, *([] if name == WHOLE else ["--variant", name]), *start]
     elif kind == "preset":
@@ -283,8 +284,9 @@ def compare(
     out: Path,
     run: Runner,
     say: Callable[[str], object],
+    contents: Mapping[str, str] | None = None,
 ) -> None:
-    """Train and evaluate what has not been evaluated yet.
+    """Train and evaluate what has not been evaluated yet; after a command that fails, all others.
 
     Args:
         scenes: folders by the names that the tables give them.
@@ -293,12 +295,15 @@ def compare(
         out: the comparison's folder.
         run: runs a command.
         say: reports progress.
+        contents: of the scenes (`check_scene`), by name, for the record.
 
     Raises:
-        RunError: a command failed, or the folder holds results of other settings.
+        Unfinished: commands failed, in the end.
+        RunError: the folder holds results of other settings.
+        SystemExit: a signal ended a command, or the reader of its output has gone.
     """
     require_same_settings(scenes, methods, settings, out)
-    jobs = _jobs(scenes, methods, out)
+    jobs, failures = _jobs(scenes, methods, out), list[Failure]()
     for number, (folder, name, scene, method) in enumerate(jobs, start=1):
         title = f"{name}, {method} ({number} of {len(jobs)})"
         if read_evaluation(folder) is not None and "evaluate" in read_process(folder):
@@ -307,14 +312,25 @@ def compare(
         portable = commands(Path("SCENE"), Path("RUN"), method, settings)
         for step, words in commands(scene, folder, method, settings).items():
             say(f"{title}: {step}")
-            record = read_process(folder) or {"settings": _record(scene, method, settings)}
+            made_from = {} if contents is None else {"scene": {"contents": contents[name]}}
+            record = read_process(folder) or {"settings": _record(scene, method, settings), **made_from}
             if step == "train" and step in record:
                 continue
             written = {"train": RUN_FILE, "evaluate": EVALUATION_FILE}[step]
             again = ["--overwrite"] if (folder / written).exists() else []
-            usage = run(tidefield(*words, *again), {})
+            try:
+                usage = run(tidefield(*words, *again), {AGAIN_VARIABLE: "the same command"})
+            except (RunError, SystemExit) as error:
+                status = error.code if isinstance(error, SystemExit) else 2
+                if not isinstance(status, int) or status > _LAST_FAILURE:
+                    raise
+                reason = str(error) if isinstance(error, RunError) else f"it ended with status {status}"
+                failures.append(Failure(f"{name}, {method}: {step}", reason, status))
+                break
             command = shlex.join(["tidefield", *portable[step]])
             write_json(folder / PROCESS_FILE, {**record, step: {"command": command, **asdict(usage), **describe()}})
+    if failures:
+        raise Unfinished(failures[0].reason, failures)
 
 
 def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], settings: Settings, out: Path) -> None:
@@ -326,36 +342,6 @@ def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], se
             was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
             asked = {key: wanted[key] for key in was}
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
-
-
-def require_one_state(scenes: Mapping[str, str], methods: Sequence[str], out: Path) -> None:
-    """Raises: RunError when results are of other poses or splits than the scene has: it was made anew in between.
-
-    Args:
-        scenes: what `check_scene` returned, by the scenes' names.
-    """
-    for name, state in scenes.items():
-        measured: dict[str, list[str]] = {}
-        for method in methods:
-            folder = out / RUNS / name / method
-            # Not `read_run`: the memory of PyTorch would be charged to every process that this one starts.
-            # One that was interrupted is trained anew.
-            run = (read_json(folder / RUN_FILE) if "train" in read_process(folder) else None) or {}
-            evaluation = read_evaluation(folder) or {}
-            for poses in {run.get("poses"), evaluation.get("poses")} - {None}:
-                measured.setdefault(poses, []).append(method)
-        if len(measured) > 1:
-            groups = ", and ".join(", ".join(group) for group in measured.values())
-            raise RunError(
-                f"{out / RUNS / name} has results of {groups}, on different poses or splits of the scene: expected the "
-                "same for all; delete the older ones, or name another folder with --out"
-            )
-        if measured and state not in measured:
-            (older,) = measured.values()
-            raise RunError(
-                f"{out / RUNS / name} has results of {', '.join(older)}, on other poses or another split than the "
-                "scene has now: expected the same; delete them, or name another folder with --out"
-            )
 
 
 def _jobs(scenes: Mapping[str, Path], methods: Sequence[str], out: Path) -> list[tuple[Path, str, Path, str]]:
@@ -370,11 +356,12 @@ def scene_runner(
     settings: Settings,
     out: Path,
     environment: Mapping[str, str],
+    contents: Mapping[str, str] | None = None,
 ) -> Iterator[Callable[[str], None]]:
     """`compare` in a worker of a cluster: a function of a scene's name, for all methods.
 
     Args:
-        scenes, methods, settings, out: as for `compare`; the paths are absolute.
+        scenes, methods, settings, out, contents: as for `compare`; the paths are absolute.
         environment: additional variables of all processes.
     """
     from tidefield.addresses import pull, push
@@ -396,8 +383,10 @@ def scene_runner(
                 pass  # the child of a worker that died has saved and ended, too
         for path in (scenes[name], out / RUNS / name):
             pull(path)
-        compare({name: scenes[name]}, methods, settings, out, run, lambda _: None)
-        push(out / RUNS / name)
+        try:
+            compare({name: scenes[name]}, methods, settings, out, run, lambda _: None, contents)
+        finally:
+            push(out / RUNS / name)
 
     yield work
 
@@ -452,24 +441,47 @@ def _is_evaluation(data: Any) -> bool:
 
 
 def _is_process(data: Any) -> bool:
-    peaks = [step.get("peak_memory_bytes") for step in data.values()]
-    return isinstance(data["settings"], dict) and all(peak is None or _is_number(peak) for peak in peaks)
+    steps = [data[step] for step in STEPS if step in data]
+    peaks = [step.get("peak_memory_bytes") for step in steps]
+    parts = [data["settings"], data.get("scene", {}), *steps]
+    described = all(_is_description(step) for step in steps if "machine" in step)
+    return described and all(isinstance(x, dict) for x in parts) and all(p is None or _is_number(p) for p in peaks)
+
+
+def _is_description(data: Any) -> bool:
+    """Whether a record has what `describe` returns."""
+    machine = data["machine"]
+    texts = [data["date"], data["version"], *(machine[name] for name in ("processor", "system", "python", "torch"))]
+    numbers = [machine["cores"], machine["memory_bytes"]]
+    return all(isinstance(x, str) for x in (*texts, *machine.get("gpus", []))) and all(map(_is_number, numbers))
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def _kind(method: str) -> str:
+def kind_of(method: str) -> str:
     """The kind of a method, or "variant" for variants of our network and for other seeds."""
     return METHODS[method].kind if method in METHODS else "variant"
+
+
+def preset_of(method: str, settings: Settings) -> str | None:
+    """The preset of a method, None for those that have none."""
+    if method in (WHOLE, "zero-shot"):
+        return settings.preset
+    return METHODS[method].preset if method in METHODS else None
+
+
+def starts_from_weights(method: str, settings: Settings) -> bool:
+    """Whether a method has trained weights before it sees the scene, if some are installed."""
+    return kind_of(method) == "zero-shot" or (kind_of(method) == "preset" and not settings.from_scratch)
 
 
 def _record(scene: Path, method: str, settings: Settings) -> dict[str, object]:
     """What a result depends on: no budget where nothing is trained, and no start weights but for our presets."""
     kept = asdict(settings)
-    if _kind(method) in ("zero-shot", "untrained"):
+    if kind_of(method) in ("zero-shot", "untrained"):
         kept |= {"minutes": None, "steps": None, "seed": None}
-    if _kind(method) not in ("preset", "variant"):
+    if kind_of(method) not in ("preset", "variant"):
         del kept["from_scratch"]
     return {**kept, "scene": str(scene.resolve())}

@@ -7,16 +7,15 @@ import io
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
+from tidefield.compare.circumstances import code_and_machines, machines, records_of, when
 from tidefield.compare.results import Results, figures_of
-from tidefield.compare.run import Settings
+from tidefield.compare.run import Settings, preset_of, starts_from_weights
 from tidefield.config import PRESETS
 from tidefield.data.load import DOUBLED_BYTES
 from tidefield.evaluation.lpips import BACKBONES, hash_prefix
 from tidefield.evaluation.metrics import METRICS
 from tidefield.files import completed_file, write_json, write_text
-from tidefield.machine import describe
 from tidefield.methods import METHODS, UNTRAINED_DEVICE, names
 
 NOTHING, MEAN = "-", "mean"
@@ -54,7 +53,10 @@ NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
 (`baselines/nerfstudio/worker.py`)."""
 OPENSPLAT_STEPS, OPENSPLAT_SCHEDULE = 30_000, 3_000
 """OpenSplat's default number of steps, and after how many it doubles the photographs' size, from a quarter on."""
-_ESCAPES = str.maketrans({"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
+_ESCAPES = str.maketrans(
+    {c: rf"\{c}" for c in "&%_#${}"}
+    | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
+)
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ class Table:
         rows = [[f"**{c}**" if (i, j) in self.bold else c for j, c in enumerate(r)] for i, r in enumerate(self.rows)]
         lines = [self.columns, ["---", *["---:"] * (len(self.columns) - 1)], *rows]
         heading = [f"### {self.title}", ""] if self.title else []
-        return "\n".join([*heading, *(f"| {' | '.join(line)} |" for line in lines)])
+        escaped = ([cell.replace("|", r"\|") for cell in line] for line in lines)
+        return "\n".join([*heading, *(f"| {' | '.join(line)} |" for line in escaped)])
 
     def latex(self) -> str:
         """A table environment; needs the package booktabs."""
@@ -94,11 +97,13 @@ class Table:
 
     def csv(self) -> str:
         """With a header; cells without a value are empty."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows([["" if cell == NOTHING else cell for cell in row] for row in self.rows])
-        return text.getvalue()
+        return _csv([self.columns, *(["" if cell == NOTHING else cell for cell in row] for row in self.rows)])
+
+
+def _csv(rows: Sequence[Sequence[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def _tex(text: str) -> str:
@@ -108,6 +113,15 @@ def _tex(text: str) -> str:
 def shown(value: float | int | None, style: str) -> str:
     """A number as text, or a dash where there is none."""
     return NOTHING if value is None else style.format(value)
+
+
+def missing_results(results: Results) -> list[str]:
+    """Which methods have no results on which scenes, as a sentence."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for scene in results.scenes:
+        groups.setdefault(tuple(m for m in results.methods if (scene, m) not in results.by), []).append(scene)
+    found = [f"{', '.join(methods)} on {', '.join(scenes)}" for methods, scenes in groups.items() if methods]
+    return [f"Not complete: no results of {'; '.join(found)}."] if found else []
 
 
 def missing_metrics(results: Results) -> list[str]:
@@ -148,11 +162,9 @@ def quality_tables(results: Results, regions: Mapping[str, str] = REGIONS) -> li
 
 def _quality(results: Results, name: str, title: str, style: str, more: bool) -> Table:
     rows, bold = [], set()
-    for i, scene in enumerate((*results.scenes, MEAN)):
-        values = [
-            results.mean(method, name, results.scenes) if scene == MEAN else results.metric(scene, method, name)
-            for method in results.methods
-        ]
+    measured = {scene: [results.metric(scene, method, name) for method in results.methods] for scene in results.scenes}
+    means = [results.mean(method, name, results.scenes) for method in results.methods]
+    for i, (scene, values) in enumerate((*measured.items(), (MEAN, means))):
         known = [value for value in values if value is not None]
         best = (max if more else min)(known) if len(known) > 1 else None
         bold |= {(i, j + 1) for j, value in enumerate(values) if value is not None and value == best}
@@ -257,8 +269,9 @@ def _steps_and_devices(results: Results, method: str) -> tuple[list[int | float]
 
 
 def _share_of_default(steps: list[int | float], default: int) -> str:
-    least, most = min(steps) / default, max(steps) / default
-    return f"{min(steps):,} to {max(steps):,} steps, {least:.1%} to {most:.1%} of its default of {default:,}"
+    ends = sorted({min(steps), max(steps)})
+    counts, shares = (f"{end:,}" for end in ends), dict.fromkeys(f"{end / default:.1%}" for end in ends)
+    return f"{' to '.join(counts)} steps, {' to '.join(shares)} of its default of {default:,}"
 
 
 @dataclass(frozen=True)
@@ -270,11 +283,11 @@ class Mark:
     meaning: str
 
 
-def learned_from() -> tuple[str, ...]:
-    """Names of the scenes that the installed weights learned from, as their files say."""
+def learned_from(presets: Collection[str] = tuple(PRESETS)) -> tuple[str, ...]:
+    """Names of the scenes that the installed weights of presets learned from, as their files say."""
     from tidefield.train.checkpoint import read_weights_file, shipped_weights
 
-    files = [file for preset in PRESETS if (file := shipped_weights(preset)) is not None]
+    files = [file for preset in presets if (file := shipped_weights(preset)) is not None]
     return tuple(sorted({name for file in files for name in read_weights_file(file)[0].get("real", ())}))
 
 
@@ -314,7 +327,10 @@ def legend(scenes: Sequence[str], marks: Sequence[Mark]) -> list[str]:
     lines = [f"- {mark.sign} {', '.join(names)}: {mark.meaning}" for mark, names in found if names]
     others = [scene for scene in scenes if not any(scene in mark.scenes for mark in marks)]
     if lines and others:
-        lines.append(f"- without a mark ({', '.join(others)}): the shipped weights and their recipe do not know it.")
+        lines.append(
+            f"- without a mark ({', '.join(others)}): no scene of this name taught the shipped weights or chose their "
+            "recipe."
+        )
     return ["\n".join(lines)] if lines else []
 
 
@@ -335,8 +351,13 @@ def trainings(results: Results) -> list[str]:
     return sentences
 
 
-def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path) -> list[Path]:
+def write_comparison(
+    results: Results, scenes: Mapping[str, Path], settings: Settings, out: Path, protocol: str | None = None
+) -> list[Path]:
     """Write tables, figures, curves and comparison.json into the comparison's folder, over older ones.
+
+    Args:
+        protocol: whose scenes these are, if any: other scenes may have the names of those in the paper.
 
     Returns:
         The files.
@@ -344,27 +365,28 @@ def write_comparison(results: Results, scenes: Mapping[str, Path], settings: Set
     from tidefield.compare.figures import side_by_side, write_curves
     from tidefield.data.load import load_scene
 
-    # The paper's tables where the scenes are among its, then every metric, then time and memory.
-    papers = (
-        paper_table(results, TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
-        paper_table(results, TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
-    )
-    tables = [*(table for table in papers if table is not None), *quality_tables(results), cost_table(results)]
-    of_weights = any(
-        METHODS[name].kind == "zero-shot" or (METHODS[name].kind == "preset" and not settings.from_scratch)
-        for name in results.methods
-    )
-    marks = scene_marks(learned_from()) if of_weights else ()
+    # The paper's table of the protocol, then every metric, then time and memory.
+    published = {
+        "mipnerf360": (TABLE_2, "As the paper's Table 2: scenes of mip-NeRF 360"),
+        "tidalflats": (TABLE_3, "As the paper's Table 3: tidal flats; ours are synthetic"),
+    }
+    paper = None if protocol is None else paper_table(results, *published[protocol])
+    tables = [*([] if paper is None else [paper]), *quality_tables(results), cost_table(results)]
+    presets = {str(preset_of(name, settings)) for name in results.methods if starts_from_weights(name, settings)}
+    marks = scene_marks(learned_from(presets)) if presets else ()
     remarks = [*trainings(results), *legend(results.scenes, marks)]
     files = write_tables("tables", "Comparison", tables, remarks, results, settings, out, marks)
     files.append(write_figures("comparison", results, settings, out))
     for name, path in scenes.items():
-        figure = side_by_side(results, name, load_scene(path, width=settings.width))
-        if figure is not None:
-            file = out / "figures" / f"{name}.png"
-            with completed_file(file, overwrite=True) as partial:
-                figure.save(partial)
-            files.append(file)
+        measured = any(scene == name for scene, _ in results.by)
+        figure = side_by_side(results, name, load_scene(path, width=settings.width)) if measured else None
+        file = out / "figures" / f"{name}.png"
+        if figure is None:
+            file.unlink(missing_ok=True)
+            continue
+        with completed_file(file, overwrite=True) as partial:
+            figure.save(partial)
+        files.append(file)
     curves = out / "curves.png"
     if any(result.curve for result in results.by.values()):
         with completed_file(curves, overwrite=True) as partial:
@@ -395,18 +417,18 @@ def write_tables(
 ) -> list[Path]:
     """Write tables with their circumstances as STEM.md, and without these and marks as STEM.tex and STEM.csv; returns
     the files."""
-    made: dict[str, Any] = describe()
-    machine = made["machine"]
+    records = records_of(results)
     budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.steps} steps"
     page = [
         f"# {title}",
-        "Means over the held-out photographs. Each method had the same photographs, split, resolution and machine, "
+        "Means over the held-out photographs. Each method had the same photographs, split and resolution, "
         f"and {budget} of training, one after another. Our presets and methods without training read what lies between "
         "pixels from files of twice the width, where there are such; methods without training and training itself do "
         f"so where those of a scene take {DOUBLED_BYTES / 1e9:g} GB at most.",
-        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB, on "
-        f"{settings.device}; photographs {widths(results)} px wide; Tidefield {made['version']}, torch "
-        f"{machine['torch']}; {made['date']}.",
+        f"On {settings.device}; photographs {widths(results)} px wide; {when(records)}.",
+        *machines(records),
+        *code_and_machines(results),
+        *missing_results(results),
         *untrained_limits(results, settings.device),
         *nerfacto_limits(results),
         *opensplat_limits(results),
@@ -418,7 +440,7 @@ def write_tables(
     texts = {
         ".md": "\n\n".join(page) + "\n",
         ".tex": "\n\n".join(table.latex() for table in tables) + "\n",
-        ".csv": "\n".join(f"{table.title}\n{table.csv()}" for table in tables),
+        ".csv": "\n".join(_csv([[table.title]]) + table.csv() for table in tables),
     }
     files = [out / f"{stem}{suffix}" for suffix in texts]
     for file, text in zip(files, texts.values(), strict=True):
@@ -427,7 +449,7 @@ def write_tables(
 
 
 def write_figures(stem: str, results: Results, settings: Settings, out: Path) -> Path:
-    """Write all figures with their settings and the machine as STEM.json; returns the file."""
+    """Write all figures with their settings as STEM.json; returns the file."""
     path = out / f"{stem}.json"
-    write_json(path, {"settings": asdict(settings), **describe(), "results": figures_of(results)})
+    write_json(path, {"settings": asdict(settings), "results": figures_of(results)})
     return path

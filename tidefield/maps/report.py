@@ -105,12 +105,13 @@ def _scaled(
     known = band[np.isfinite(band)]
     low, high = np.percentile(known, percentiles).tolist() if len(known) else (0.0, 1.0)
     low = 0.0 if percentiles[0] == 0 else low
-    figure, axes = map_of(*band.shape, INCHES if relief is not None else _HALF)
+    rows, columns = band.shape
+    figure, axes = map_of(rows, columns, INCHES if relief is not None else _HALF)
     if relief is not None:
         axes.imshow(relief, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="nearest")
-    ends = {"vmin": low, "vmax": max(high, low + 1e-9)}
-    alpha = None if relief is None else 0.6
-    image = axes.imshow(band, cmap=colours, alpha=alpha, extent=extent, interpolation="nearest", **ends)
+    shown = None if relief is None else 0.6
+    image = axes.imshow(band, cmap=colours, alpha=shown, extent=extent, interpolation="nearest")
+    image.set_clim(low, max(high, low + 1e-9))
     beyond = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
     arrows = beyond[bool((known < low).any()), bool((known > high).any())]
     figure.colorbar(image, ax=axes, fraction=0.035, pad=0.02, extend=arrows, alpha=1).set_label(label)
@@ -121,7 +122,7 @@ def _classes(values: np.ndarray, extent: Extent) -> Markup:
     picture = np.zeros((*values.shape[1:], 4), np.uint8)
     for value, colour, _ in _CLASSES:
         picture[values[0] == value] = [*bytes.fromhex(colour[1:]), 255]
-    figure, axes = map_of(*picture.shape[:2], _HALF)
+    figure, axes = map_of(values.shape[1], values.shape[2], _HALF)
     axes.imshow(picture, extent=extent, interpolation="nearest")
     handles = [Patch(color=colour, label=name) for _, colour, name in _CLASSES]
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncol=3, frameon=False)
