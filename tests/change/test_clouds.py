@@ -11,7 +11,7 @@ from pyproj import CRS, Transformer
 from tidefield.change.clouds import Cloud, compare_clouds, in_system, read_cloud, write_distances, write_surface
 from tidefield.change.inputs import open_pair
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, open_surface, other_zeros
+from tidefield.change.surfaces import ChangeError, open_surface, other_datums
 
 US_FOOT = 1200 / 3937
 EAST, NORTH = 1_830_000.0, 646_000.0
@@ -80,7 +80,7 @@ def test_feet_become_metres_of_the_utm_zone(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("keys", "unit", "zero", "remarked"),
+    ("keys", "unit", "datum", "remarked"),
     [
         ({4096: 6360}, US_FOOT, "North American Vertical Datum 1988", False),
         ({4096: 5703, 4099: 9003}, US_FOOT, "North American Vertical Datum 1988", False),
@@ -90,13 +90,13 @@ def test_feet_become_metres_of_the_utm_zone(tmp_path: Path):
     ],
 )
 def test_old_files_state_the_unit_of_their_heights_in_keys(
-    tmp_path: Path, keys: dict[int, int], unit: float, zero: str | None, remarked: bool
+    tmp_path: Path, keys: dict[int, int], unit: float, datum: str | None, remarked: bool
 ):
     xyz = square(np.random.default_rng(0), 100.0) + np.array([980_000.0, 200_000.0, 10.0])
     paths = [write_old_cloud(tmp_path / name, xyz, {1024: 1, 3072: 2263, **keys}) for name in ("a.las", "b.las")]
     cloud = read_cloud(paths[0])
     assert cloud.xyz[:, 2] == pytest.approx(10 * unit, abs=1e-3)
-    assert cloud.zero == zero
+    assert cloud.vertical_datum == datum
     found = open_pair(paths[0], paths[1], tmp_path)
     for name, survey in (("a.las", found.earlier), ("b.las", found.later)):
         assert any(name in remark and "US survey foot" in remark for remark in survey.remarks) == remarked
@@ -201,7 +201,7 @@ def test_clouds_over_two_ellipsoids_are_remarked_and_refused_without_registratio
         for name, system in (("a", "EPSG:32632"), ("b", "EPSG:25832"))
     )
     found = open_pair(one, other, tmp_path)
-    assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (other_zeros(found.earlier, found.later) or "")
+    assert "the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (other_datums(found.earlier, found.later) or "")
     with pytest.raises(ChangeError, match=r"a\.laz.*b\.laz.*one vertical datum"):
         open_pair(one, other, tmp_path, registered=False)
 

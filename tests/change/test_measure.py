@@ -54,7 +54,7 @@ def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
 
 
 @pytest.mark.thorough
-def test_heights_over_other_zeros_are_refused_where_nothing_takes_the_difference(tmp_path: Path):
+def test_heights_over_other_datums_are_refused_where_nothing_takes_the_difference(tmp_path: Path):
     surfaces = [open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]]
     one, other = (replace(surface, datum=datum) for surface, datum in zip(surfaces, ("sea", "take-off"), strict=True))
     asked = Options(register="none", datum_error_m=0.02)

@@ -9,7 +9,7 @@ import shapely
 from pyproj import CRS, Transformer
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
-from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface, other_zeros, require_one_zero
+from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface, other_datums, require_one_datum
 from tidefield.change.write import CHANGE_BANDS, _multi
 
 
@@ -342,11 +342,11 @@ def test_ellipsoidal_heights_are_not_compared_with_those_over_a_geoid(tmp_path: 
     assert common_grid([open_surface(one), open_surface(third)]).rows > 1
     surfaces = [open_surface(path) for path in (one, third)]
     assert "up to two metres apart: the ellipsoid of WGS 84 and the ellipsoid of ETRS89" in (
-        other_zeros(*surfaces) or ""
+        other_datums(*surfaces) or ""
     )
-    assert other_zeros(surfaces[0], surfaces[0]) is None
+    assert other_datums(surfaces[0], surfaces[0]) is None
     with pytest.raises(ChangeError, match=r"WGS 84.*ETRS89.*leave --register none out"):
-        require_one_zero([(surface.path, surface.zero) for surface in surfaces], registered=False)
+        require_one_datum([(surface.path, surface.vertical_datum) for surface in surfaces], registered=False)
 
 
 def test_a_vertical_system_without_a_name_is_compared_with_any(tmp_path: Path):

@@ -77,7 +77,7 @@ def test_a_scene_among_maps_and_nothing_at_all_are_one_clear_error(scene: Path, 
         view(View((), port=0, no_browser=True), QUIET)
 
 
-def test_heights_over_other_zeros_are_warned_of(
+def test_heights_over_other_datums_are_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
     pytest.importorskip("rasterio")

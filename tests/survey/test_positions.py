@@ -175,7 +175,7 @@ def test_a_system_above_a_table_is_named(tmp_path):
     ]
 
 
-def test_unit_and_zero_of_heights_in_a_title_go_before_those_of_the_system(tmp_path):
+def test_unit_and_datum_of_heights_in_a_title_go_before_those_of_the_system(tmp_path):
     for title, height_m, datum in (
         ("alt", 1000 * 1200 / 3937, "mean sea level"),
         ("alt [m]", 1000, "mean sea level"),

@@ -326,7 +326,7 @@ def test_a_picture_without_a_place_is_refused(tmp_path: Path):
         Atlas([tmp_path])
 
 
-def test_maps_over_another_zero_of_heights_are_not_warped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_maps_over_another_vertical_datum_are_not_warped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name, crs in (("a", "EPSG:32630"), ("b", "EPSG:32630+5773")):
         write_surface(tmp_path / name / "dsm.tif", np.ones(SHAPE, np.float32), CELL, crs=crs)
     monkeypatch.setattr("rasterio.vrt.WarpedVRT", None)

@@ -25,7 +25,7 @@ from tidefield.geometry.geodesy import (
     horizontal,
     metres_per_height,
     same_system,
-    zero_of_heights,
+    vertical_datum_of,
 )
 from tidefield.maps.classes import NOISE, WATER
 
@@ -54,7 +54,7 @@ class Cloud:
         crs: a system of true metres; None where the file states none, or a local one.
         xyz: east, north, up.
         sigma: standard errors of their heights, if the file has them.
-        zero: name of the datum of the heights, if the file states one.
+        vertical_datum: of the heights, if the file states one.
         remarks: what a user should know of how it was read.
     """
 
@@ -62,7 +62,7 @@ class Cloud:
     crs: CRS | None
     xyz: Float64[np.ndarray, "N 3"]
     sigma: Float64[np.ndarray, " N"] | None
-    zero: str | None = None
+    vertical_datum: str | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -145,7 +145,7 @@ def read_cloud(path: Path) -> Cloud:
     unstated = has_unstated_unit(crs) and keys.get(_HEIGHT_UNIT) not in _UNITS_M
     remarks = (unstated_unit(path, crs, _ASSIGN),) if unstated else ()
     own = crs if metres_per_height(crs) == 1 else horizontal(crs)
-    return in_system(Cloud(path, own, xyz, sigma, zero_of_heights(crs), remarks), metric)
+    return in_system(Cloud(path, own, xyz, sigma, vertical_datum_of(crs), remarks), metric)
 
 
 def _system(header: Any) -> tuple[CRS | None, dict[int, int]]:

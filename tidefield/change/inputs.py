@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, require_system, write_surface
 from tidefield.change.shift import is_picture
-from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, opened, require_one_zero
+from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, opened, require_one_datum
 
 FILLED, CLASSES = "filled.tif", "classes.tif"
 """Of `tidefield map --fill`, and of every map, next to the surface."""
@@ -111,7 +111,7 @@ def open_pair(
         registered: whether stable ground takes out what their ellipsoids differ by.
 
     Raises:
-        ChangeError: one has no surface, only one is a cloud, folders have no clouds, or zeros of heights differ.
+        ChangeError: one has no surface, only one is a cloud, folders have no clouds, or vertical datums differ.
     """
     if is_cloud(earlier) != is_cloud(later):
         cloud = earlier if is_cloud(earlier) else later
@@ -142,7 +142,9 @@ def open_pair(
         path = work / f"{name}.tif"
         write_surface(cloud, cell, path)
         opened = open_surface(path, date or date_in(cloud.path.stem))
-        surfaces.append(replace(opened, source=cloud.path.name, datum=cloud.zero, remarks=list(cloud.remarks)))
+        surfaces.append(
+            replace(opened, source=cloud.path.name, datum=cloud.vertical_datum, remarks=list(cloud.remarks))
+        )
     return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
 
 
@@ -170,7 +172,7 @@ def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tu
 
 def _both(earlier: Path, later: Path, registered: bool) -> tuple[Cloud, Cloud]:
     first, second = read_cloud(earlier), read_cloud(later)
-    require_one_zero([(cloud.path, cloud.zero) for cloud in (first, second)], registered)
+    require_one_datum([(cloud.path, cloud.vertical_datum) for cloud in (first, second)], registered)
     return first, in_system(second, first.crs)
 
 

@@ -34,7 +34,7 @@ from tidefield.change.registration import (
 )
 from tidefield.change.repeats import repeated, rounding_m
 from tidefield.change.shift import Shift, find_shift
-from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_zeros, warped
+from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_datums, warped
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.errors import list_names
 from tidefield.geometry.geodesy import lost_in_conversion
@@ -215,7 +215,7 @@ def measure(
         regions: reads polygons whose volumes are given one by one.
 
     Raises:
-        ChangeError: the surveys do not overlap, have too little stable ground, or state other zeros of their heights
+        ChangeError: the surveys do not overlap, have too little stable ground, or state different vertical datums
             and are not registered.
     """
     options = options or Options()
@@ -227,14 +227,14 @@ def measure(
     for surface in (earlier, later):
         if surface.crs is not None and target is not None and (lost := lost_in_conversion(surface.crs, target)):
             remarks.append(f"{surface.file}: coordinates {lost}; errors do not include that")
-    if zeros := other_zeros(earlier, later):
+    if datums := other_datums(earlier, later):
         if options.register == "none":
             raise ChangeError(
-                f"{earlier.file} and {later.file} cannot be compared without registration: {zeros}; expected "
+                f"{earlier.file} and {later.file} cannot be compared without registration: {datums}; expected "
                 "one; convert one of them first (gdalwarp), leave --register none out, or, if they are the same one, "
                 "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
             )
-        remarks.append(f"{zeros}; only stable ground takes the difference")
+        remarks.append(f"{datums}; only stable ground takes the difference")
     shift = _shift(earlier, later, grid, options, remarks)
     moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
     dz, own = read_difference(earlier, later, grid, moved, tick=tick)

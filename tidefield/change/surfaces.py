@@ -26,7 +26,7 @@ from tidefield.geometry.geodesy import (
     metres_per_height,
     metric_system,
     same_system,
-    zero_of_heights,
+    vertical_datum_of,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ MOST_CELLS = 400_000_000
 PLAIN = 'LOCAL_CS["metres",UNIT["metre",1]]'
 """A system for files that need one, where surfaces have none."""
 _ELLIPSOID = "the ellipsoid"
-"""How the zeros of ellipsoidal heights are named."""
+"""How vertical datums of ellipsoidal heights are named."""
 _RESULTS = ("dz:", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
 """How this program describes what is no height, nor an error of heights, in its rasters."""
 _UNITS_M = {
@@ -140,7 +140,7 @@ class Surface:
         orthophoto, cloud: of the same survey, if there are any.
         source: name of the cloud that the surface was made of, or of the folder.
         date: YYYY-MM-DD of the photographs, if the file or its name tells.
-        datum: zero of the heights in words, where the file (of `tidefield map`) or the cloud states it.
+        datum: vertical one of the heights in words, where the file (of `tidefield map`) or the cloud states it.
         remarks: what a user should know of how it was read.
     """
 
@@ -175,9 +175,9 @@ class Surface:
         return self.source or self.path.name
 
     @property
-    def zero(self) -> str | None:
-        """Zero of the heights by the coordinate system; None where that defines none."""
-        return None if self.crs is None else zero_of_heights(self.crs)
+    def vertical_datum(self) -> str | None:
+        """Of the heights, by the coordinate system; None where that defines none."""
+        return None if self.crs is None else vertical_datum_of(self.crs)
 
     @contextmanager
     def on_grid(self, grid: Grid, shift_m: tuple[float, float] = (0.0, 0.0)) -> Iterator[Read]:
@@ -424,9 +424,9 @@ def is_local(crs: CRS) -> bool:
     return crs.type_name == "Engineering CRS"
 
 
-def other_zeros(earlier: Surface, later: Surface) -> str | None:
-    """Name the zeros of two surfaces' heights, by their systems or else in words, if they state different ones."""
-    by_system = earlier.zero, later.zero
+def other_datums(earlier: Surface, later: Surface) -> str | None:
+    """Name the vertical datums of two surfaces, by their systems or else in words, if they state different ones."""
+    by_system = earlier.vertical_datum, later.vertical_datum
     one, other = by_system if None not in by_system else (earlier.datum, later.datum)
     if one is None or other is None or one == other:
         return None
@@ -554,7 +554,7 @@ def _place(box: tuple[float, float, float, float]) -> str:
 
 
 def _require_same_heights(surfaces: list[Surface]) -> None:
-    """Raises: ChangeError when some have a coordinate system and some not, or heights over different zeros."""
+    """Raises: ChangeError when only some have a coordinate system, or heights are over different vertical datums."""
     named = [surface for surface in surfaces if surface.crs is not None]
     if named and len(named) < len(surfaces):
         bare = next(surface for surface in surfaces if surface.crs is None)
@@ -562,11 +562,11 @@ def _require_same_heights(surfaces: list[Surface]) -> None:
             f"{named[0].file} has a coordinate system, {bare.file} has none: expected it in all files or in "
             "none; assign it with gdal_edit.py -a_srs"
         )
-    require_one_zero([(Path(surface.file), surface.zero) for surface in named])
+    require_one_datum([(Path(surface.file), surface.vertical_datum) for surface in named])
 
 
-def require_one_zero(zeros: Sequence[tuple[Path, str | None]], registered: bool = True) -> None:
-    """Check that files state heights over one zero; None states none.
+def require_one_datum(datums: Sequence[tuple[Path, str | None]], registered: bool = True) -> None:
+    """Check that files state heights over one vertical datum; None states none.
 
     Args:
         registered: whether stable ground takes out what ellipsoids of modern datums differ by, up to two metres.
@@ -574,8 +574,10 @@ def require_one_zero(zeros: Sequence[tuple[Path, str | None]], registered: bool 
     Raises:
         ChangeError: they do not.
     """
-    stated = [(zero, path) for path, zero in zeros if zero is not None]
-    alike = {_ELLIPSOID if registered and zero.startswith(_ELLIPSOID) else zero: (zero, path) for zero, path in stated}
+    stated = [(datum, path) for path, datum in datums if datum is not None]
+    alike = {
+        _ELLIPSOID if registered and datum.startswith(_ELLIPSOID) else datum: (datum, path) for datum, path in stated
+    }
     heights = dict(alike.values())
     if len(heights) > 1:
         (one, first), (other, second), *_ = heights.items()

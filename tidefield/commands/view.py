@@ -109,7 +109,7 @@ def _view_maps(options: View, console: Console) -> None:
     given = next((name for name, usual in of_scenes.items() if getattr(options, name) != usual), None)
     if given is not None:
         raise RunError(f"--{given.replace('_', '-')} was given with maps: it belongs to runs and scenes; leave it out")
-    from tidefield.change.surfaces import other_zeros
+    from tidefield.change.surfaces import other_datums
     from tidefield.viewer.atlas import Atlas
     from tidefield.viewer.map_page import MapPage
 
@@ -119,8 +119,8 @@ def _view_maps(options: View, console: Console) -> None:
         for remark in heights.remarks:
             log.warning(f"{title}: {remark}")
     for (title, heights), (other_title, other) in combinations(surfaces, 2):
-        if zeros := other_zeros(heights, other):
-            log.warning(f"{title} and {other_title}: {zeros}; sections and differences between them include that")
+        if datums := other_datums(heights, other):
+            log.warning(f"{title} and {other_title}: {datums}; sections and differences between them include that")
     page = MapPage(atlas, options.host, options.port)
     try:
         serve(page.address, options.host, options.no_browser, console)

@@ -55,7 +55,7 @@ class LocalFrame:
     Attributes:
         longitude_deg, latitude_deg, height_m: the origin, on that datum and from its own prime meridian.
         crs: projected coordinate reference system of the products: "EPSG:27700", or WKT where it has no code.
-        vertical_datum: zero of the heights, as text.
+        vertical_datum: of the heights, as text.
     """
 
     longitude_deg: float
@@ -373,8 +373,8 @@ def name_in_metres(vertical: str) -> str:
     return _IN_FEET.sub("", vertical)
 
 
-def zero_of_heights(crs: CRS) -> str | None:
-    """Return the name of the zero of a system's heights, or None where it defines none."""
+def vertical_datum_of(crs: CRS) -> str | None:
+    """Return the name of the vertical datum of a system, or None where it defines none."""
     if crs.is_compound:
         vertical = crs.sub_crs_list[1]
         name = vertical.name if vertical.datum is None else vertical.datum.name

@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from tidefield.data.georeference import Georeference
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, SurveyError, list_names
-from tidefield.geometry.geodesy import parse_crs, zero_of_heights
+from tidefield.geometry.geodesy import parse_crs, vertical_datum_of
 from tidefield.maps.grid import Grid, MapFrame
 from tidefield.maps.rasters import sample
 from tidefield.survey.io.gcp_file import split_unknown
@@ -150,7 +150,7 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
                 own.append((scene.names.index(photograph), (pixel[0], pixel[1])))
         if not surveyed:
             raise SurveyError(f"{path} has no check points: {_EXPECTED} after its first line; add them")
-        _require_one_zero(path, crs, frame)
+        _require_one_datum(path, crs, frame)
         xyz = np.array(list(surveyed.values()), dtype=np.float64)
         world = frame.frame.from_system(crs, xyz)
     except (SurveyError, ValueError) as error:
@@ -164,20 +164,20 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
     ]
 
 
-def _require_one_zero(path: Path, crs: str, frame: MapFrame) -> None:
-    """Raises: SurveyError when a file states heights over another zero than the map's."""
-    zero, own = zero_of_heights(parse_crs(crs)), zero_of_heights(parse_crs(frame.wkt))
-    if zero is None:
+def _require_one_datum(path: Path, crs: str, frame: MapFrame) -> None:
+    """Raises: SurveyError when a file states heights over another vertical datum than the map's."""
+    datum, own = vertical_datum_of(parse_crs(crs)), vertical_datum_of(parse_crs(frame.wkt))
+    if datum is None:
         return
     if own is None and _ELLIPSOID in frame.heights:
-        own = zero if _ELLIPSOID in zero else frame.heights  # of whichever name
+        own = datum if _ELLIPSOID in datum else frame.heights  # of whichever name
     if own is None:
         log.warning(
-            f"heights in {path.name} are over {zero}, those of the map: {frame.heights}; the mean error has both"
+            f"heights in {path.name} are over {datum}, those of the map: {frame.heights}; the mean error has both"
         )
-    elif zero != own:
+    elif datum != own:
         raise SurveyError(
-            f"its heights are over {zero}, those of the map over {own}: expected one vertical datum; convert the "
+            f"its heights are over {datum}, those of the map over {own}: expected one vertical datum; convert the "
             "points first"
         )
 

@@ -28,8 +28,8 @@ from tidefield.render.camera_paths import layout_of
 
 LOCAL_NAME = "local frame of the scene (not georeferenced)"
 LOCAL_WKT = f'LOCAL_CS["{LOCAL_NAME}",UNIT["unknown",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
-OPEN_ZEROS = ("unknown", "mean sea level")
-"""How the words for zeros of heights begin that a vertical system may still define."""
+OPEN_DATUMS = ("unknown", "mean sea level")
+"""How the words for vertical datums begin that a vertical system may still define."""
 FINEST = 0.9
 """Finest cells, as a share of the photographs' ground sampling distance: finer ones would show no more."""
 MOST_CELLS = 4_000_000_000
@@ -150,7 +150,7 @@ def _vertical(datum: str, given: str | None, stated: CRS | None = None) -> CRS |
             raise RunError(f"--heights {given} was given: expected a vertical system, such as EPSG:5701") from error
         if not crs.is_vertical:
             raise RunError(f"--heights {given} is {crs.name}: expected a vertical system, such as EPSG:5701")
-        other = not datum.startswith(OPEN_ZEROS) if known is None else _datum_name(known) != _datum_name(crs)
+        other = not datum.startswith(OPEN_DATUMS) if known is None else _datum_name(known) != _datum_name(crs)
         if other:
             raise RunError(
                 f"--heights {given} is {crs.name}, but the scene's heights are over {datum}: expected the option only "

@@ -24,7 +24,7 @@ class Position:
         latitude_deg, longitude_deg: geographic coordinates.
         height_m: altitude above `datum`; NaN if unknown.
         horizontal_m, vertical_m: standard deviations that the receiver states (RTK); NaN if it states none.
-        datum: zero of the height. EXIF states mean sea level or nothing; makers differ.
+        datum: vertical one of the height. EXIF states mean sea level or nothing; makers differ.
         source: where the position was read, such as "EXIF" or "gps.csv".
     """
 

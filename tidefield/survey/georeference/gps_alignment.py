@@ -56,7 +56,7 @@ class GivenPositions:
         longitude_latitude_height: WGS 84, degrees and metres.
         stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none, or the
             height is not theirs.
-        vertical_datum: zero of the heights, as text.
+        vertical_datum: of the heights, as text.
         notes: which positions or heights are not used, as whole sentences.
     """
 
@@ -86,21 +86,21 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
     """Collect positions with heights: absolute ones, else above take-off, else all at one height.
 
     Heights are used if at least half of the positions have them; positions without are then left out. So are those
-    whose heights may count from another zero, which would tilt the model.
+    whose heights may be over another vertical datum, which would tilt the model.
     """
     located = [(photograph, photograph.position) for photograph in photographs if photograph.position is not None]
-    any_zero = [pair for pair in located if math.isfinite(pair[1].height_m)]
-    absolute = _of_one_zero(any_zero)
+    with_height = [pair for pair in located if math.isfinite(pair[1].height_m)]
+    absolute = _of_one_datum(with_height)
     relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
     enough, count, without, notes = max(3, len(located) / 2), len(located), 0, []
-    if len(any_zero) >= enough and len(absolute) >= 3:
-        located, heights, without = absolute, [position.height_m for _, position in absolute], count - len(any_zero)
+    if len(with_height) >= enough and len(absolute) >= 3:
+        located, heights, without = absolute, [position.height_m for _, position in absolute], count - len(with_height)
         datum = _DATUMS[absolute[0][1].datum]
-        zero = _zero(absolute[0][1])
-        if others := [_zero(position) for _, position in any_zero if _zero(position) != zero]:
+        own = _datum(absolute[0][1])
+        if others := [_datum(position) for _, position in with_height if _datum(position) != own]:
             notes.append(
                 f"{len(others)} of {count} positions are not used: their heights are over "
-                f"{' and '.join(sorted(set(others)))}, those of the others over {zero}. To have them used, give all "
+                f"{' and '.join(sorted(set(others)))}, those of the others over {own}. To have them used, give all "
                 "positions in one file, with heights over one vertical datum."
             )
     elif len(relative) >= enough:
@@ -131,15 +131,15 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
     )
 
 
-def _of_one_zero(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[Photograph, Position]]:
-    """Select positions whose heights have one zero: that of most, or of a differential receiver that saw the survey.
+def _of_one_datum(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[Photograph, Position]]:
+    """Select positions with one vertical datum: that of most, or of a differential receiver that saw the survey.
 
     A few differential positions at one place or on one line say less of the model's tilt than many others, unless these
     are on one line, too.
     """
-    by_zero = defaultdict(list)
+    by_datum = defaultdict(list)
     for pair in located:
-        by_zero[_zero(pair[1])].append(pair)
+        by_datum[_datum(pair[1])].append(pair)
     across_m, along_m = _breadths_m([position for _, position in located])
     least_m = _LEAST_BREADTH * np.array([across_m if across_m > _NARROW_M else 0.0, along_m])
 
@@ -147,7 +147,7 @@ def _of_one_zero(located: Sequence[tuple[Photograph, Position]]) -> list[tuple[P
         accurate = [p for _, p in own if p.horizontal_m < DIFFERENTIAL_M and p.vertical_m < DIFFERENTIAL_M]
         return len(accurate) >= FEWEST_DIFFERENTIAL and bool((_breadths_m(accurate) >= least_m).all()), len(own)
 
-    return max(by_zero.values(), key=worth, default=[])
+    return max(by_datum.values(), key=worth, default=[])
 
 
 def _breadths_m(positions: Sequence[Position]) -> Float64[np.ndarray, " 2"]:
@@ -159,8 +159,8 @@ def _breadths_m(positions: Sequence[Position]) -> Float64[np.ndarray, " 2"]:
     return np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(np.cov((degrees * metres_per_degree(degrees[0, 1])).T))))
 
 
-def _zero(position: Position) -> str:
-    """Name the zero of a height: the ellipsoid is one, but two sources' sea levels may differ by tens of metres."""
+def _datum(position: Position) -> str:
+    """Name a height's vertical datum: the ellipsoid is one, but two sources' sea levels may be tens of metres apart."""
     if position.datum == "ellipsoid":
         return "the ellipsoid"
     source = position.source.partition(", ")[0].replace("XMP", "EXIF")

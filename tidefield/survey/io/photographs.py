@@ -57,7 +57,7 @@ _CORRECTED_SHARE = 0.1
 _REPEATED_SHARE = 0.9
 """Of a flight's photographs: where EXIF repeats the drone's own positions in so many, it was not corrected."""
 _AFTER_FLIGHT = "EXIF after the flight"
-"""Source of the positions of a flight that was corrected where another was not: their heights may have two zeros."""
+"""Source of the positions of a flight that was corrected where another was not, perhaps over another vertical datum."""
 _PAUSE_S = 120.0
 """Photographs further apart in time are of two flights."""
 _SCENE_PARTS = ("sparse", "georeference.json", "prepare/stages.json")  # the last, in one that is still being prepared

@@ -43,7 +43,7 @@ GPS_FILES = ("geo.txt", "gps.csv")
 """Looked for in the folder of the photographs, in this order."""
 
 # Column titles of tables of receivers, Pix4D and Metashape, in lower case, without punctuation, and without units and
-# zeros of heights, in brackets or not.
+# vertical datums, in brackets or not.
 _COLUMNS = {
     "name": ("name", "imagename", "image", "filename", "file", "photo", "photograph", "label", "sourcefile"),
     "latitude": ("latitude", "lat", "y", "gpslatitude", "latitudedeg"),
@@ -65,7 +65,7 @@ _COLUMNS = {
 }
 _LENGTHS = ("height", "horizontal", "vertical")
 _ANGLES = ("yaw", "pitch", "roll")
-_ZEROS: dict[str, VerticalDatum] = {
+_DATUMS: dict[str, VerticalDatum] = {
     **dict.fromkeys(("ellipsoid", "ellipsoidal", "ellips", "ell", "hae"), "ellipsoid"),
     **dict.fromkeys(("sea", "msl", "amsl", "orthometric", "navd", "egm"), "mean sea level"),
 }
@@ -74,7 +74,7 @@ _METRES = ("m", "metre", "metres", "meter", "meters")
 _UNITS_M = {"mm": 0.001, "cm": 0.01, **dict.fromkeys(("ft", "foot", "feet"), FOOT_M), **dict.fromkeys(_METRES, 1.0)}
 # Words of a title beside that of the quantity. "Geoid" is none of them: the height of the geoid is another quantity.
 _OF_DEGREES = ("deg", "degree", "degrees", "decimal", "dd")
-_OF_LENGTHS = (*_ZEROS, *_UNITS_M, "us", "survey", "wgs", "above", "over", "mean", "level")
+_OF_LENGTHS = (*_DATUMS, *_UNITS_M, "us", "survey", "wgs", "above", "over", "mean", "level")
 _BESIDE = {
     "name": ("name",),
     **dict.fromkeys(("latitude", "longitude", *_ANGLES), _OF_DEGREES),
@@ -175,7 +175,7 @@ def locate_photographs(
 
 
 def _with_height(position: Position, own: Position | None) -> Position:
-    """Complete a position without a height by that of the photograph's own, with its zero and accuracy."""
+    """Complete a position without a height by that of the photograph's own, with its vertical datum and accuracy."""
     if own is None or math.isfinite(position.height_m) or not math.isfinite(own.height_m):
         return position
     height = {"height_m": own.height_m, "vertical_m": own.vertical_m, "datum": own.datum}
@@ -238,7 +238,7 @@ def _words(title: str) -> list[str]:
 
 
 def _means(words: Sequence[str], key: str) -> bool:
-    """Whether the words of a title name one of the `_COLUMNS`, with or without a unit and a zero of heights."""
+    """Whether the words of a title name one of the `_COLUMNS`, with or without a unit and a vertical datum."""
     own = "".join(word for word in words if word not in _BESIDE[key])
     return "".join(words) in _COLUMNS[key] or own in _COLUMNS[key]
 
@@ -263,7 +263,7 @@ def _read_table(
     titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
     hemispheres = _hemispheres(titles)
     above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
-    zeros: list[VerticalDatum] = [*(_ZEROS[word] for word in above if word in _ZEROS), _datum(system)]
+    datums: list[VerticalDatum] = [*(_DATUMS[word] for word in above if word in _DATUMS), _datum(system)]
     height_unit_m = 1.0 if {*above} & {*_UNITS_M} else metres_per_height(system)
     read: list[_Row] = []
     rows: list[list[str]] = []
@@ -298,7 +298,7 @@ def _read_table(
         values = [numbers.get(key, math.nan) for key in _GEO]
         values[2] *= height_unit_m
         read.append((name, where, values))
-    found = _records(path, read, system, zeros[0])
+    found = _records(path, read, system, datums[0])
     remarks += _conversion_remarks(path, system) if other else []
     unread = {*range(len(titles))} - {index for index, _ in columns.values()} - {*hemispheres.values()}
     numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
