@@ -234,15 +234,15 @@ def test_tiles_that_fail_are_asked_for_again_and_those_not_shown_any_more_are_no
         tab.route("**/tile/0/orthophoto/**", lambda route: route.abort(), times=1)
         tab.goto(page.address)
         assert tuple(colours(tab, "again")[350, 450]) == (200, 30, 30)
-        assert len(failed) == 1
+        # On a busy machine a coarse tile is not waited for either, once finer ones are there.
+        assert len([one for one in failed if "ERR_ABORTED" not in one]) == 1
         held: list[Any] = []
         tab.route("**/tile/0/height/**", lambda route: held.append(route))
         with tab.expect_request("**/tile/0/height/**"):
             tab.get_by_label("Layer", exact=True).select_option("0.height")
         with tab.expect_event("requestfailed"):
             tab.get_by_label("Layer", exact=True).select_option("0.orthophoto")
-        assert "/tile/0/height/" in failed[1]
-        assert "ERR_ABORTED" in failed[1]
+        assert [one for one in failed if "/tile/0/height/" in one and "ERR_ABORTED" in one]
         tab.unroute("**/tile/0/height/**")
         tab.get_by_label("Layer", exact=True).select_option("0.height")
         colours(tab, "height")
