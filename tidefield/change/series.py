@@ -6,7 +6,7 @@ difference of the two (`closure`) shows what co-registration and different commo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from itertools import pairwise
@@ -98,9 +98,23 @@ def areas_m2(entries: Sequence[Entry], region: str) -> tuple[float, float] | Non
     return None if min(areas) > _SAME_GROUND * max(areas) else (min(areas), max(areas))
 
 
-def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, command: str) -> dict[str, Any]:
-    """Write series.csv, series.json and series.html."""
+def write_series(
+    entries: Sequence[Entry],
+    remarks: Mapping[tuple[int, int], Sequence[str]],
+    names: Sequence[str],
+    folder: Path,
+    command: str,
+) -> dict[str, Any]:
+    """Write series.csv, series.json and series.html.
+
+    Args:
+        remarks: of each comparison, by the numbers of its surveys.
+    """
     rows = series_rows(entries, names)
+    remarked: dict[str, list[str]] = {}
+    for (start, end), texts in remarks.items():
+        for remark in texts:
+            remarked.setdefault(remark, []).append(f"{names[start]} to {names[end]}")
     write_csv(folder / "series.csv", rows)
     regions = list(dict.fromkeys(entry.region for entry in entries))
     uneven = {region: areas for region in regions if (areas := areas_m2(entries, region))}
@@ -110,6 +124,7 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
         "volumes": rows,
         "closure": {region: closure(entries, region) for region in regions},
         "different_ground_m2": uneven,
+        "remarks": remarked,
     }
     write_json(folder / "series.json", numbers)
     environment = template_environment("tidefield.change")
@@ -117,6 +132,8 @@ def write_series(entries: Sequence[Entry], names: Sequence[str], folder: Path, c
     shown = regions[:_MOST_PLOTS]
     html = environment.get_template("series.html").render(
         names=names,
+        remarks=remarked,
+        comparisons=len(remarks),
         regions=[(name, draw_series(entries, names, name), _table(entries, name), uneven.get(name)) for name in shown],
         more=len(regions) - len(shown),
         steps=[(k, names[k - 1], names[k]) for k in range(1, len(names))],

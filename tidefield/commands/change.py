@@ -137,7 +137,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
     paths = (options.earlier, options.later, *options.series)
     dates = _dates(options, len(paths))
     names: list[str] = [""] * len(paths)
-    entries, stated = [], list(dates)
+    entries, remarks, stated = [], {}, list(dates)
     # What is missing or out of order is found before the first survey is compared.
     for k, path in enumerate(paths):
         if not is_cloud(path):
@@ -154,6 +154,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
                 for k, surface in ((start, found.change.earlier), (end, found.change.later)):
                     names[k], stated[k] = surface.name, surface.date
                 _require_order(paths[: end + 1], stated[: end + 1])
+                remarks[start, end] = found.change.remarks
                 if start == 0:
                     entries += entries_of(found.change, "first", start, end)
                 if start == end - 1:
@@ -162,7 +163,7 @@ def _series(options: Change, console: Console, work: Path) -> None:
                     _write(found, options, folder / f"step_{end}", console)
                     console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
                     _say(found, console)
-        numbers = write_series(entries, _distinct(names), folder, command_line())
+        numbers = write_series(entries, remarks, _distinct(names), folder, command_line())
         if uneven := numbers["different_ground_m2"]:
             log.warning(
                 f"{list_names(list(uneven))}: not all surveys have heights everywhere, so that volumes are of "
