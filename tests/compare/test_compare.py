@@ -531,7 +531,7 @@ def test_opensplat_is_compared_with_the_program_that_is_named(
     page = (out / "tables.md").read_text()
     assert "| scene | opensplat | nearest |" in page
     assert "| flats, opensplat | 0.0 | 2 |" in page
-    assert "Within the budget OpenSplat made 2 to 2 steps" in page
+    assert "Within the budget OpenSplat made 2 steps" in page
     run = json.loads((out / "runs" / "flats" / "opensplat" / "run.json").read_text())
     assert run["config"] == {"version": "1.1.4 (git commit 1234567)", "method": "opensplat"}
     assert str(tmp_path) not in (out / "comparison.json").read_text()
