@@ -332,6 +332,7 @@ def test_a_tilt_needs_stable_ground_on_all_sides(tmp_path: Path):
         measured(earlier, later, stable=lambda grid: [corner], options=Options(register="tilt"))
 
 
+@pytest.mark.thorough
 def test_a_tilt_is_found(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 9, 0.0)
     import rasterio
@@ -444,6 +445,7 @@ def test_the_error_of_a_shift_on_a_slope_is_what_the_vertical_registration_leave
     assert found.net.systematic_m3 == pytest.approx(math.hypot(own * found.net.area_m2, whole), rel=0.03)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("shift", "found_by_pictures"), [("none", False), ("auto", False), ("auto", True)])
 def test_a_stated_error_of_the_shift_counts_on_slopes_unless_a_shift_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift: Literal["none", "auto"], found_by_pictures: bool
@@ -500,6 +502,7 @@ def test_a_comparison_within_copied_heights_is_made_with_a_remark(tmp_path: Path
     assert any("as if one had them from the other: errors are too small" in remark for remark in found.remarks)
 
 
+@pytest.mark.thorough
 def test_the_order_of_windows_does_not_matter(tmp_path: Path):
     earlier, later, _ = pair(tmp_path, 0, 0.06)
     one, other = (measured(earlier, later, options=Options(windows=w)) for w in ((5, 11, 21), (21, 5, 11)))

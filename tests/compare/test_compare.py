@@ -233,6 +233,7 @@ def test_results_of_other_settings_are_not_mixed_in(disk: Path, tmp_path: Path):
         compare({"flats": disk}, ("tidefield",), longer, tmp_path / "out", run, quiet)
 
 
+@pytest.mark.thorough
 def test_results_on_a_scene_that_was_made_anew_are_not_mixed_in(disk: Path, tmp_path: Path):
     out, methods = tmp_path / "out", ("tidefield", "nearest", "nerf")
     compare({"flats": disk}, methods, SETTINGS, out, Children(load_scene(disk, width=48)), quiet)

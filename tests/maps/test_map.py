@@ -211,6 +211,7 @@ def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path,
     assert (out / MAP_FILE).read_bytes() == before
 
 
+@pytest.mark.thorough
 def test_a_map_that_replaces_another_has_none_of_its_files(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -359,6 +360,7 @@ def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
         assert abs(np.diff(values, axis=-2)).max() < largest
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("limit", [pytest.param(6_000, marks=pytest.mark.slow), 30_000])
 def test_a_full_disk_is_one_message_and_loses_nothing(scene: Path, out: Path, tmp_path: Path, limit: int):
     """The system refuses every byte of a file beyond a limit, as a full disk does."""

@@ -526,6 +526,7 @@ def off_truth(flight: Flight, survey: Survey) -> tuple[np.ndarray, Georeference]
     return np.array([centres[name_of(i)] for i in range(len(truth))]) - truth, found
 
 
+@pytest.mark.thorough
 def test_control_in_one_corner_does_not_turn_what_differential_positions_have_placed():
     flight = fly(lines=4, each=20, position_m=0.015)
     corner = np.array([[-140.0, -30], [-121, -28], [-139, -11], [-122, -9]])

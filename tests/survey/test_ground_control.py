@@ -97,6 +97,7 @@ def test_control_points_are_not_added_to_the_model(flight):
     assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
 
 
+@pytest.mark.thorough
 def test_errors_of_control_are_what_the_model_has_minus_what_was_surveyed(flight):
     survey = with_control(flight)
     assert survey.control is not None
@@ -321,6 +322,7 @@ def test_marks_in_photographs_without_a_pose_are_left_out(flight):
         located(flight, with_marks(survey, lambda m: replace(m, photograph="lost.jpg")))
 
 
+@pytest.mark.thorough
 def test_check_points_take_no_part_however_wrong_they_are(flight):
     survey = with_control(flight)
     model, found = located(flight, survey)
