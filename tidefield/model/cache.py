@@ -85,6 +85,7 @@ class FeatureCache:
         cones: read photographs at the size that a view shows them in, not at the scene's own (`data.pyramid`).
         budget_bytes: memory for features, `memory_for_features` if not given; a few blocks are kept even if they need
             more.
+        pyramid: of the photographs, made if not given.
     """
 
     def __init__(
@@ -94,10 +95,11 @@ class FeatureCache:
         device: torch.device,
         cones: bool = True,
         budget_bytes: int | None = None,
+        pyramid: Pyramid | None = None,
     ) -> None:
         self.network, self.scene, self.device = network, scene, device
         self.budget_bytes = memory_for_features(device) if budget_bytes is None else budget_bytes
-        self.pyramid = Pyramid(scene)
+        self.pyramid = Pyramid(scene) if pyramid is None else pyramid
         self._cones = cones
         self._cameras = self.pyramid.cameras.to(device)
         patch = torch.zeros(1, 3, 32, 32, device=device)

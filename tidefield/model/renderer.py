@@ -89,11 +89,11 @@ class Renderer:
     ) -> None:
         scene = as_given(scene, config)
         self.network, self.scene, self.config, self.device = network, scene, config, device
+        self.sampling = sampling
         self.cache = FeatureCache(network, scene, device, sampling.cones)
         self.matcher = None
         if config.network.has("matched surface"):
             self.matcher = Matcher(scene, self.cache.pyramid, finer=True, device=device)
-        self.rays_per_side = sampling.rays_per_side
         gathered = network.values_per_tile(TILE_PX, network.config.views + EXTRA_VIEWS)
         limit = VALUES_AT_ONCE * (1 if device.type == "cpu" else GPU_FACTOR)
         # A power of two divides blocks into few kinds of pieces, which a GPU records one by one.
@@ -105,6 +105,13 @@ class Renderer:
         lines = slice(None, None, BEHIND_STEP)
         self.mean_colours = {i: to_common_exposure(scene, i, lines, lines).mean((0, 1)) for i in few}
         self._recorded: tuple[Encoded, Recorder[_Piece, Tensor]] | None = None
+
+    def renew(self, network: Network) -> None:
+        """Go on with other weights; what was read and compared of photographs depends on none."""
+        pyramid = self.cache.pyramid
+        del self.cache  # its memory first
+        self.network, self._recorded = network, None
+        self.cache = FeatureCache(network, self.scene, self.device, self.sampling.cones, pyramid=pyramid)
 
     def __call__(self, camera: Cameras, prior: Float[Tensor, "3 h w"] | None = None) -> Rendering:
         """Render the view of one camera, at its own gain, from its sources (`Scene.sources`).
@@ -138,7 +145,7 @@ class Renderer:
         return render_with_rays(partial(self._render, cells=surface, match=True), camera, self._rays_per_side(camera))
 
     def _rays_per_side(self, camera: Cameras) -> int:
-        return self.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
+        return self.sampling.rays_per_side or (2 if self.cache.pyramid.is_much_coarser(camera) else 1)
 
     def _points_surface(self, camera: Cameras) -> Float[Tensor, "3 h w"]:
         """The surface of a camera, of all its rays, before photographs are matched."""

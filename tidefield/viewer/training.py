@@ -7,7 +7,6 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from tidefield.geometry.cameras import Cameras
-from tidefield.model.cache import FeatureCache
 from tidefield.model.renderer import Renderer
 from tidefield.model.rendering import Render, Rendering
 from tidefield.recording import recording_lock
@@ -15,7 +14,6 @@ from tidefield.viewer.frames import SAMPLING
 from tidefield.viewer.page import ScenePage
 
 if TYPE_CHECKING:
-    from tidefield.model.network import Network
     from tidefield.train.loop import Trainer
 
 REFRESH_SECONDS = 20.0
@@ -71,7 +69,7 @@ def _as_it_is(trainer: Trainer, kept: list[Renderer] | None = None) -> Render:
     def render(camera: Cameras) -> Rendering:
         with recording_lock:  # the training goes on in another thread
             if not made and earlier and isinstance(still, SceneTrainer):
-                _renew(earlier[0], still.network)
+                earlier[0].renew(still.network)
                 made.append(earlier[0])
             elif not made:
                 made.append(still.renderer(SAMPLING))
@@ -79,13 +77,3 @@ def _as_it_is(trainer: Trainer, kept: list[Renderer] | None = None) -> Render:
             return made[0](camera)
 
     return render
-
-
-def _renew(renderer: Renderer, network: Network) -> None:
-    """Have a renderer use another network; what it has read and compared of photographs depends on none."""
-    pyramid = renderer.cache.pyramid
-    del renderer.cache  # its memory first
-    renderer._recorded = None
-    renderer.network = network
-    renderer.cache = FeatureCache(network, renderer.scene, renderer.device, SAMPLING.cones)
-    renderer.cache.pyramid = pyramid
