@@ -14,7 +14,7 @@ How much photographs differ is chosen by what it explains in photographs that ar
 unless it explains some of each.
 
 Alphabet: V photographs, O observations of sparse points, K coefficients of a polynomial, D of the
-direction, N unknowns, F folds.
+direction, T unknowns that one observation depends on, of N unknowns, F folds.
 """
 
 from __future__ import annotations
@@ -175,8 +175,10 @@ class _Model:
     Attributes:
         seen: the observations.
         value: their log colours at the common exposure.
-        design: derivative of the values with respect to the unknowns: OWN_TERMS of each photograph, then those of the
+        terms: derivatives of the values with respect to the unknowns that they depend on, T for each.
+        columns: these unknowns for each photograph; of all, OWN_TERMS of each photograph come first, then those of the
             lenses, then SQUARES of the direction.
+        design: the derivatives with respect to all unknowns.
         prior: inverse covariance of the unknowns of the photographs, at a spread of 1.
         to_monomials: from coefficients of the orthonormal terms to those of monomials.
         lens: of each photograph.
@@ -185,6 +187,8 @@ class _Model:
 
     seen: Seen
     value: Float64[np.ndarray, "O 3"]
+    terms: Float64[np.ndarray, "O T"]
+    columns: Int64[np.ndarray, "V T"]
     design: sparse.csr_array
     prior: sparse.csr_array
     to_monomials: Float64[np.ndarray, "K K"]
@@ -198,17 +202,22 @@ class _Model:
         count, photograph = len(cameras), seen.photograph
         which = torch.from_numpy(photograph)
         xy = (points.uv_px[torch.from_numpy(seen.row)] - cameras.principal_px[which]) / cameras.focal_px[which]
-        terms = monomials(xy.double(), SHADING_DEGREE).numpy()
-        to_monomials = np.linalg.inv(np.linalg.qr(terms, mode="r")) * np.sqrt(len(terms))
-        terms = terms @ to_monomials
+        frame = monomials(xy.double(), SHADING_DEGREE).numpy()
+        to_monomials = np.linalg.inv(np.linalg.qr(frame, mode="r")) * np.sqrt(len(frame))
+        frame = frame @ to_monomials
         names = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
         lens = np.array([names[own] for own in lenses])
-        own, shared = terms[:, :OWN_TERMS], terms[:, 1:]
         squares = _squares(seen.direction)
         deviation = np.maximum(squares.std(0), 1e-9)
-        of_direction = sparse.csr_array((squares - squares.mean(0)) / deviation)
-        of_frames = _blocks(own, photograph, count), _blocks(shared, lens[photograph], len(names))
-        design = sparse.hstack([*of_frames, of_direction])
+        own, shared, of_direction = frame[:, :OWN_TERMS], frame[:, 1:], (squares - squares.mean(0)) / deviation
+        terms, columns, first = np.concatenate([own, shared, of_direction], axis=1), [], 0
+        for part, group in ((own, np.arange(count)), (shared, lens), (of_direction, np.zeros(count, dtype=np.int64))):
+            each = part.shape[1]
+            columns.append(first + group[:, None] * each + np.arange(each))
+            first += each * (int(group.max()) + 1)
+        each_column = np.concatenate(columns, axis=1)
+        rows = np.arange(len(terms) + 1) * terms.shape[1]
+        design = sparse.csr_array((terms.ravel(), each_column[photograph].ravel(), rows), shape=(len(terms), first))
         chain = _chain(cameras, in_sequence(exposure_and_clock(metadata, count)[1], np.arange(count)))
         degree = np.repeat(np.arange(OWN_DEGREE + 1), np.arange(OWN_DEGREE + 1) + 1)
         precision = np.maximum(degree, 1.0) ** 2
@@ -218,7 +227,9 @@ class _Model:
         return _Model(
             seen=seen,
             value=seen.value - known.numpy(),
-            design=sparse.csr_array(design),
+            terms=terms,
+            columns=each_column,
+            design=design,
             prior=sparse.csr_array(sparse.kron(chain, sparse.diags_array(precision))),
             to_monomials=to_monomials,
             lens=lens,
@@ -231,14 +242,24 @@ class _Model:
         to_points = sparse.csr_array((weight, (self.seen.point, np.arange(len(weight)))))
         sums, to_mean = sparse.csr_array(to_points @ self.design), 1 / np.maximum(of_point, 1e-12)
         back = sparse.csr_array((sparse.diags_array(to_mean) @ sums).T)
-        products = self.design.T @ (sparse.diags_array(weight) @ self.design)
         right = self.design.T @ (weight[:, None] * self.value) - back @ (to_points @ self.value)
         eliminated = None
         if len(right) <= MOST_DENSE:
             # A matrix times its own transpose takes half the time of two matrices' product.
             root = np.sqrt(to_mean)[:, None] * sums.toarray()
             eliminated = root.T @ root
-        return _Equations(sparse.csr_array(products), sums, back, right, eliminated)
+        return _Equations(self._products(weight), sums, back, right, eliminated)
+
+    def _products(self, weight: Float64[np.ndarray, " O"]) -> sparse.csr_array:
+        """Weighted sums of the products of two terms, from dense products of each photograph's: a tenth of the time of
+        sparse ones."""
+        photograph, (count, each) = self.seen.photograph, self.columns.shape
+        order = np.argsort(photograph, kind="stable")
+        ends = np.cumsum(np.bincount(photograph, minlength=count))
+        of_each = [(terms := self.terms[own]).T @ (weight[own, None] * terms) for own in np.split(order, ends[:-1])]
+        where = np.repeat(self.columns, each, axis=1).ravel(), np.tile(self.columns, each).ravel()
+        unknowns = self.design.shape[1]
+        return sparse.csr_array((np.stack(of_each).ravel(), where), shape=(unknowns, unknowns))
 
     def solve(
         self,
@@ -324,14 +345,6 @@ class _Equations:
             right=self.right[rest],
             eliminated=None if self.eliminated is None else self.eliminated[rest, rest],
         )
-
-
-def _blocks(terms: Float64[np.ndarray, "O K"], group: Int64[np.ndarray, " O"], count: int) -> sparse.csr_array:
-    """A matrix with each observation's terms in the columns of its group."""
-    observations, each = terms.shape
-    columns = group[:, None] * each + np.arange(each)
-    rows = np.arange(observations + 1) * each
-    return sparse.csr_array((terms.ravel(), columns.ravel(), rows), shape=(observations, count * each))
 
 
 def _chain(cameras: Cameras, sequence: Pairs) -> sparse.sparray:
