@@ -14,7 +14,7 @@ from jaxtyping import Float
 from matched_sizes import matched_sizes
 from torch import Tensor
 
-from tidefield.data import matching
+from tidefield.data import matching, surface
 from tidefield.data.depth_prior import DepthPrior, DepthPriors, surface_prior
 from tidefield.data.images import Read
 from tidefield.data.matching import Matcher
@@ -272,6 +272,37 @@ def test_parts_of_a_large_picture_fit_together(monkeypatch: pytest.MonkeyPatch):
     parts = matched(at, cells)
     assert not torch.equal(parts, whole)
     assert ((parts - whole).abs() * STEP * at.cameras.focal_px[0, 0])[6:-6, 12:-12].max() < 0.3
+
+
+def test_a_part_reads_the_weights_of_the_photographs_that_see_it_alone():
+    generator = torch.Generator().manual_seed(3)
+    weight, camera = torch.zeros(40, 12, 16), wall.cameras(1).resized(1600, 1200)
+    for index, row in enumerate(weight):
+        row[index % 12, int(torch.randint(16, (), generator=generator))] = 0.5
+    for outer, _ in matching._parts(camera, 200):
+        read = matching._read_at(weight, camera, outer).flatten(1).any(1)
+        used = matching._used_in(weight, camera, outer)
+        assert (used | ~read).all()
+        assert used.sum() < 0.6 * len(used)
+
+
+def test_photographs_are_looked_for_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    at = scene()
+    camera = at.cameras[TARGET].resized(32, 24)
+    depth = matching._on_pixels(camera, surface_prior(camera, at.points, at.cameras)[0])
+    together = Matcher(at)._views(camera, depth)
+    sizes: list[int] = []
+    project = Cameras.project
+
+    def recorded(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:
+        sizes.append(len(cameras))
+        return project(cameras, points)
+
+    monkeypatch.setattr(Cameras, "project", recorded)
+    monkeypatch.setattr(surface, "PROJECTED_AT_ONCE", 2 * depth.numel())
+    apart = Matcher(at)._views(camera, depth)
+    assert max(sizes) == 2
+    assert all(torch.equal(*pair) for pair in zip(apart, together, strict=True))
 
 
 def test_a_large_picture_is_matched_at_half_its_size_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch):

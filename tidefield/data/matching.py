@@ -18,7 +18,7 @@ from functools import partial
 from itertools import pairwise, product
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -27,7 +27,7 @@ from tidefield.data.images import Read
 from tidefield.data.neighbours import BORDER, from_border
 from tidefield.data.pyramid import Pyramid
 from tidefield.data.scene import Scene
-from tidefield.data.surface import in_frame, which_see
+from tidefield.data.surface import groups, in_frame, which_see
 from tidefield.geometry.cameras import Cameras, angle_between, pixel_grid
 from tidefield.parallel import SharedValues, in_parallel, read_ahead
 
@@ -220,8 +220,9 @@ class Matcher:
                 principal_px=camera.principal_px - camera.principal_px.new_tensor([left, top]),
                 size_px=camera.size_px.new_tensor([[right - left, bottom - top]]),
             )
-            its = _read_at(weight, camera, outer)
-            found, fit = self._level(part, start[top:bottom, left:right], its, views, steps, reach)
+            used = _used_in(weight, camera, outer)  # of many photographs few see a part
+            its = _read_at(weight[used], camera, outer)
+            found, fit = self._level(part, start[top:bottom, left:right], its, views[used.cpu()], steps, reach)
             (x0, y0), (x1, y1) = inner
             results = found, fit.cost, *(_surface(found, fit) if smooth else ())
             for image, values in zip(images, results, strict=True):
@@ -248,22 +249,31 @@ class Matcher:
             indices = indices[which_see(self._cameras[indices.to(self.device)], points).cpu()]
         if not len(indices):
             return inverse_depth.new_zeros(0, *shape), indices
+        parts = [self._seen_from(indices[some], rays, points) for some in groups(len(indices), len(points))]
+        angle, border = (torch.cat(part) for part in zip(*parts, strict=True))
+        nearest, which = angle.topk(min(VIEWS + 1, len(angle)), dim=0, largest=False)
+        # The weight falls to 0 at the first photograph left out, so that the cost is continuous.
+        limit = nearest[VIEWS] if len(angle) > VIEWS else torch.full_like(nearest[0], torch.inf)
+        nearest, which = nearest[:VIEWS], which[:VIEWS]
+        share = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
+        share = share * ((nearest - LEAST_ANGLE_RAD) / (WHOLE_ANGLE_RAD - LEAST_ANGLE_RAD)).clamp(max=1)
+        weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
+        weight = weight * border
+        used = (weight > 0).any(1)
+        return weight[used].unflatten(1, shape), indices[used.cpu()]
+
+    def _seen_from(
+        self, indices: Int[Tensor, " V"], rays: Float[Tensor, "P 3"], points: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "V P"], Float[Tensor, "V P"]]:
+        """Angles between rays and photographs' directions to points on them, infinite where a photograph does not see
+        the point or is in the ray's own place; and `from_border` of the points' pixels."""
         sources = self._cameras[indices.to(self.device)]
         uv, z = sources.project(points)
         seen = in_frame(sources, uv, z, self.scene.photographs.masks_of(indices.tolist()))
         theirs = F.normalize(points - sources.position_world[:, None], dim=-1)
         angle = angle_between(F.normalize(rays, dim=-1), theirs)
         angle = angle.masked_fill(~seen | (angle < LEAST_ANGLE_RAD), torch.inf)
-        nearest, which = angle.topk(min(VIEWS + 1, len(sources)), dim=0, largest=False)
-        # The weight falls to 0 at the first photograph left out, so that the cost is continuous.
-        limit = nearest[VIEWS] if len(sources) > VIEWS else torch.full_like(nearest[0], torch.inf)
-        nearest, which = nearest[:VIEWS], which[:VIEWS]
-        share = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
-        share = share * ((nearest - LEAST_ANGLE_RAD) / (WHOLE_ANGLE_RAD - LEAST_ANGLE_RAD)).clamp(max=1)
-        weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
-        weight = weight * from_border(uv, sources.size_px[:, None], BORDER)
-        used = (weight > 0).any(1)
-        return weight[used].unflatten(1, shape), indices[used.cpu()]
+        return angle, from_border(uv, sources.size_px[:, None], BORDER)
 
     def _level(
         self,
@@ -545,6 +555,17 @@ def _read_at(images: Float[Tensor, "V a b"], camera: Cameras, box: _Box) -> Floa
     x, y = ((torch.arange(*of, device=images.device) + 0.5) for of in ((left, right), (top, bottom)))
     grid = torch.stack(torch.meshgrid(2 * x / camera.width - 1, 2 * y / camera.height - 1, indexing="xy"), dim=-1)
     return F.grid_sample(images[None], grid[None], padding_mode="border", align_corners=False)[0]
+
+
+def _used_in(images: Float[Tensor, "V a b"], camera: Cameras, box: _Box) -> Bool[Tensor, " V"]:
+    """Which images have anything but 0 among what `_read_at` interpolates."""
+    height, width = images.shape[1:]
+    (left, top), (right, bottom) = box
+    columns, rows = (
+        slice(max(0, math.floor(first * size / side) - 1), math.ceil(last * size / side) + 1)
+        for first, last, size, side in ((left, right, width, camera.width), (top, bottom, height, camera.height))
+    )
+    return (images[:, rows, columns] != 0).flatten(1).any(1)
 
 
 def _parts(camera: Cameras, most_px: int) -> list[tuple[_Box, _Box]]:

@@ -62,7 +62,7 @@ def trusted_points(camera: Cameras, points: SparsePoints, cameras: Cameras) -> t
     """
     uv, inverse = _visible(camera, points, cameras)
     if len(uv):
-        keep = _agree_with_neighbours(uv, inverse - _on_plane(_robust_plane(uv, inverse), uv))
+        keep = agree_with_neighbours(uv, inverse - _on_plane(_robust_plane(uv, inverse), uv))
         uv, inverse = uv[keep], inverse[keep]
     return uv, inverse
 
@@ -77,7 +77,7 @@ def seen_count(camera: Cameras, depth: Float[Tensor, "H W"], cameras: Cameras, m
     """Count the `cameras` that have each pixel's surface point in front of them, inside their image, and not masked."""
     points_world = surface_points(camera, depth)
     count = torch.zeros(len(points_world), dtype=torch.long, device=depth.device)
-    for some in _groups(len(cameras), len(points_world)):
+    for some in groups(len(cameras), len(points_world)):
         part = cameras[some]
         count += in_frame(part, *part.project(points_world), masks[some.start : some.stop]).sum(0)
     return count.reshape(depth.shape)
@@ -103,11 +103,11 @@ def in_frame(
 
 def which_see(cameras: Cameras, points_world: Float[Tensor, "P 3"]) -> Bool[Tensor, " V"]:
     """Decide which cameras have any of some points in their frames; memory does not grow with their number."""
-    parts = [cameras[some] for some in _groups(len(cameras), len(points_world))]
+    parts = [cameras[some] for some in groups(len(cameras), len(points_world))]
     return torch.cat([in_frame(part, *part.project(points_world)).any(1) for part in parts])
 
 
-def _groups(cameras: int, points: int) -> Iterator[slice]:
+def groups(cameras: int, points: int) -> Iterator[slice]:
     """Split cameras into groups that points are projected with at once."""
     size = max(1, PROJECTED_AT_ONCE // points)
     return (slice(start, start + size) for start in range(0, cameras, size))
@@ -184,8 +184,13 @@ def _on_plane(plane: Float64[np.ndarray, "3"], uv: _Pixels) -> _Values:
     return uv @ plane[:2] + plane[2]
 
 
-def _agree_with_neighbours(uv: _Pixels, residual: _Values) -> Bool[np.ndarray, " P"]:
-    """Which points lie within `OUTLIER_SPREADS` of their image neighbours' median: neither occluded nor mismatched."""
+def agree_with_neighbours(uv: _Pixels, residual: _Values) -> Bool[np.ndarray, " P"]:
+    """Decide which points lie within `OUTLIER_SPREADS` of their neighbours' median: neither occluded nor mismatched.
+
+    Args:
+        uv: places in an image or on a map.
+        residual: what is compared with that of the `NEIGHBOURS` nearest points.
+    """
     from scipy.spatial import KDTree
 
     if len(uv) <= NEIGHBOURS:
@@ -194,7 +199,7 @@ def _agree_with_neighbours(uv: _Pixels, residual: _Values) -> Bool[np.ndarray, "
     around = residual[nearest[:, 1:]]
     median = np.median(around, axis=1)
     spread = np.median(np.abs(around - median[:, None]), axis=1)
-    # Where neighbours agree by chance, the image's median spread applies.
+    # Where neighbours agree by chance, the median spread of all points applies.
     return np.abs(residual - median) <= OUTLIER_SPREADS * np.maximum(spread, np.median(spread))
 
 
