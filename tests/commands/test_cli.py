@@ -20,7 +20,7 @@ from surveys_of_two_dates import write_surface
 
 from tidefield import cli, synthetic
 from tidefield import progress as meter
-from tidefield.commands import demo
+from tidefield.commands import common, demo
 from tidefield.data.load import load_scene
 from tidefield.files import only_writer
 from tidefield.synthetic import make_survey, write_survey
@@ -282,6 +282,7 @@ def test_the_demonstration_makes_all_that_it_names(
     assert after == before
     # Anew: what the demonstration made is replaced, unless something else would be lost with it.
     (out / "run" / "notes.txt").write_text("mine")
+    call(*words)  # what is completed again does not become the demonstration's
     assert "no demonstration made (run/notes.txt)" in fails(capsys, *words, "--overwrite")
     assert contents(out).items() >= before.items()
     (out / "run" / "notes.txt").unlink()
@@ -289,6 +290,20 @@ def test_the_demonstration_makes_all_that_it_names(
     call("demo", out / "link", *words[2:], "--overwrite")
     assert (out / "thesis.docx").read_text() == "years of work"
     assert json.loads((out / "run" / "evaluation.json").read_text())["mean"]
+
+
+def test_mistakes_are_refused_before_anything_is_made_or_read(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(common, "load", lambda *_: pytest.fail("photographs were read"))
+    out = tmp_path / "demo"
+    assert "--minutes 0.0" in fails(capsys, "demo", out, "--minutes", 0)
+    assert not out.exists()
+    video = "render", scene, tmp_path / "a.mp4", "--zero-shot"
+    assert "no camera path is called 'oribt'" in fails(capsys, *video, "--path", "oribt")
+    assert "path.json" in fails(capsys, *video, "--path", tmp_path / "path.json")
+    assert "0 frames" in fails(capsys, *video, "--frames", 0)
+    assert "--width 8" in fails(capsys, *video, "--width", 8)
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

@@ -335,6 +335,7 @@ def test_photographs_that_an_evaluation_reads_at_another_width_show_progress(
     options = {"zero": ZeroShot(zero_shot=True), "width": 28, "opened_width": 48, "device": "cpu"}
     evaluate(Evaluate(scene, tmp_path / "other", **options), QUIET)
     assert shown.count("Reading photographs") == 9
+    assert read_evaluation(tmp_path / "other")["configuration"]["opened_width"] == 48
 
 
 def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Path) -> None:
@@ -464,19 +465,22 @@ def test_a_pretraining_is_not_continued_with_another_scene_of_the_same_name(
     for folder in (own, other):
         shutil.copytree(scene, folder)
 
-    def go_on(real: Path, steps: int, resume: bool = True) -> None:
+    def go_on(*real: Path, steps: int, resume: bool = True, out: str = "out") -> None:
         options = {"budget": Budget(steps=steps), "device": "cpu", "resume": resume}
-        pretrain_command(Pretrain(tmp_path / "out", real=(real,), **options), QUIET)
+        pretrain_command(Pretrain(tmp_path / out, real=real, **options), QUIET)
 
-    go_on(own, 1, resume=False)
+    go_on(own, steps=1, resume=False)
     file = tmp_path / "out" / PRETRAINING_FILE
     started = json.loads(file.read_text())
     assert started["real"] == [str(own.resolve())]
     with pytest.raises(RunError, match=r"was started with real \['.*/a/flats'\], not \['.*/b/flats'\]: expected"):
-        go_on(other, 2)
+        go_on(other, steps=2)
     file.write_text(json.dumps({**started, "real": ["flats"]}))  # as of an earlier version
-    go_on(own, 2)
+    go_on(own, steps=2)
     assert json.loads(file.read_text())["real"] == started["real"]
+    go_on(other, own, steps=1, resume=False, out="both")
+    with pytest.raises(RunError, match="was started with real"):  # scenes are drawn by their place
+        go_on(own, other, steps=2, out="both")
 
 
 def test_a_pretraining_is_continued_to_the_end_of_its_own_budget_unless_another_is_given(

@@ -329,6 +329,9 @@ def test_validation_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     points = json.loads((tmp_path / "validation.json").read_text())
     assert [point["step"] for point in points] == [2, 4, 5]
     assert all(5 < point["psnr"]["wall"] < 60 for point in points)
+    after_a_kill = Validation({"wall": scene}, tmp_path)
+    after_a_kill.resume(3)
+    assert [point["step"] for point in after_a_kill.points] == [2]
 
 
 @pytest.mark.parametrize("text", ["7", "[7]", '[{"step": "x"}]', '{"step": 1}'])

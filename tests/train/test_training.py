@@ -367,6 +367,9 @@ def test_an_interruption_saves_before_it_stops(number: signal.Signals, scene: Sc
     other = SceneTrainer(SMALL, scene, seed=1, device=CPU)
     other.resume(tmp_path)
     assert other.progress.step == trainer.progress.step
+    trainer.step = interrupted_step  # type: ignore[method-assign]
+    trainer.progress.step = 2
+    assert train(trainer, tmp_path, Budget(steps=3), Console(quiet=True)) == number, "its command ends, too"
 
 
 @pytest.mark.parametrize("config", [PAPER, SWIFT])

@@ -108,8 +108,8 @@ class Footprint:
     """How pixels are sampled."""
 
     rays_per_pixel: Literal[1, 4, 9, 16] | None = None
-    """Rays whose mean a pixel is. If not given, 4 where pixels show much more ground than those of the photographs at
-    the scene's or the run's width, else 1."""
+    """Rays whose mean a pixel is. If not given, 1; with our presets, 4 where pixels show much more ground than those of
+    the photographs at the scene's or the run's width."""
     no_cones: bool = False
     """Read photographs at the scene's or the run's width only, instead of where their pixels are about as large as what
     a pixel of the picture shows; for comparison."""

@@ -54,6 +54,10 @@ class Demo:
 
 def demo(options: Demo, console: Console) -> None:
     """Run `tidefield demo`."""
+    from tidefield.device import choose_device
+
+    Budget(options.minutes).checked()  # before a survey is made for nothing
+    choose_device(options.device)
     with only_writer(options.out):
         _demo(options, console)
 
@@ -119,10 +123,11 @@ class Made:
         record = read_json(self.file) or {"files": [], "unfinished": False}
         try:
             self.files, unfinished = {str(name) for name in record["files"]}, bool(record["unfinished"])
+            self.others = {str(name) for name in record.get("others", [])}
         except (KeyError, TypeError) as error:
             raise RunError(f"{self.file} is damaged: expected a list of files; choose another folder") from error
         if unfinished:  # it was killed, and what is new was being made
-            self.files |= self._present()
+            self.files |= self._present() - self.others
             for name in names:
                 for partial in out.glob(f".{Path(name).stem}-????????.partial*"):
                     _delete(partial)
@@ -138,12 +143,14 @@ class Made:
 
     @contextmanager
     def making(self) -> Iterator[None]:
-        """Record what is made in the block, even if it is interrupted."""
+        """Record what is made in the block, even if it is interrupted; what others put there before is not."""
+        self.others = self._present() - self.files
         self._write(unfinished=True)
         try:
             yield
         finally:
-            self.files |= self._present()
+            self.files |= self._present() - self.others
+            self.others.clear()
             self._write(unfinished=False)
 
     def delete(self) -> None:
@@ -165,7 +172,7 @@ class Made:
         return found
 
     def _write(self, unfinished: bool) -> None:
-        write_json(self.file, {"files": sorted(self.files), "unfinished": unfinished})
+        write_json(self.file, {"files": sorted(self.files), "others": sorted(self.others), "unfinished": unfinished})
 
 
 def _delete(place: Path) -> None:

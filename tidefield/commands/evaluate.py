@@ -97,6 +97,8 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         render = untrained(method, scene, sampling)
         return evaluate_method(render, scene, out, configuration=record, **settings)
     render, record = open_zero_shot(options.zero, scene, choose_device(options.device), sampling)
+    if options.opened_width is not None:
+        record["opened_width"] = options.opened_width
     truth = scene if options.opened_width is None else _at_width(scene, options.width, console)
     return evaluate_method(render, truth, out, configuration=record, **settings)
 

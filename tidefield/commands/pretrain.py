@@ -102,6 +102,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         trainer = across.Pretrainer(config, stream, shown, seed, device)
         if options.resume:
             trainer.resume(folder)
+            validation.resume(trainer.progress.step)
             if trainer.is_main_process:  # an older one may lack it
                 write_json(folder / PRETRAINING_FILE, {**_record(options), "budget": asdict(budget)})
             if budget.share(trainer.progress.step, trainer.progress.seconds) >= 1:
@@ -126,7 +127,7 @@ def _record(options: Pretrain) -> dict[str, Any]:
     """What must not change while a training is continued: its weights tell what they learned from."""
     from tidefield.addresses import address_of
 
-    real = sorted(address_of(scene) or str(scene.resolve()) for scene in options.real)
+    real = [address_of(scene) or str(scene.resolve()) for scene in options.real]  # scenes are drawn by their place
     return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
 
 

@@ -70,6 +70,7 @@ def render(options: Render, console: Console) -> None:
     from tidefield.cluster import connected
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
+    from tidefield.render.camera_paths import make_trajectory, require_path
     from tidefield.render.stills import describe_view, still_files, title, write_still
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
@@ -87,6 +88,12 @@ def render(options: Render, console: Console) -> None:
     if options.cluster is not None and camera is not None:
         raise RunError("--cluster shares the frames of a path among machines: --camera NAME is one view; leave it out")
     require_writable(*([out] if camera is None else still_files(out)), overwrite=overwrite)
+    for name, value in (("width", options.width), ("height", options.height)):
+        if value is not None and not 16 <= value <= 16384:
+            raise TidefieldError(f"--{name} {value} was asked for: expected 16 to 16384 pixels; choose another")
+    path, count = options.path or "orbit", FRAMES if options.frames is None else options.frames
+    if camera is None:
+        require_path(path, count)  # before photographs are read, which may take minutes
     device, sampling = choose_device(options.device), options.footprint.sampling
     opened = open_source(options.source, options.zero, device, options.allow_missing, console, sampling)
     with opened as (scene, view, record):
@@ -99,10 +106,8 @@ def render(options: Render, console: Console) -> None:
             return
         width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
         from tidefield.model.renderer import in_turn
-        from tidefield.render.camera_paths import make_trajectory
         from tidefield.render.video import write_video
 
-        path, count = options.path or "orbit", FRAMES if options.frames is None else options.frames
         trajectory = make_trajectory(path, scene, frames=count, width=width, height=height)
         cameras = _resized(trajectory.cameras, options.width, options.height)
 
@@ -137,9 +142,6 @@ def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras
 
 def _size(camera: Cameras, width: int | None, height: int | None) -> tuple[int, int]:
     """Width and height of a picture: the given ones, else in the camera's proportion, else the camera's."""
-    for name, value in (("width", width), ("height", height)):
-        if value is not None and not 16 <= value <= 16384:
-            raise TidefieldError(f"--{name} {value} was asked for: expected 16 to 16384 pixels; choose another")
     if width is None and height is None:
         return camera.width, camera.height
     if width is None:

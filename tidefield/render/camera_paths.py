@@ -22,6 +22,7 @@ from scipy.special import softmax
 
 from tidefield.data.hull import Hull
 from tidefield.data.near_far import ranges_of_points, with_widest
+from tidefield.data.readers.files import read_json
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
@@ -116,6 +117,16 @@ class Layout:
         return axis, np.cross(normal, axis)
 
 
+def require_path(path: str, frames: int) -> None:
+    """Raise a TidefieldError where `make_trajectory` would, as far as can be told without a scene."""
+    if frames < 1:
+        raise TidefieldError(f"a video of {frames} frames was asked for: expected at least one; choose more --frames")
+    if Path(path).suffix.lower() == ".json":
+        read_json(Path(path))
+    elif path not in SHAPES:
+        raise TidefieldError(f"no camera path is called {path!r}: expected {', '.join(SHAPES)} or a .json file")
+
+
 def make_trajectory(
     path: str, scene: Scene, *, frames: int, width: int, height: int, frames_per_second: float = FRAMES_PER_SECOND
 ) -> Trajectory:
@@ -129,12 +140,9 @@ def make_trajectory(
     Raises:
         TidefieldError: the name is none of these, it would have no frames, or the file cannot be read as a camera path.
     """
-    if frames < 1:
-        raise TidefieldError(f"a video of {frames} frames was asked for: expected at least one; choose more --frames")
+    require_path(path, frames)
     if path in SHAPES:
         return Trajectory(_well_seen(SHAPES[path], scene, frames, width, height), frames_per_second)
-    if Path(path).suffix.lower() != ".json":
-        raise TidefieldError(f"no camera path is called {path!r}: expected {', '.join(SHAPES)} or a .json file")
     stored = read_nerfstudio_path(Path(path), scene.root)
     position = stored.position - scene.origin_world.double().cpu().numpy()
     cameras = path_cameras(scene, position, stored.rotation, stored.width, stored.height, stored.focal_px)

@@ -340,7 +340,7 @@ def train(
     `callback` is called after every step; its time does not count.
 
     Returns:
-        The signal that stopped it, after which `resume` continues; None if the budget was used up.
+        A signal that came, after which `resume` continues what is left; None if the budget was used up without one.
     """
     progress = trainer.progress
 
@@ -376,7 +376,7 @@ def train(
             if stopped_by() is None:
                 _write_picture(trainer, writer)
     # Without a signal of its own, a process stops with the others of a distributed training.
-    return None if used() >= 1 else stopped_by() or signal.SIGINT
+    return stopped_by() or (None if used() >= 1 else signal.SIGINT)
 
 
 def _write_picture(trainer: Trainer, writer: SummaryWriter) -> None:

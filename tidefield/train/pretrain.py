@@ -6,7 +6,6 @@ Under `torchrun` every process draws its own scenes, and all learn from the mean
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +21,7 @@ from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
 from tidefield.evaluation.curves import make_curve
-from tidefield.files import read_json, write_text
+from tidefield.files import read_json, write_json
 from tidefield.model.renderer import Renderer
 from tidefield.synthetic import CATEGORIES, Flight
 from tidefield.train.loop import SceneTrainer, Trainer
@@ -166,6 +165,10 @@ class Validation:
         ):
             raise RunError(f"{self.file} is damaged: expected what training wrote; delete it to start it again")
 
+    def resume(self, step: int) -> None:
+        """Keep the points of the first steps: a training that was killed may have lost later ones."""
+        self.points = [point for point in self.points if point["step"] <= step]
+
     def __call__(self, trainer: Trainer, share: float) -> None:
         step = trainer.progress.step
         if not trainer.is_main_process or (step % VALIDATION_STEPS and share < 1):
@@ -178,6 +181,6 @@ class Validation:
             curve.add(trainer.progress.seconds, [render(camera) for camera in curve.cameras])
             psnr[name] = curve.points[-1][1]
         trainer.network.train()
-        self.points = [point for point in self.points if point["step"] < step]
+        self.resume(step - 1)
         self.points.append({"step": step, "seconds": trainer.progress.seconds, "psnr": psnr})
-        write_text(self.file, json.dumps(self.points))
+        write_json(self.file, self.points)
