@@ -3,18 +3,22 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 from located_surveys import fly, photograph, quiet
+from rich.console import Console
 
 from tidefield.errors import RunError
 from tidefield.geometry.similarity import Similarity, refine_similarity
+from tidefield.survey import prepare
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images
 from tidefield.survey.sfm import blocks as module
 from tidefield.survey.sfm.blocks import DONE, Block, cut, matched_pairs, merge, reconstruct_blocks, settle
 from tidefield.survey.sfm.features import encode_name
+from tidefield.survey.survey import LensPrior
 
 
 def grid(rows: int, columns: int) -> list:
@@ -96,6 +100,32 @@ def survey(tmp_path_factory: pytest.TempPathFactory):
                     geometry.cam2_from_cam1 = pose
                     db.write_two_view_geometry(first, second, geometry)
     return flight, path
+
+
+def test_a_lens_is_not_chosen_on_a_block_of_another_site(
+    survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight, database = survey
+    lens = LensPrior(350.0, None, None, "EXIF", trusted=False)
+    known = replace(flight.survey, photographs=tuple(replace(p, lens=lens) for p in flight.survey.photographs))
+    larger, smaller = fly(lines=3, each=8).model, fly(lines=2, each=8).model
+    tried = []
+    for name, stand_in in {
+        "matched_pairs": lambda *_: {},
+        "cut": lambda *_: [SimpleNamespace(names=[])] * 2,
+        "reconstruct_blocks": lambda *_: [larger, smaller],
+        "large_enough": lambda models, *_: models,
+        "settle": lambda _: None,
+        "choose_lens": lambda *given: tried.append(given[-1]),
+        "write_model": lambda *_: None,
+        "_to_json": lambda _: {},
+    }.items():
+        monkeypatch.setattr(prepare, name, stand_in)
+    for merged in ([larger, smaller], [smaller, larger]):
+        monkeypatch.setattr(prepare, "merge", lambda *_, merged=merged: merged)
+        prepare.estimate_poses(known, database, tmp_path / "model", Console(quiet=True))
+    assert tried[0].num_reg_images() == larger.num_reg_images()
+    assert tried[1] is None
 
 
 def test_blocks_are_merged_to_one_model_of_the_true_shape(survey, tmp_path: Path):

@@ -146,6 +146,15 @@ def test_the_same_line_twice_is_one_mark(tmp_path):
             r"1 of 1 marks are outside .*\(64 x 48 pixels\).*resized, scale the marks",
         ),
         ("EPSG:27700\n" + line(0, (1, 2), "DJI_0000.JPG A"), "from the photographs|nowhere near the photographs"),
+        (
+            UTM
+            + "\n"
+            + line(0, (1, 2), "DJI_0000.JPG A")
+            + line(1, (3, 4), "DJI_0000.JPG B")
+            # A point is missing in the easting.
+            + "57664025 5188211.19 2000 7 8 DJI_0000.JPG D",
+            r"line 4 puts the point D at \(57664025, 5188211.19\), which is nowhere in WGS 84 / UTM zone",
+        ),
     ],
 )
 def test_a_list_that_cannot_be_right_is_an_error(tmp_path, text, message):

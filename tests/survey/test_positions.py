@@ -481,6 +481,9 @@ def test_the_folder_in_a_path_of_another_machine_distinguishes_names():
     assert names.find("/elsewhere/DJI_0003.JPG") == "DJI_0003.JPG"
     with pytest.raises(SurveyError, match=r"names 2 photographs .*write its folder, too"):
         names.find("/elsewhere/DJI_0001.JPG")
+    later = PhotographNames(["100MEDIA/DJI_0001.JPG", "100MEDIA/DJI_0002.JPG"])
+    assert later.find("101MEDIA/DJI_0001.JPG") is None, "cameras number photographs anew in each folder"
+    assert later.find("DJI_0001.JPG") == "100MEDIA/DJI_0001.JPG"
 
 
 def test_letters_of_the_hemispheres_beside_unsigned_degrees_are_signs(tmp_path):

@@ -8,6 +8,7 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -375,6 +376,13 @@ def test_the_report_of_a_good_survey_with_check_points_has_no_warnings(tmp_path)
     checked = findings(flight(5, 12), georeference=located(control=control, check=check))
     checked = replace(checked, survey=replace(checked.survey, control=surveyed(control, check)))
     assert report(checked, tmp_path)[1]["tidefield"]["remarks"] == []
+
+
+def test_the_report_says_what_its_geojson_loses(tmp_path, monkeypatch):
+    module = import_module("tidefield.survey.report.numbers")
+    monkeypatch.setattr(module, "lost_in_conversion", lambda crs, target: f"in {crs.name} are 2 m off")
+    remarks = report(findings(), tmp_path)[1]["tidefield"]["remarks"]
+    assert any(remark.startswith("survey.geojson: coordinates in WGS 84 / UTM zone") for remark in remarks)
 
 
 def test_a_photograph_100_km_away_does_not_shrink_the_map(tmp_path):

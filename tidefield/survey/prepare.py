@@ -313,6 +313,8 @@ def estimate_poses(
             parts = large_enough(sorted(parts, key=lambda model: -model.num_reg_images()), database, names)
             largest = pycolmap.Reconstruction(parts[0])
             models = merge(parts, database)
+            if not set(largest.reg_image_ids()) <= set(models[0].reg_image_ids()):
+                largest = None  # it is of another site, perhaps of another drone
             settle(models[0])
     with ProgressBar(console, "Choosing a lens") as bar:
         choice = choose_lens(models[0], survey.photographs, known, bar, largest)

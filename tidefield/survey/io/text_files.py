@@ -25,7 +25,8 @@ _CODE = re.compile(r"\+|\w+[:[]")
 class PhotographNames:
     """Index of the photographs of a survey by full or shortened name.
 
-    A name may be the path in the survey's folder or the file name alone, with or without suffix, in any case.
+    A name may be the path in the survey's folder or the file name alone, with or without suffix, in any case. One in
+    another folder is another photograph: cameras number them anew in each.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -56,7 +57,13 @@ class PhotographNames:
             raise SurveyError(
                 f"{text} names {len(names)} photographs ({list_names(names)}): expected one; write its folder, too"
             )
-        return names[0] if names else None
+        if not names or (len(path.parts) > 1 and "/" in names[0] and not self._is_in(names[0], places)):
+            return None
+        return names[0]
+
+    def _is_in(self, name: str, places: Sequence[tuple[str, str]]) -> bool:
+        """Whether a photograph is at one of some places."""
+        return any(name in self._names.get(place, ()) for place in places)
 
     def split(self, line: str) -> tuple[str | None, list[str]]:
         """Split a line that begins with a photograph's name, which may have spaces, into the name and further cells."""

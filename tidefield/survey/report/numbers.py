@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from shapely.geometry import mapping
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.geometry.geodesy import LocalFrame, parse_crs
+from tidefield.geometry.geodesy import WGS84, LocalFrame, lost_in_conversion, parse_crs
 from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report.findings import Comparison, Findings
@@ -435,6 +435,8 @@ def _remarks(findings: Findings, statistics: Statistics, cameras: list[Numbers])
         found.append(
             "No check points were held out: the residuals of control points are those of a fit, and flatter it."
         )
+    if findings.frame is not None and (lost := lost_in_conversion(parse_crs(findings.frame.crs), parse_crs(WGS84))):
+        found.append(f"survey.geojson: coordinates {lost}; survey.gpkg has the same shapes in the survey's own.")
     found += _clock_remark(findings, statistics)
     share = statistics.coverage.area(3) / max(statistics.coverage.area(1), 1e-12)
     if share < THIN_SHARE:
