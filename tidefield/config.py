@@ -189,7 +189,9 @@ class Config:
     method: Literal["tidefield"] = "tidefield"
 
 
-AnyConfig = Config | NerfConfig | NerfstudioConfig | OpensplatConfig
+ExternalConfig = NerfstudioConfig | OpensplatConfig
+"""Of what a program of its own trains."""
+AnyConfig = Config | NerfConfig | ExternalConfig
 
 
 @dataclass(frozen=True)

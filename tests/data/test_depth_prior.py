@@ -14,6 +14,8 @@ from tidefield.data.depth_prior import (
     SPARSE_DISTANCE,
     SPARSE_MARGIN,
     STRIDE,
+    DepthPrior,
+    DepthPriors,
     read_prior,
     surface_prior,
 )
@@ -102,6 +104,20 @@ def test_with_too_few_points_for_an_interval_it_is_the_cameras_near_and_far():
     torch.testing.assert_close(expected, torch.full_like(expected, 1 / wall.DEPTH))
     torch.testing.assert_close(near, torch.full_like(near, 1 / 3))
     torch.testing.assert_close(far, torch.full_like(far, 1 / 10))
+
+
+def test_no_more_priors_are_kept_than_there_is_room_for():
+    scene, found = wall.scene(wall.cameras(4)), []
+
+    def match(camera: Cameras, cells: Tensor) -> DepthPrior:
+        found.append(len(found))
+        return DepthPrior(cells, torch.zeros(camera.height, camera.width))
+
+    one = DepthPriors(scene, match=match)[0].nbytes
+    priors = DepthPriors(scene, match=match, most_bytes=2 * one)
+    for index in (0, 1, 0, 2, 0, 1):
+        assert priors[index].nbytes == one
+    assert len(found) - 1 == 4, "1 went when 2 came"
 
 
 def test_a_new_camera_without_observations_has_a_prior():

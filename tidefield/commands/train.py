@@ -17,8 +17,8 @@ from tidefield.config import (
     AnyConfig,
     Budget,
     Config,
+    ExternalConfig,
     NerfstudioConfig,
-    OpensplatConfig,
     checked_seed,
     vary,
 )
@@ -124,7 +124,7 @@ def _train(options: Train, console: Console, again: str) -> None:
             raise RunError(
                 f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
             )
-        if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+        if isinstance(run.config, ExternalConfig):
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
         _require_its_options(options, run)
         weights = _resumed_weights(options, run)
@@ -132,20 +132,20 @@ def _train(options: Train, console: Console, again: str) -> None:
             budget = run.budget.checked()
     else:
         run, weights = _new_run(options)
-    scene = load(run.scene, run.width, options.allow_missing, console)
-    if not scene.train:
-        raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
-    if options.view and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+    if options.view and isinstance(run.config, ExternalConfig):
         raise RunError(f"{run.config.method} trains in a program of its own: --view shows our methods; leave it out")
-    if options.curve and budget.minutes is None and isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+    if options.curve and budget.minutes is None and isinstance(run.config, ExternalConfig):
         raise RunError(
             f"--curve was given with --steps: {run.config.method} has curves over minutes only; give --minutes, or "
             "leave --curve out"
         )
+    scene = load(run.scene, run.width, options.allow_missing, console)
+    if not scene.train:
+        raise SceneError(f"{options.scene} has no training photographs: expected at least three; add photographs")
     curve = make_curve(scene) if options.curve else None
     start = f", starting from {weights}" if weights else ""
     log.info(f"{len(scene.train)} photographs, {len(scene.test)} held out; {run.config.method} on {device}{start}")
-    if isinstance(run.config, NerfstudioConfig | OpensplatConfig):
+    if isinstance(run.config, ExternalConfig):
         from tidefield.baselines import opensplat
         from tidefield.baselines.nerfstudio import driver
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.surface import depth_through, trusted_points
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.machine import cores
+from tidefield.parallel import SharedValues
 
 STRIDE = 4
 """Pixels between the cells of a prior."""
@@ -57,6 +59,10 @@ class DepthPrior:
 
     cells: Float[Tensor, "3 h w"]
     detail: Float[Tensor, "H W"] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        return self.cells.nbytes + (0 if self.detail is None else self.detail.nbytes)
 
     def detail_of_tiles(self, corner_px: Float[Tensor, "T 2"], side_px: int) -> Float[Tensor, "T R"]:
         """Return the detail of the pixels of tiles, row by row; 0 outside of the image."""
@@ -166,6 +172,7 @@ class DepthPriors:
         scene: of the cameras.
         observed: points for `observed` (the supervision of depth); the scene's own if not given.
         match: finds the surface of a camera from its prior's cells (`matching.Matcher`); None leaves the cells.
+        most_bytes: that are kept; what goes is computed again. None keeps all.
     """
 
     def __init__(
@@ -173,17 +180,19 @@ class DepthPriors:
         scene: Scene,
         observed: SparsePoints | None = None,
         match: Callable[[Cameras, Float[Tensor, "3 h w"]], DepthPrior] | None = None,
+        most_bytes: int | None = None,
     ) -> None:
         self.scene, self.points, self.match = scene, observed or scene.points, match
-        self._priors: dict[int, DepthPrior] = {}
+        self._priors: SharedValues[int, DepthPrior] = SharedValues(most_bytes or sys.maxsize, lambda p: p.nbytes)
         self._observed: dict[int, Observed] = {}
 
     def __getitem__(self, index: int) -> DepthPrior:
-        if index not in self._priors:
-            cameras = self.scene.cameras
-            cells = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
-            self._priors[index] = DepthPrior(cells) if self.match is None else self.match(cameras[index], cells)
-        return self._priors[index]
+        return self._priors.get(index, self._find)
+
+    def _find(self, index: int) -> DepthPrior:
+        cameras = self.scene.cameras
+        cells = surface_prior(cameras[index], self.scene.points, cameras, self.scene.hull)
+        return DepthPrior(cells) if self.match is None else self.match(cameras[index], cells)
 
     def observed(self, index: int) -> Observed:
         """Return the sparse points in front of a camera that its photograph observed."""

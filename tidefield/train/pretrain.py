@@ -74,7 +74,8 @@ def join(device: torch.device) -> torch.device:
 def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> dict[str, Scene]:
     """Scenes to validate on: a procedural one of each category, that no stream draws, and the real ones, by name.
 
-    Where an earlier scene has the name of a real one's folder, a number follows it.
+    Where an earlier scene has the name of a real one's folder, a number follows it. Processes that do not validate have
+    no real ones.
     """
     if not is_main_process():
         dist.barrier()  # the first process makes them
@@ -85,7 +86,9 @@ def validation_scenes(folder: Path, real: Sequence[Path], console: Console) -> d
             console.print(f"Making a scene to validate on: {category}", highlight=False)
             make(Recipe(category, (1 << 31) + number, 16, 224, Flight(), ()), path)
         scenes[category] = load_scene(path)
-    if is_distributed() and is_main_process():
+    if not is_main_process():
+        return scenes
+    if is_distributed():
         dist.barrier()
     for path in sorted(path.resolve() for path in real):  # named alike in whatever order
         name, number = path.name, 1

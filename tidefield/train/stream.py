@@ -36,6 +36,8 @@ from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey, write_s
 
 POOL_SIZE = 8
 """Scenes that are drawn from at a time."""
+PRIOR_BYTES = 500_000_000
+"""Of the depth priors of one of them: a real one may have thousands of photographs."""
 STEPS_EACH = 200
 """Steps after which the oldest scene is replaced."""
 CORES_PER_MAKER = 4
@@ -284,7 +286,7 @@ class Stream:
         if self.network.has("matched surface"):  # as for one scene; on greys, which are those of any order of channels
             match = Matcher(misaligned, Pyramid(misaligned, twice), most_px=MATCHED_PX, finer=True, device=device)
         doubled = None if twice is None else recoloured(twice, own.channels)
-        return Drawn(augmented, DepthPriors(augmented, observed, match), augmented.cameras, doubled)
+        return Drawn(augmented, DepthPriors(augmented, observed, match, PRIOR_BYTES), augmented.cameras, doubled)
 
 
 def recoloured(scene: Scene, channels: tuple[int, ...]) -> Scene:
