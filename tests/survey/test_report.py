@@ -378,6 +378,17 @@ def test_the_report_of_a_good_survey_with_check_points_has_no_warnings(tmp_path)
     assert report(checked, tmp_path)[1]["tidefield"]["remarks"] == []
 
 
+def test_residuals_without_heights_are_reported_in_plan(tmp_path):
+    given = residuals("GPS")
+    level = Residuals(given.names, given.error_m * (1, 1, math.nan))
+    text, table = report(findings(georeference=located(gps=level)), tmp_path)
+    Reader(text)
+    (found,) = [each for each in table["tidefield"]["residuals"] if each["kind"] == "gps"]
+    assert found["rms_horizontal"] > 0
+    assert found["rms_vertical"] is None
+    assert "Residuals in plan" in text
+
+
 def test_the_report_says_what_its_geojson_loses(tmp_path, monkeypatch):
     module = import_module("tidefield.survey.report.numbers")
     monkeypatch.setattr(module, "lost_in_conversion", lambda crs, target: f"in {crs.name} are 2 m off")

@@ -139,7 +139,10 @@ def _gps_residuals(model: pycolmap.Reconstruction, positions: GivenPositions, fr
         return Residuals()
     centres = camera_centres(model)
     found = np.array([centres[name] for name in positions.names])
-    return Residuals(positions.names, found - frame.from_geographic(positions.longitude_latitude_height))
+    error_m = found - frame.from_geographic(positions.longitude_latitude_height)
+    if not positions.has_heights:
+        error_m[:, 2] = math.nan
+    return Residuals(positions.names, error_m)
 
 
 def _transform(model: pycolmap.Reconstruction, similarity: Similarity) -> None:

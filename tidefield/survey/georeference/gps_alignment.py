@@ -57,6 +57,7 @@ class GivenPositions:
         stated_m: standard deviations (horizontal, vertical) stated by the receivers, NaN where they state none, or the
             height is not theirs.
         vertical_datum: of the heights, as text.
+        has_heights: otherwise all are taken to be at one height.
         notes: which positions or heights are not used, as whole sentences.
     """
 
@@ -64,6 +65,7 @@ class GivenPositions:
     longitude_latitude_height: Float64[np.ndarray, "N 3"]
     stated_m: Float64[np.ndarray, "N 2"]
     vertical_datum: str
+    has_heights: bool = True
     notes: tuple[str, ...] = ()
 
     @property
@@ -93,6 +95,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
     absolute = _of_one_datum(with_height)
     relative = [pair for pair in located if math.isfinite(pair[0].relative_altitude_m)]
     enough, count, without, notes = max(3, len(located) / 2), len(located), 0, []
+    has_heights = True
     if len(with_height) >= enough and len(absolute) >= 3:
         located, heights, without = absolute, [position.height_m for _, position in absolute], count - len(with_height)
         datum = _DATUMS[absolute[0][1].datum]
@@ -107,7 +110,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         located, heights = relative, [photograph.relative_altitude_m for photograph, _ in relative]
         datum, without = "the place of take-off", count - len(relative)
     else:
-        heights = [0.0] * count
+        heights, has_heights = [0.0] * count, False
         datum = "the mean height of flight, since too few photographs have heights"
         if absolute or relative:
             notes.append(
@@ -127,6 +130,7 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
         longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
         stated_m=np.array(stated, dtype=np.float64).reshape(-1, 2),
         vertical_datum=datum,
+        has_heights=has_heights,
         notes=tuple(notes),
     )
 

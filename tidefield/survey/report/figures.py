@@ -161,13 +161,14 @@ def draw_histogram(
 
 @style.context(STYLE)
 def draw_residuals(comparison: Comparison) -> Markup | None:
-    """Draw residuals in plan, and their heights in a strip next to it; None if none are known."""
+    """Draw residuals in plan, and their heights in a strip next to it, which is empty where positions had none; None if
+    no residuals are known."""
     finite = comparison.residuals.known
     if not (finite & comparison.used).any():
         return None
     error_m, used = comparison.residuals.error_m[finite], comparison.used[finite]
     names = np.array(comparison.residuals.names, dtype=object)[finite]
-    largest = max(float(np.abs(error_m[used]).max()), 1e-6)
+    largest = max(float(np.nanmax(np.abs(error_m[used]))), 1e-6)
     step = _round_step(largest / 3)
     reach = step * math.ceil(largest / step - 1e-9)
     inside = error_m.clip(-1.03 * reach, 1.03 * reach)  # one that was not used may lie far outside
@@ -196,7 +197,8 @@ def draw_residuals(comparison: Comparison) -> Markup | None:
         (~used, "unused", {"marker": "x", "color": LOST, "markersize": 5.5, "markeredgewidth": 1.4}),
     ):
         plan.plot(inside[keep, 0], inside[keep, 1], linestyle="", gid=gid, **marker)
-        strip.plot(np.zeros(keep.sum()), inside[keep, 2], linestyle="", gid=gid, **marker)
+        if np.isfinite(error_m[:, 2]).all():
+            strip.plot(np.zeros(keep.sum()), inside[keep, 2], linestyle="", gid=gid, **marker)
     longest = float(np.hypot(*error_m[used, :2].T).max())
     description = f"{comparison.title}. Residuals in plan, the largest {longest:.3f} m long, and their heights."
     tooltips = {"used": [*names[used]], "unused": [f"{name}: not used" for name in names[~used]]}
