@@ -35,7 +35,7 @@ class Difference:
 
     Attributes:
         change_m: the creek cuts this much on one bank and leaves as much on the other; the bar grows by it. Negative
-            turns all of it round; 0 changes no ground.
+            turns all of it round; 0 changes no ground, but for pools that a lower tide leaves behind.
         marsh_growth: the share of the dry ground that is marsh becomes this many times as large.
         tide_m: how much higher the water stands.
         sun_turn_deg: how far the sun's azimuth has moved.
