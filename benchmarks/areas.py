@@ -10,7 +10,7 @@ much the mean error of the picture changes from one side to the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.records import store
-from tidefield.compare.run import Runner, run_measured, tidefield
+from benchmarks.records import MEASURED, HiddenRunner, say, show, store
+from tidefield.compare.run import run_measured, tidefield
 from tidefield.compare.tables import Table
 from tidefield.config import PRESETS, Budget
 from tidefield.data.areas import cut
@@ -43,27 +43,25 @@ BORDER_VIEWS = 24
 """Views over borders."""
 
 
-def measure_areas(
+def areas(
     work: Path,
-    runs: Path,
-    counts: Sequence[int],
-    width: int,
-    steps: int,
-    compared_steps: int,
-    say: Callable[[str], object],
-    run: Runner = run_measured,
+    runs: Path = MEASURED,
+    counts: tuple[int, ...] = (500, 1000, 2000),
+    width: int = 160,
+    steps: int = 600,
+    compared_steps: int = 1600,
+    run: HiddenRunner = run_measured,
 ) -> dict[str, Any]:
     """Measure memory on flights of several sizes, then quality and seams on the smallest; what is stored is kept.
 
     Args:
-        work: folder for flights, scenes and runs.
-        runs: folder of areas.json.
-        counts: of photographs, multiples of `EACH`.
-        width: of the photographs, pixels.
-        steps: of the trainings whose memory is measured.
-        compared_steps: of those that are compared.
-        say: reports progress.
-        run: runs a command.
+        work: Folder for flights, scenes and runs; what is there is not made again.
+        runs: Store the figures in this folder's areas.json; what it holds is not measured again.
+        counts: Photographs of the flights, multiples of 50.
+        width: Of a photograph, in pixels.
+        steps: Of the trainings whose memory is measured.
+        compared_steps: Of the trainings at once and by areas that are compared.
+        run: Runs a command.
     """
     record = read_json(runs / AREAS_FILE)
     about = {"width": width, "steps": steps, "compared_steps": compared_steps}
@@ -88,6 +86,7 @@ def measure_areas(
             new = compare(_scene(smallest, work), smallest, name == "by areas", compared_steps)
             record["compared"][name] = new
             _store(record, new, runs)
+    show(tables(record))
     return record
 
 

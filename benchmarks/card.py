@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.records import STRICT_400, say
 from benchmarks.table import SCENES, age, marks_of, notes, without_empty_columns
 from tidefield.compare.results import Results, read_figures
 from tidefield.compare.tables import Table, lpips_weights, marked, shown
@@ -39,15 +39,12 @@ LICENCES = {
 """Of the photographs of real scenes that may be learned from."""
 
 
-def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
-    """Write PRESET.md next to the weights.
+def card(weights: Path, comparison: tuple[Path, ...] = STRICT_400) -> Path:
+    """Write PRESET.md next to the weights; returns it.
 
     Args:
-        weights: of `tidefield pretrain`.
-        comparison: files of `tidefield compare` with the method zero-shot or paper-zero-shot.
-
-    Returns:
-        The card.
+        weights: Of `tidefield pretrain`.
+        comparison: Files of `tidefield compare` with the method zero-shot, or paper-zero-shot for those of paper.
 
     Raises:
         RunError: the comparison has no such results, or a scene was learned from whose licence is not known.
@@ -59,11 +56,12 @@ def write_card(weights: Path, comparison: Sequence[Path]) -> Path:
         files = ", ".join(map(str, comparison))
         raise RunError(f"{files} hold no {own} results: expected some; run `tidefield compare` with them")
     out = weights.with_suffix(".md")
-    write_text(out, card(weights, results))
+    write_text(out, _page(weights, results))
+    say(out)
     return out
 
 
-def card(weights: Path, results: Results) -> str:
+def _page(weights: Path, results: Results) -> str:
     """The whole card; the first of the results' methods is what the weights are called there."""
     recorded, _ = read_weights_file(weights)
     unknown = [name for name in recorded["real"] if name not in LICENCES]

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 
 from benchmarks.change_pairs import measure_pairs, summarise
+from benchmarks.records import MEASURED, say
 from tidefield.change.errors import anderson_terms, nmad
 from tidefield.change.m3c2 import m3c2
 from tidefield.change.measure import measure
@@ -24,6 +25,7 @@ from tidefield.machine import describe
 CHANGE_FILE = "change.json"
 FIRST_SEED = 100
 """The rules of outlines and intervals were chosen on pairs 0 to 19; others are measured."""
+AMOUNTS_M = (0.0, 0.05, -0.05, 0.1, -0.1, 0.2, -0.2)
 FOUND_AMOUNTS_M = (0.0, 0.1, -0.1)
 """With stable ground that is found instead of given."""
 VOLUMES = ("net", "cut", "fill")
@@ -167,17 +169,31 @@ def store(runs: Path, part: str, found: Any) -> None:
     write_json(runs / CHANGE_FILE, {**record, part: {"found": found, **describe()}})
 
 
-def measure_change(data: Path | None, runs: Path, pairs: int, say: Callable[[str], None]) -> None:
-    """Measure what was published and built-in pairs, and store each in RUNS/change.json as it is done."""
+def change(
+    data: Path | None = None,
+    pairs: int = 20,
+    runs: Path = MEASURED,
+    out: Path = Path("docs/change-results.md"),
+) -> None:
+    """Measure what was published and built-in pairs, store each as it is done, and write the page.
+
+    Args:
+        data: Folder with bmx and st_leonards; without it, their figures stay as they are stored.
+        pairs: Of built-in surveys for each amount of change; 0 leaves their figures as they are stored.
+        runs: Store the figures in this folder's change.json.
+        out: The Markdown file to write; replaced if it is there.
+    """
     if data is not None:
         say("published figures")
         store(runs, "published", published(data))
     if pairs:
         say(f"{pairs} pairs of built-in surveys for each amount of change")
         seeds = range(FIRST_SEED, FIRST_SEED + pairs)
-        measured = measure_pairs(seeds, say) + measure_pairs(seeds, say, FOUND_AMOUNTS_M, given=False)
+        measured = measure_pairs(seeds, AMOUNTS_M, given=True) + measure_pairs(seeds, FOUND_AMOUNTS_M, given=False)
         kept = ("change_m", "stable_ground")
         store(runs, "pairs", [{key: found[key] for key in kept} | summarise(found) for found in measured])
+    write_page(runs, out)
+    say(out)
 
 
 def _published_tables(found: dict[str, Any]) -> list[Table]:

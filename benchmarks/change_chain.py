@@ -6,18 +6,19 @@ Every step is compared with it, so that it shows where what is lost gets lost.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from benchmarks.change import store
 from benchmarks.change_pairs import compared
 from benchmarks.maps import made_map
+from benchmarks.records import MEASURED, say
 from tidefield.change.inputs import open_survey
-from tidefield.change.measure import Change, dilated, measure
-from tidefield.change.regions import Region
+from tidefield.change.measure import Change, measure
+from tidefield.change.regions import Region, dilated
 from tidefield.change.surfaces import Grid
 from tidefield.change.write import polygons_of
 from tidefield.data.load import load_scene
@@ -89,13 +90,14 @@ class Truth:
         return self.of["bed1"] - self.of["bed0"]
 
 
-def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) -> dict[str, Any]:
+def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEASURED) -> None:
     """Make the photographs, prepare and map both surveys, compare them, and compare each step with the truth.
 
     Args:
-        work: folder for all of it; what is there is not made again.
-        views: photographs of each survey.
-        width: of a photograph, pixels.
+        work: Folder for photographs, scenes and maps; what is there is not made again.
+        views: Photographs of each survey.
+        width: Of the photographs in pixels.
+        runs: Store the figures in this folder's change.json.
     """
     from rich.console import Console
 
@@ -123,7 +125,7 @@ def run_chain(work: Path, views: int, width: int, say: Callable[[str], object]) 
         found = measure(earlier, later, stable=stable, within=lambda grid: _bare(surveys, grid))
         record["steps"][f"change, stable ground {name}"] = _against_truth(found, surveys)
         say(f"stable ground {name}: {record['steps'][f'change, stable ground {name}']}")
-    return record
+    store(runs, "chain", record)
 
 
 def _area(work: Path) -> Path:

@@ -7,14 +7,15 @@ orthophoto: what `tidefield map` adds to them is measured with the whole chain.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.change import store
 from benchmarks.change_pairs import stable_frame, write_surface
+from benchmarks.records import MEASURED, say
 from tidefield.change.cover import compare_cover
 from tidefield.change.measure import Options, measure
 from tidefield.change.surfaces import Grid, open_surface
@@ -38,14 +39,19 @@ ERRORS = SurveyErrors(datum_m=0.0)
 """The surveys share their control: levels of water are in both surveys' heights."""
 
 
-def measure_covers(seeds: Sequence[int], say: Callable[[str], object]) -> list[dict[str, Any]]:
-    """One record for each pair, a pair of each category for each seed."""
+def change_cover(seeds: int = 4, runs: Path = MEASURED) -> None:
+    """Store one record for each pair, a pair of each category for each seed.
+
+    Args:
+        seeds: Pairs of each category.
+        runs: Store the figures in this folder's change.json.
+    """
     found = []
-    for seed in seeds:
+    for seed in range(FIRST_SEED, FIRST_SEED + seeds):
         for category in CATEGORIES:
             found.append({"category": category, "seed": seed, **_pair(category, seed)})
-            say(str(found[-1]))
-    return found
+            say(found[-1])
+    store(runs, "cover", found)
 
 
 def _pair(category: str, seed: int) -> dict[str, Any]:

@@ -8,7 +8,6 @@ half, which nothing was measured on.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,19 @@ from typing import Any
 import numpy as np
 import shapely
 
+from benchmarks.change import store
 from benchmarks.maps import made_map
+from benchmarks.records import MEASURED, say
 from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
-from tidefield.change.light import greenness, smoothed
-from tidefield.change.measure import Options, dilated, measure
-from tidefield.change.regions import Region, rasterised
+from tidefield.change.light import greenness
+from tidefield.change.measure import Options, measure
+from tidefield.change.regions import Region, dilated, rasterised
 from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import Grid, Surface, common_grid
 from tidefield.change.write import polygons_of
 from tidefield.files import completed_folder, write_text
+from tidefield.maps.smoothing import smoothed
 
 FLIGHTS = {"first": (1414, 1481), "third": (1548, 1618)}
 CELL_M = 0.15
@@ -52,12 +54,13 @@ def copy_flight(photographs: Path, flight: tuple[int, int], folder: Path) -> Non
         write_text(partial_ / "gcp_list.txt", "\n".join([first, *kept]) + "\n")
 
 
-def measure_null(photographs: Path, work: Path, say: Callable[[str], object]) -> dict[str, Any]:
+def change_null(photographs: Path, work: Path, runs: Path = MEASURED) -> None:
     """Prepare, map and compare both flights.
 
     Args:
-        photographs: swindale, as `shared/data/photographs` has it.
-        work: folder for all of it; what is there is not made again.
+        photographs: Folder with swindale's photographs, gps.csv and gcp_list.txt.
+        work: Folder for scenes and maps; what is there is not made again.
+        runs: Store the figures in this folder's change.json.
     """
     from rich.console import Console
 
@@ -74,10 +77,10 @@ def measure_null(photographs: Path, work: Path, say: Callable[[str], object]) ->
         say(f"{name}: map")
         made = made_map(own / "scene", own / "map", gsd=CELL_M)
         record[name] = {key: made[key] for key in ("area", "sigma_median", "views_median")}
-    return {**record, **compare(work, say)}
+    store(runs, "null", {**record, **compare(work)})
 
 
-def compare(work: Path, say: Callable[[str], object]) -> dict[str, Any]:
+def compare(work: Path) -> dict[str, Any]:
     """Compare the maps of both flights over dry ground."""
     earlier, later = (open_survey(work / name / "map") for name in FLIGHTS)
     grid = common_grid([earlier, later])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from tidefield.change.measure import Change, dilated, measure
-from tidefield.change.regions import Region
+from benchmarks.records import say
+from tidefield.change.measure import Change, measure
+from tidefield.change.regions import Region, dilated
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.volumes import Volume
 from tidefield.change.write import polygons_of
@@ -20,18 +21,12 @@ from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import ground_pair, surveyed
 
 CATEGORIES = ("river_mouths", "tidal_trees", "ground_textures")
-AMOUNTS_M = (0.0, 0.05, -0.05, 0.1, -0.1, 0.2, -0.2)
 CELLS_M = (0.25, 0.2)
 """Of the earlier and the later survey."""
 
 
-def measure_pairs(
-    seeds: Sequence[int],
-    say: Callable[[str], None],
-    amounts: Sequence[float] = AMOUNTS_M,
-    given: bool = True,
-) -> list[dict[str, Any]]:
-    """One record for each amount of change."""
+def measure_pairs(seeds: Sequence[int], amounts: Sequence[float], given: bool) -> list[dict[str, Any]]:
+    """One record for each amount of change; `given` is that of `measure_pair`."""
     found: list[dict[str, Any]] = []
     for amount in amounts:
         pairs = [measure_pair(seed, amount, given) for seed in seeds]
@@ -40,7 +35,7 @@ def measure_pairs(
     return found
 
 
-def measure_pair(seed: int, amount: float, given: bool = True) -> dict[str, Any]:
+def measure_pair(seed: int, amount: float, given: bool) -> dict[str, Any]:
     """Survey a flat twice, compare the surveys, and compare that with the truth.
 
     Args:

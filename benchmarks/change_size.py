@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import resource
-import sys
 import tempfile
-import time
-from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tidefield.errors import RunError
+from benchmarks.change import store
+from benchmarks.records import MEASURED, say
+from tidefield.compare.run import run_measured, tidefield
 from tidefield.machine import cores
 
 CELL_M = 0.05
@@ -59,31 +58,34 @@ def write_pair(folder: Path, side: int) -> tuple[Path, Path]:
     return paths
 
 
-def measure_size(million: float, say: Callable[[str], object]) -> dict[str, Any]:
-    """Compare two surfaces of so many million cells by the command, in a process of its own."""
+def change_size(million: float = 100, runs: Path = MEASURED) -> dict[str, Any]:
+    """Compare two surfaces by the command, in a process of its own; store and return what it took.
+
+    Args:
+        million: Cells of each surface, in millions.
+        runs: Store the figures in this folder's change.json.
+    """
     side = round((million * 1e6) ** 0.5)
     with tempfile.TemporaryDirectory() as folder:
         say(f"two surfaces of {side} x {side} cells")
         earlier, later = write_pair(Path(folder), side)
         out = Path(folder) / "out"
         say("tidefield change")
-        words = [sys.executable, "-m", "tidefield.cli", "change", str(earlier), str(later), str(out), "--quiet"]
-        started, before = time.monotonic(), _processor_seconds()
-        process = os.posix_spawn(sys.executable, words, dict(os.environ))
-        _, status, usage = os.wait4(process, 0)
-        seconds = time.monotonic() - started
-        if status != 0:
-            raise RunError(f"`tidefield change` ended with status {os.waitstatus_to_exitcode(status)}: expected 0")
-        written = sum(path.stat().st_size for path in out.iterdir())
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {
-        "million_cells": side * side / 1e6,
-        "seconds": seconds,
-        "processor_seconds": _processor_seconds() - before,
-        "peak_memory_bytes": usage.ru_maxrss * unit,
-        "written_bytes": written,
-        "cores": cores(),
-    }
+        before = _processor_seconds()
+        usage = run_measured(tidefield("change", earlier, later, out, "--quiet"), {})
+        found = {
+            "million_cells": side * side / 1e6,
+            **asdict(usage),
+            "processor_seconds": _processor_seconds() - before,
+            "written_bytes": sum(path.stat().st_size for path in out.iterdir()),
+            "cores": cores(),
+        }
+    say(
+        f"{found['million_cells']:.0f} million cells: {found['seconds']:.0f} s, {found['processor_seconds']:.0f} s of "
+        f"the processor, {found['peak_memory_bytes'] / 1e9:.2f} GB"
+    )
+    store(runs, "size", found)
+    return found
 
 
 def _processor_seconds() -> float:

@@ -14,13 +14,15 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tyro.conf import Positional
 
+from benchmarks.records import MEASURED, say, show
 from tidefield.compare.run import tidefield
 from tidefield.compare.tables import Table
 from tidefield.data.georeference import read_georeference
@@ -41,28 +43,33 @@ COMPARED = (".tif", ".laz", ".geojson")
 """Suffixes of a map's files that hold no dates."""
 
 
-def measure_cluster(
-    scene_folder: Path, work: Path, runs: Path, metres: float, cell: float, kills: int, seed: int, say: Callable
-) -> dict[str, Any]:
-    """Make the maps, store their figures as RUNS/cluster.json and return them.
+def cluster(
+    scene: Positional[Path],
+    work: Positional[Path],
+    runs: Path = MEASURED,
+    metres: float = 1000.0,
+    cell: float = 0.2,
+    kills: int = 10,
+    seed: int = 0,
+) -> None:
+    """Make the maps, and store their figures.
 
     Args:
-        scene_folder: a georeferenced survey.
-        work: folder for the maps; those that the record has are not made again.
-        runs: folder of the record.
-        metres: side of the square.
-        cell: side of a cell, metres.
-        kills: how often a worker is killed.
-        seed: of the moments.
-        say: reports progress.
+        scene: A survey that is larger than the square.
+        work: Folder for the maps; those that the record has are not made again.
+        runs: Store the figures in this folder's cluster.json.
+        metres: Side of the square in the survey's middle that is mapped.
+        cell: Side of a cell, metres.
+        kills: How often a worker is killed.
+        seed: Of the moments.
 
     Raises:
-        RunError: the survey is too small, a command failed, or a map differs from another one.
+        RunError: the survey is too small or not georeferenced, a command failed, or a map differs from another one.
     """
-    square, tiles = _square(scene_folder, work, metres, cell)
+    square, tiles = _square(scene, work, metres, cell)
     if kills > max(0, tiles - 3):
         raise RunError(f"--kills {kills} was asked for, of {tiles} tiles: expected at most {max(0, tiles - 3)}")
-    options = [scene_folder, "--zero-shot", "--device", "cpu", "--gsd", cell, "--area", square, "--quiet"]
+    options = [scene, "--zero-shot", "--device", "cpu", "--gsd", cell, "--area", square, "--quiet"]
     record: dict[str, Any] = read_json(runs / CLUSTER_FILE) or {}
     made: dict[str, Any] = record.get("maps", {})
     for name, workers, count in (("two", 2, 0), ("killed", 2, kills), ("one", 1, 0)):
@@ -73,7 +80,7 @@ def measure_cluster(
         with _cluster(workers) as address:
             made[name] = {"workers": workers, **_map(options, work / name, address, after)}
         record = {
-            "scene": scene_folder.name,
+            "scene": scene.name,
             "square_metres": metres**2,
             "cell_m": cell,
             "tiles": tiles,
@@ -88,11 +95,12 @@ def measure_cluster(
     write_json(runs / CLUSTER_FILE, record)
     if different:
         raise RunError(f"{len(different)} of {files} files differ between the maps in {work}: expected equal ones")
-    return record
+    show(tables(record))
+    say(f"{files} files are the same in all maps")
 
 
 def tables(record: dict[str, Any]) -> list[Table]:
-    """The figures of `measure_cluster`."""
+    """What the maps took, against those of one worker."""
     labels = {"one": "one worker", "two": "two workers", "killed": "two workers, killed"}
     rows = [
         [

@@ -9,16 +9,18 @@ a stage is serial follows from its seconds and CPU seconds. Each measurement is 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
 from scipy.optimize import nnls
+from tyro.conf import Positional
 
 from benchmarks.large import LARGE_FILE, run_by_stage, total
+from benchmarks.records import MEASURED, say, show
 from tidefield.compare.run import tidefield
 from tidefield.compare.tables import Table
 from tidefield.errors import RunError
@@ -82,17 +84,51 @@ class Estimate:
     disk_bytes: float
 
 
-def measure_costs(
-    flights: Sequence[Path], work: Path, runs: Path, device: str, say: Callable[[str], object]
-) -> dict[str, Any]:
-    """Prepare, train for some steps and map each flight; store seconds, memory and disk in RUNS/cost.json.
+def cost(
+    flights: Positional[tuple[Path, ...]] = (),
+    work: Path = Path("runs/cost"),
+    runs: Path = MEASURED,
+    out: Path = Path("docs/cost.md"),
+    photographs: int | None = None,
+    megapixels: float = 20.0,
+    cells: float = 0.0,
+    minutes: float = 10.0,
+    cores: int = 2,
+    gpus: int = 0,
+    machines: int = 1,
+    device: Literal["cpu", "cuda"] = "cpu",
+) -> None:
+    """Measure flights, and write the page or answer for one survey.
 
     Args:
-        flights: folders of `python -m benchmarks flight`, at least five, of different numbers and sizes of photographs.
-        work: folder for the scenes, runs and maps; those of a flight that is measured are made anew.
-        runs: folder of the record; what it holds is not measured again.
-        device: of training and maps.
-        say: reports progress.
+        flights: Folders of `python -m benchmarks flight` to prepare, train on and map first (minutes each).
+        work: Folder for their scenes, runs and maps.
+        runs: Store the figures in this folder's cost.json; what it holds is not measured again.
+        out: The Markdown file to write; replaced if it is there.
+        photographs: Answer for a survey of so many, and write no page.
+        megapixels: Of each photograph.
+        cells: Of its map.
+        minutes: Of training.
+        cores: Of each machine.
+        gpus: Of each machine; expects measurements with --device cuda.
+        machines: That make the map.
+        device: Where flights are trained on and mapped.
+    """
+    record = measure_costs(flights, work, runs, device)
+    if photographs is None:
+        write_page(runs, out)
+        say(out)
+        return
+    model = fit_model(list(record["measured"].values()), "cuda" if gpus else "cpu")
+    asked = "the survey", Survey(photographs, megapixels, cells, minutes), Machines(cores, gpus, machines)
+    show([estimate_table(model, [asked])])
+
+
+def measure_costs(flights: Sequence[Path], work: Path, runs: Path, device: str) -> dict[str, Any]:
+    """Prepare, train for some steps and map each flight; store seconds, memory and disk in RUNS/cost.json.
+
+    A model needs at least five, of different numbers and sizes of photographs. Scenes, runs and maps of a flight that
+    is measured are made anew.
     """
     record = read_json(runs / COST_FILE) or {"measured": {}}
     for flight in flights:

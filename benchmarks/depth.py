@@ -7,7 +7,7 @@ The baseline is the surface that interpolates the triangulated points in the vie
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.maps import errors
-from benchmarks.records import store
+from benchmarks.records import MEASURED, say, show, store
+from tidefield.compare.run import make_flat
 from tidefield.compare.tables import Table
+from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen, surface_depth, surface_points
-from tidefield.files import completed_folder, read_json
+from tidefield.device import choose_device
+from tidefield.files import read_json
+from tidefield.methods import zero_shot
 from tidefield.model.rendering import Render
+from tidefield.synthetic import CATEGORIES
 from tidefield.synthetic.write import VEGETATION
+from tidefield.train.checkpoint import given_or_shipped, weights_sha256
 
 DEPTH_FILE = "depth.json"
 STEEP = 0.25
@@ -34,32 +40,30 @@ BASELINE_M = 0.5
 """Distance over which slopes are taken: that of a bank, not of a ripple."""
 
 
-def measure_depth(
-    work: Path,
-    runs: Path,
-    categories: Sequence[str],
-    width: int,
-    views: int,
-    seed: int,
-    open_scene: Callable[[Scene], Render],
-    about: dict[str, Any],
-    say: Callable[[str], object],
+def depth(
+    work: Path = Path("runs/depth"),
+    runs: Path = MEASURED,
+    categories: tuple[str, ...] = tuple(CATEGORIES),
+    width: int = 800,
+    views: int = 24,
+    seed: int = 61,
+    weights: Path | None = None,
+    device: str = "auto",
 ) -> dict[str, Any]:
     """Render held-out views of a flat of each category and compare their depths; what was measured is kept.
 
     Args:
-        work: folder for the flats.
-        runs: folder for depth.json.
-        categories: of flats.
-        width: of the photographs, pixels.
-        views: photographs of each survey.
-        seed: of the flats.
-        open_scene: makes the method from a scene.
-        about: the method, for the record; figures of another one are measured again.
-        say: reports progress.
+        work: Folder for the flats.
+        runs: Store the figures in this folder's depth.json; what it holds is not measured again.
+        categories: Of flats.
+        width: Of the photographs in pixels.
+        views: Photographs of each survey.
+        seed: Of the flats.
+        weights: Of `tidefield pretrain`; those that came with Tidefield if not given.
+        device: auto, cpu, cuda, cuda:N or mps.
     """
-    from tidefield.synthetic import make_survey, write_survey
-
+    where, file = choose_device(device), given_or_shipped(weights, "swift")
+    about = {"preset": "swift", "weights": weights_sha256(file)}
     record = read_json(runs / DEPTH_FILE)
     if record is None or record["method"] != about:
         record = {"figures": {}, "method": about}
@@ -68,15 +72,14 @@ def measure_depth(
         if name in record["figures"]:
             continue
         folder = work / f"{category}_{width}_{views}_{seed}"
-        if not folder.exists():
-            say(f"{name}: photographs")
-            with completed_folder(folder) as partial:
-                write_survey(make_survey(category, seed=seed, views=views, width=width), partial)
+        say(f"{name}: photographs")
+        make_flat(folder, category, seed, views, width)
         say(f"{name}: depths")
         scene = load_scene(folder)
-        record["figures"][name] = compare_depths(scene, open_scene(scene))
+        record["figures"][name] = compare_depths(scene, zero_shot(PRESETS["swift"], file, scene, where)[0])
         command = f"python -m benchmarks depth --width {width} --views {views} --seed {seed}"
         store(runs / DEPTH_FILE, record, record["figures"][name], record["figures"].values(), command)
+    show(tables(record))
     return record
 
 

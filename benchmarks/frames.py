@@ -14,19 +14,23 @@ import math
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from tyro.conf import Positional
 
+from benchmarks.records import HiddenRunner, show
 from tidefield.compare.run import Runner, run_measured, tidefield
+from tidefield.compare.tables import Table
 from tidefield.config import PRESETS
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.device import choose_device
 from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
 from tidefield.machine import describe
@@ -45,45 +49,68 @@ FLIGHT_FRAMES = 240
 """Of a flight past all photographs, ten seconds long."""
 
 
-def measure_frames(
-    folder: Path,
+def frames(
+    scene: Positional[Path],
     runs: Path,
-    preset: Literal["swift", "paper"],
-    given: Path | None,
-    device: str,
-    size_px: tuple[int, int],
-    run: Runner = run_measured,
+    preset: Literal["swift", "paper"] = "swift",
+    weights: Path | None = None,
+    width: int = 800,
+    height: int = 600,
+    device: str = "cpu",
+    run: HiddenRunner = run_measured,
 ) -> dict[str, Any]:
-    """Measure all of it for the scene in a folder, store it as RUNS/frames.json and return it.
+    """Measure all of it for a scene, print, store and return it.
 
-    `given` are the network's weights; those that came with Tidefield if None. `run` runs a command.
+    Args:
+        scene: The scene, a survey.
+        runs: Store the figures in this folder's frames.json.
+        preset: Which network.
+        weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
+        width, height: Of the views, in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+        run: Runs a command.
     """
-    scene, weights = load_scene(folder), given_or_shipped(given, preset)
-    name = scene.names[(scene.test or scene.train)[0]]
-    first = _first(folder, name, preset, weights, device, size_px, runs, run)
-    where, named = torch.device(device), "" if given is None else " --weights WEIGHTS"
+    loaded, file, where = load_scene(scene), given_or_shipped(weights, preset), choose_device(device)
+    name = loaded.names[(loaded.test or loaded.train)[0]]
+    first = _first(scene, name, preset, file, str(where), (width, height), runs, run)
+    named = "" if weights is None else " --weights WEIGHTS"
 
     def view_of(other: Scene) -> Render:
-        return zero_shot(PRESETS[preset], weights, other, where)[0]
+        return zero_shot(PRESETS[preset], file, other, where)[0]
 
-    width, height = size_px
-    flight = make_trajectory("cameras", scene, frames=FLIGHT_FRAMES, width=width, height=height).cameras
+    flight = make_trajectory("cameras", loaded, frames=FLIGHT_FRAMES, width=width, height=height).cameras
     middle = len(flight) // 2
     shown = flight[middle : middle + 1]
     record = {
         "preset": preset,
-        "device": device,
+        "device": str(where),
         "size_px": [width, height],
-        "photographs": len(scene.names),
+        "photographs": len(loaded.names),
         "first": first,
-        "further_seconds": _further(view_of(scene), flight[middle : middle + FURTHER + 1]),
-        "by_photographs": _by_photographs(view_of, scene, shown),
+        "further_seconds": _further(view_of(loaded), flight[middle : middle + FURTHER + 1]),
+        "by_photographs": _by_photographs(view_of, loaded, shown),
         "command": f"python -m benchmarks frames SCENE --runs RUNS --preset {preset}{named} --width {width} "
-        f"--height {height} --device {device}",
+        f"--height {height} --device {where}",
         **describe(),
     }
     write_json(runs / FRAMES_FILE, record)
+    show(frame_tables(record))
     return record
+
+
+def frame_tables(frames: Mapping[str, Any]) -> list[Table]:
+    """Seconds of views."""
+    (width, height), first = frames["size_px"], frames["first"]
+    rows = [
+        ("the first, from the scene on disk, start of the program included", f"{first['seconds']:.1f}"),
+        ("each further view along a flight, median", f"{frames['further_seconds']:.2f}"),
+        *(
+            (f"the same view repeatedly, of a survey of {count} photographs", f"{seconds:.2f}")
+            for count, seconds in frames["by_photographs"].items()
+        ),
+    ]
+    title = f"Zero-shot views of {width} x {height} px, {frames['preset']}, {frames['device']}"
+    return [Table(title, ["view", "seconds"], rows)]
 
 
 def _first(

@@ -19,7 +19,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -29,7 +29,9 @@ from random import Random
 from typing import Any
 from unittest.mock import patch
 
-from benchmarks.readers import Reader, make_seeds
+from benchmarks.readers import READERS, Reader, make_seeds
+from benchmarks.records import say, show
+from tidefield.compare.tables import Table
 from tidefield.errors import RunError, TidefieldError
 from tidefield.files import write_json
 from tidefield.machine import describe
@@ -54,25 +56,47 @@ class Count:
     findings: dict[str, int] = field(default_factory=dict)
 
 
+def fuzz(
+    minutes: float = 10.0,
+    runs: Path | None = None,
+    kept: Path = Path("runs/fuzz"),
+    readers: tuple[str, ...] = (),
+    seed: int = 0,
+) -> None:
+    """Give damaged files to readers, and print what happened.
+
+    Args:
+        minutes: For all readers together, each for the same time.
+        runs: Store the counts in this folder's fuzz.json.
+        kept: Folder for the findings: the files and their tracebacks.
+        readers: Names of readers, as the table shows them; all if not given.
+        seed: Of the damage.
+
+    Raises:
+        RunError: there are findings, a reader is not known, or some readers' counts would be stored as all.
+    """
+    if readers and runs is not None:
+        raise RunError("--readers was given with --runs: the record is of all readers; leave one of them out")
+    names = [reader.name for reader in READERS]
+    unknown = next((name for name in readers if name not in names), None)
+    if unknown is not None:
+        raise RunError(f"there is no reader {unknown!r}: expected one of {'; '.join(names)}; choose one of these")
+    chosen = [reader for reader in READERS if not readers or reader.name in readers]
+    counts = measure_fuzz(chosen, minutes, seed, kept, runs)
+    show([fuzz_table({name: vars(count) for name, count in counts.items()})])
+    if any(count.findings for count in counts.values()):
+        raise RunError(f"there are findings: expected none; their files and tracebacks are in {kept}")
+
+
 def measure_fuzz(
     readers: Sequence[Reader],
     minutes: float,
     seed: int,
     kept: Path,
     runs: Path | None,
-    say: Callable[[str], object],
     seeds: Callable[[Path], object] = make_seeds,
 ) -> dict[str, Count]:
-    """Damage files of every reader for an equal time, and count what happens.
-
-    Args:
-        readers: of files.
-        minutes: for all of them together.
-        seed: of the damage.
-        kept: folder for the findings: the file, its traceback and what it was a damage of.
-        runs: folder of the record, RUNS/fuzz.json; None for none.
-        say: reports progress.
-        seeds: writes the whole files.
+    """Damage files of every reader for an equal time, and count what happens; `seeds` writes the whole files.
 
     Raises:
         RunError: a reader does not accept its whole files.
@@ -94,6 +118,24 @@ def measure_fuzz(
         command = f"python -m benchmarks fuzz --minutes {minutes:g} --seed {seed}"
         write_json(runs / FUZZ_FILE, {"command": command, "readers": record, **describe()})
     return counts
+
+
+def fuzz_table(readers: Mapping[str, Mapping[str, Any]]) -> Table:
+    """What happened to the damaged files of every reader, and of all."""
+    rows = [
+        (
+            name,
+            *(f"{count[key]:,}" for key in ("files", "accepted", "refused")),
+            str(sum(count["findings"].values())),
+            f"{count['slowest_seconds']:.2f}",
+        )
+        for name, count in readers.items()
+    ]
+    sums = [sum(count[key] for count in readers.values()) for key in ("files", "accepted", "refused")]
+    found = sum(sum(count["findings"].values()) for count in readers.values())
+    slowest = max((count["slowest_seconds"] for count in readers.values()), default=0.0)
+    rows.append(("all", *(f"{total:,}" for total in sums), str(found), f"{slowest:.2f}"))
+    return Table("Damaged files", ["reader", "files", "accepted", "refused", "findings", "slowest, s"], rows)
 
 
 def _fuzz(reader: Reader, seconds: float, seed: int, worker: _Worker, kept: Path, count: Count) -> None:

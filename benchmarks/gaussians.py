@@ -7,7 +7,7 @@ covered where the Gaussians stop at least half of the light; all other pixels co
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -19,14 +19,17 @@ import torch
 from jaxtyping import Bool
 from rich.console import Console
 from torch import Tensor
+from tyro.conf import Positional
 
-from benchmarks.records import NETWORK, distinct_names, network_of, require_same, store
+from benchmarks.records import MEASURED, NETWORK, network_of, require_same, say, show, store
 from tidefield.baselines.splats import read_splats, render_splats
 from tidefield.commands.common import ZeroShot, open_source
+from tidefield.compare.run import named
 from tidefield.compare.tables import Table
 from tidefield.config import Sampling
 from tidefield.data.load import at_width
 from tidefield.data.scene import Scene
+from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.evaluation.metrics import Image8, flip_map, psnr, ssim_map
 from tidefield.files import read_json
@@ -49,23 +52,27 @@ WAYS: Mapping[str, Choice] = {
 """Ways to choose points; the last one is that of `tidefield export`."""
 
 
-def measure_gaussians(
-    sources: Sequence[Path], runs: Path, widths: Iterable[int], device: torch.device, say: Callable[[str], object]
+def gaussians(
+    sources: Positional[tuple[Path, ...]],
+    runs: Path = MEASURED,
+    widths: tuple[int, ...] = (400,),
+    device: str = "auto",
 ) -> dict[str, Any]:
     """Export runs, or scenes with the trained weights, and measure their Gaussians; what was measured is kept.
 
     Args:
-        sources: folders of runs, or of scenes.
-        runs: folder for gaussians.json.
-        widths: of the exported views and of the photographs that they are compared with, pixels.
-        device: to render on.
-        say: reports progress.
+        sources: Runs, or scenes for the trained weights.
+        runs: Store the figures in this folder's gaussians.json, after each; what it holds is not measured again.
+        widths: Of the views that are exported and of the photographs, in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
 
     Raises:
-        RunError: a source holds no photograph out, two have one name, or a figure that is kept is of other weights.
+        SceneError: two sources have one name.
+        RunError: a source holds no photograph out, or a figure that is kept is of other weights.
     """
+    where = choose_device(device)
     record = read_json(runs / GAUSSIANS_FILE) or {"figures": {}}
-    for name, source in distinct_names(sources).items():
+    for name, source in named(sources).items():
         network, missing = {NETWORK: network_of(source)}, []
         for width in widths:
             kept = record["figures"].get(f"{name}, {width} px")
@@ -79,17 +86,18 @@ def measure_gaussians(
         if not missing:
             continue
         zero = ZeroShot(zero_shot=not (source / RUN_FILE).exists())
-        opened = open_source(source, zero, device, False, Console(quiet=True), Sampling(rays_per_side=1))
+        opened = open_source(source, zero, where, False, Console(quiet=True), Sampling(rays_per_side=1))
         with opened as (scene, render, about):
             if not scene.test:
                 raise RunError(f"{source} holds no photograph out: expected at least one to compare with; add some")
             for width in missing:
                 say(f"{name}, {width} px")
-                found = compare_ways(scene, render, width, device)
+                found = compare_ways(scene, render, width, where)
                 method = {key: about.get(key) for key in ("preset", "weights", "run")} | network
                 new = record["figures"][f"{name}, {width} px"] = {"ways": found, "method": method}
                 command = "python -m benchmarks gaussians SCENE|RUN..."
                 store(runs / GAUSSIANS_FILE, record, new, record["figures"].values(), command)
+    show(tables(record))
     return record
 
 

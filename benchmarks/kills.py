@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.records import MEASURED, say
+from tidefield.compare.tables import Table
 from tidefield.errors import RunError
 from tidefield.files import file_sha256, read_json, write_json
 from tidefield.machine import describe
@@ -58,27 +60,29 @@ class Job:
     content: Callable[[Path], Content]
 
 
-def measure_kills(
-    runs: Path, counts: Mapping[str, int], seed: int, say: Callable[[str], object]
+def kills(
+    runs: Path = MEASURED, train: int = 20, prepare: int = 10, compare: int = 10, seed: int = 0
 ) -> dict[str, dict[str, Any]]:
-    """Kill every command that often, store the counts as RUNS/kills.json and return them.
+    """Kill every command that often, store the counts and return them.
 
     Args:
-        runs: folder of the record.
-        counts: how often, by command.
-        seed: of the moments.
-        say: reports progress.
+        runs: Store the counts in this folder's kills.json.
+        train: How often `tidefield train` is killed.
+        prepare: How often `tidefield prepare`.
+        compare: How often `tidefield compare`.
+        seed: Of the moments.
 
     Raises:
         RunError: a command failed, a result was another one, or something was left behind.
     """
+    counts = {"train": train, "prepare": prepare, "compare": compare}
     moments, record = random.Random(seed), {}
     with tempfile.TemporaryDirectory(prefix="kills-") as folder:
         work = Path(folder)
         environment = {**os.environ, "XDG_CACHE_HOME": str(work / "cache")}
         for name, job in _jobs(work).items():
             if counts[name]:
-                record[name] = _kill(job, name, counts[name], work, environment, moments, say)
+                record[name] = _kill(job, name, counts[name], work, environment, moments)
                 # After each, as the whole takes long and may be interrupted.
                 done = " ".join(f"--{name} {record[name]['kills'] if name in record else 0}" for name in counts)
                 command = f"python -m benchmarks kills {done} --seed {seed}"
@@ -89,7 +93,17 @@ def measure_kills(
             f"{' and '.join(bad)} did not recover from every kill: expected the same result and nothing left; see "
             f"{runs / KILLS_FILE}"
         )
+    for name, of in record.items():
+        say(f"{name}: {of['identical']} of {of['kills']} identical")
     return record
+
+
+def kills_table(kills: Mapping[str, Mapping[str, Any]]) -> Table:
+    """What killed commands completed when they were repeated, and what they left behind."""
+    keys = ("kills", "identical", "processes", "files")
+    rows = [(f"tidefield {name}", *(str(record[key]) for key in keys)) for name, record in kills.items()]
+    columns = ["command", "kills", "identical results", "processes left", "partial files left"]
+    return Table("Killed commands", columns, rows)
 
 
 def _jobs(work: Path) -> dict[str, Job]:
@@ -125,7 +139,6 @@ def _kill(
     work: Path,
     environment: Mapping[str, str],
     moments: random.Random,
-    say: Callable[[str], object],
 ) -> dict[str, Any]:
     """Kill one command several times; returns the counts."""
     start = time.perf_counter()

@@ -10,13 +10,15 @@ import os
 import re
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import numpy as np
+from tyro.conf import Positional
 
+from benchmarks.records import MEASURED, say
 from tidefield.compare.run import tidefield
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_json
@@ -91,35 +93,34 @@ def _usage(root: int) -> tuple[int, float]:
     return memory, cpu
 
 
-def measure_flight(
-    flight: Path,
-    scene: Path,
-    runs: Path,
-    name: str,
-    options: Sequence[str] = (),
+def large(
+    flights: Positional[tuple[Path, ...]],
+    work: Path,
+    runs: Path = MEASURED,
+    options: tuple[str, ...] = (),
     threads: int = 1,
-    say: Callable[[str], object] = print,
-) -> dict[str, Any]:
-    """Prepare a flight, and store what it cost and how far the cameras are from the truth in RUNS/large.json.
+) -> None:
+    """Prepare flights, and store what it cost and how far the cameras are from the truth.
 
     Args:
-        flight: of `make_large_flight`.
-        scene: a new folder.
-        runs: folder of the record.
-        name: of the measurement; an earlier one of this name is kept.
-        options: of `tidefield prepare`.
-        threads: of each process.
-        say: reports progress.
+        flights: Their folders.
+        work: Folder for the scenes.
+        runs: Store the figures in this folder's large.json; what is measured is not measured again.
+        options: Of `tidefield prepare`, without their dashes, such as mapper=global.
+        threads: Of each process.
     """
+    words = [word for option in options for word in f"--{option}".split("=", 1)]
     record = read_json(runs / LARGE_FILE) or {"measured": {}}
-    if name in record["measured"]:
-        return record["measured"][name]
-    say(f"{name}: prepare")
-    stages = run_by_stage(tidefield("prepare", flight / "photographs", scene, *options), threads)
-    found = {"stages": stages, "options": list(options), "threads": threads, **compare_with_truth(flight, scene)}
-    record["measured"][name] = {**found, **describe()}
-    write_json(runs / LARGE_FILE, record)
-    return record["measured"][name]
+    for flight in flights:
+        name = " ".join([flight.resolve().name, *options])
+        if name not in record["measured"]:
+            say(f"{name}: prepare")
+            scene = work / name.replace(" ", "_")
+            stages = run_by_stage(tidefield("prepare", flight / "photographs", scene, *words), threads)
+            found = {"stages": stages, "options": words, "threads": threads, **compare_with_truth(flight, scene)}
+            record["measured"][name] = {**found, **describe()}
+            write_json(runs / LARGE_FILE, record)
+        say("\n".join([name, *lines(record["measured"][name])]))
 
 
 def compare_with_truth(flight: Path, scene: Path) -> dict[str, Any]:

@@ -13,16 +13,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from tyro.conf import Positional
 
 from benchmarks.maps import errors
+from benchmarks.records import show
 from tidefield.compare.tables import Table
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import at_width, load_scene
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError
+from tidefield.files import write_json
 from tidefield.machine import describe
 from tidefield.maps.grid import Grid, Tile, ground_sampling_distance, make_grid, map_frame
-from tidefield.maps.surface import COARSEST, GreyPhotographs, match, sparse_surface
+from tidefield.maps.surface import COARSEST, match, sparse_surface
+from tidefield.maps.views import GreyPhotographs
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
 
 SIDE = 96
@@ -31,16 +35,24 @@ BAR_M = 0.05
 """The RMSE of heights should be below this and one ground sampling distance."""
 
 
-def measure_control(root: Path, control: Path) -> dict[str, Any]:
-    """Measure the surface at each point of a prepared scene's gcp_list.txt.
+def map_control(scene: Positional[Path], control: Positional[Path], runs: Path = Path("runs/maps")) -> dict[str, Any]:
+    """Measure the surface at each point of a prepared scene's gcp_list.txt, print, store and return it.
 
     Args:
-        root: the scene.
-        control: the file it was prepared with.
+        scene: A scene that was prepared with ground control.
+        control: Its gcp_list.txt.
+        runs: Folder for map_control.json.
 
     Raises:
         RunError: the scene has no ground control.
     """
+    record = _measure(scene, control)
+    show(tables(record))
+    write_json(runs / "map_control.json", record)
+    return record
+
+
+def _measure(root: Path, control: Path) -> dict[str, Any]:
     georeference = read_georeference(root)
     if georeference is None or georeference.frame is None or not georeference.check.names:
         raise RunError(f"{root} has no ground control that was left out: expected a scene prepared with a gcp_list.txt")

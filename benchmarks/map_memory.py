@@ -9,17 +9,21 @@ from __future__ import annotations
 import os
 import resource
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tyro.conf import Positional
+
+from benchmarks.records import say
+from tidefield.commands.common import ZeroShot, open_zero_shot
 from tidefield.data.load import load_scene
+from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.files import write_json
-from tidefield.machine import describe
+from tidefield.machine import describe, peak_bytes
 from tidefield.maps.grid import Grid, make_grid, map_frame
 from tidefield.maps.make import DSM, TILES, Job, TileMaker, finish_map, make_missing, tile_file
 
@@ -27,38 +31,30 @@ SQUARE = "square"
 """Folder of the map."""
 
 
-def measure_memory(
-    scene_folder: Path, runs: Path, metres: float, cell: float, say: Callable[[str], object]
+def map_memory(
+    scene: Positional[Path], runs: Path = Path("runs/maps"), metres: float = 1000.0, cell: float = 0.05
 ) -> dict[str, Any]:
-    """Map a square that repeats a scene's middle, and store the peak memory of this process in map_memory.json.
-
-    The map is deleted afterwards.
+    """Map a square that repeats a scene's middle, store the peak memory of this process and return what was measured.
 
     Args:
-        scene_folder: a scene in metres.
-        runs: folder for the map, some 40 bytes a cell.
-        metres: side of the square.
-        cell: side of a cell, metres.
-        say: reports progress.
+        scene: A scene in metres, such as one of those that maps makes.
+        runs: Folder for the map, which is deleted afterwards, and for map_memory.json.
+        metres: Side of the square.
+        cell: Side of a cell, metres.
 
     Raises:
         RunError: the folder is there, or the scene is too small for four tiles.
     """
-    from tidefield.commands.common import ZeroShot, open_zero_shot
-    from tidefield.device import choose_device
-
     out, few = runs / SQUARE, runs / f"{SQUARE}_tiles"
     if out.exists() or few.exists():
         raise RunError(f"{out} or {few} is there already: expected a new folder; delete them, or choose another --runs")
-    scene = load_scene(scene_folder, hold_out=False)
-    render, record = open_zero_shot(ZeroShot(zero_shot=True), scene, choose_device("cpu"))
-    grid = make_grid(map_frame(scene, None), scene, cell)
-    job = Job(scene, grid, None, False, {})
+    loaded = load_scene(scene, hold_out=False)
+    render, record = open_zero_shot(ZeroShot(zero_shot=True), loaded, choose_device("cpu"))
+    grid = make_grid(map_frame(loaded, None), loaded, cell)
+    job = Job(loaded, grid, None, False, {})
     side = job.tiles()[0].side - 2 * job.tiles()[0].margin
     if min(grid.columns, grid.rows) < 2 * side:
-        raise RunError(
-            f"{scene_folder} has {grid.columns} x {grid.rows} cells: expected at least {2 * side} on each side"
-        )
+        raise RunError(f"{scene} has {grid.columns} x {grid.rows} cells: expected at least {2 * side} on each side")
     west = grid.west + (grid.columns // 2 - side) * grid.cell
     north = grid.north - (grid.rows // 2 - side) * grid.cell
     middle = replace(job, grid=replace(grid, west=west, north=north, columns=2 * side, rows=2 * side))
@@ -82,13 +78,13 @@ def measure_memory(
         return _Quiet()
 
     started = time.monotonic()
-    made = finish_map(large, out, {"scene": scene_folder.name, "method": record}, bar)
+    made = finish_map(large, out, {"scene": scene.name, "method": record}, bar)
     result = {
         "square_metres": made["area"],
         "cells": made["cells"],
         "points": made["points"],
         "cell_m": cell,
-        "photographs": len(scene.names),
+        "photographs": len(loaded.names),
         "peak_memory_bytes": _peak(),
         "peak_memory_tiles_bytes": tiles_bytes,
         "tile_seconds": tiles_seconds / 4,
@@ -100,6 +96,11 @@ def measure_memory(
     shutil.rmtree(out)
     shutil.rmtree(few)
     write_json(runs / "map_memory.json", result)
+    say(
+        f"{result['square_metres']:,.0f} m2, {result['cells']:,} cells of {100 * cell:g} cm, {result['points']:,} "
+        f"points: peak memory {result['peak_memory_bytes'] / 1e9:.2f} GB, {result['seconds']:.0f} s after the tiles, "
+        f"{result['tile_seconds']:.0f} s a tile, {result['disk_bytes'] / 1e9:.1f} GB of files"
+    )
     return result
 
 
@@ -115,5 +116,4 @@ class _Quiet:
 
 def _peak() -> int:
     """Largest resident memory of this process so far, bytes."""
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
+    return peak_bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

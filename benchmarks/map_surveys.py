@@ -6,11 +6,13 @@ lie from those, and how precise it is, its own standard error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from tyro.conf import Positional
+
 from benchmarks.maps import made_map
+from benchmarks.records import say, show
 from tidefield.compare.tables import Table
 from tidefield.files import read_json, write_json
 from tidefield.machine import describe
@@ -23,18 +25,17 @@ PUBLISHED = (
 and Y joined here. A developer tried settings of SIFT on the original photographs."""
 
 
-def measure_surveys(scenes: Sequence[Path], out: Path, say: Callable[[str], object]) -> dict[str, Any]:
+def map_surveys(scenes: Positional[tuple[Path, ...]], runs: Path = Path("runs/map_surveys")) -> None:
     """Map surveys that `tidefield prepare` made, and read what both commands recorded of themselves.
 
     Args:
-        scenes: of `tidefield prepare`.
-        out: folder for the maps and map_surveys.json.
-        say: reports progress.
+        scenes: Scenes of tidefield prepare; times are those of the same machine if it was prepared there.
+        runs: Folder for the maps and map_surveys.json.
     """
     record: dict[str, Any] = {**describe(), "surveys": {}}
     for scene in scenes:
         say(f"{scene.name}: map")
-        made, prepared = made_map(scene, out / scene.name), read_json(scene / "report.json")
+        made, prepared = made_map(scene, runs / scene.name), read_json(scene / "report.json")
         assert prepared is not None, f"{scene} is not of `tidefield prepare`"
         errors = prepared["gps_errors"]
         record["surveys"][scene.name] = {
@@ -48,8 +49,8 @@ def measure_surveys(scenes: Sequence[Path], out: Path, say: Callable[[str], obje
             "prepare_seconds": prepared["processing_statistics"]["steps_times"]["Total Time"],
             "map_seconds": made["seconds"],
         }
-    write_json(out / "map_surveys.json", record)
-    return record
+    write_json(runs / "map_surveys.json", record)
+    show([table(record)])
 
 
 def table(record: dict[str, Any]) -> Table:

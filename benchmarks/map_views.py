@@ -7,64 +7,53 @@ photograph's by an affine function, because its exposure is not known to the map
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from tyro.conf import Positional
 
-from benchmarks.maps import _whole, made_map, write_square
+from benchmarks.maps import made_map, read_map, whole, write_square
+from benchmarks.records import say, show
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.evaluation.metrics import fit_colours, flip_map, ssim_map
 from tidefield.files import completed_folder, write_json
 from tidefield.machine import describe
-from tidefield.maps.grid import Grid, map_frame
-from tidefield.maps.make import DSM, ORTHOPHOTO
-from tidefield.maps.surface import COARSEST, View, sparse_surface
+from tidefield.maps.grid import Grid
+from tidefield.maps.views import View
 
 ROUNDS = 30
 """A ray's height is taken from the surface where it was last, so often."""
 
 
-def measure_views(root: Path, out: Path, half_m: float, say: Callable[[str], object]) -> dict[str, Any]:
+def map_views(scene: Positional[Path], runs: Path = Path("runs/map_views"), half: float = 6.0) -> None:
     """Map the middle of a built-in flat without its most central photograph, and compare with that.
 
     Args:
-        root: the scene.
-        out: folder for a copy without the photograph, the map, pictures and map_views.json.
-        half_m: half the side of the square that is mapped.
-        say: reports progress.
+        scene: A built-in flat, such as one of those that maps makes.
+        runs: Folder for the map and map_views.json.
+        half: Half the side of the square that is mapped, metres.
     """
-    import rasterio
-
-    scene = load_scene(root, hold_out=False)
-    position = (scene.cameras.position_world.double() + scene.origin_world.double()).numpy()
+    loaded = load_scene(scene, hold_out=False)
+    position = (loaded.cameras.position_world.double() + loaded.origin_world.double()).numpy()
     left_out = int(np.linalg.norm(position[:, :2], axis=1).argmin())
-    name = scene.names[left_out]
-    if not (out / "scene").exists():
-        with completed_folder(out / "scene") as partial:
-            shutil.copytree(root / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
-            shutil.copytree(root / "sparse", partial / "sparse")
+    name = loaded.names[left_out]
+    if not (runs / "scene").exists():
+        with completed_folder(runs / "scene") as partial:
+            shutil.copytree(scene / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
+            shutil.copytree(scene / "sparse", partial / "sparse")
     say(f"map without {name}")
-    made_map(out / "scene", out / "map", area=write_square(out, half_m), allow_missing=True)
-    with rasterio.open(out / "map" / DSM) as dataset:
-        height = dataset.read(1, masked=True).filled(np.nan)
-        transform = dataset.transform
-    with rasterio.open(out / "map" / ORTHOPHOTO) as dataset:
-        colour = dataset.read([1, 2, 3]).transpose(1, 2, 0)
-    assert scene.points is not None
-    middle = float(np.nanmedian(height))
-    grid = Grid(map_frame(scene, None), transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
-    sparse = sparse_surface(scene, grid.coarser(COARSEST)).on(_whole(grid), 0)[: grid.rows, : grid.columns]
-    truth = scene.photographs[left_out]
-    view = View(scene.cameras[left_out], _whole(grid))
+    made_map(runs / "scene", runs / "map", area=write_square(runs, half), allow_missing=True)
+    grid, height, sparse, colour = read_map(loaded, runs / "map")
+    truth = loaded.photographs[left_out]
+    view = View(loaded.cameras[left_out], whole(grid))
     result: dict[str, Any] = {"photograph": name, "cell_m": grid.cell}
     known, shown = None, {}
     for method, surface in (("map", height), ("sparse points", sparse)):
-        warped, mask = warp(colour, surface - middle, view, grid)
+        warped, mask = warp(colour, surface - grid.height, view, grid)
         shown[method], known = warped, mask if known is None else known & mask
     assert known is not None
     rows, columns = np.nonzero(known)
@@ -72,15 +61,15 @@ def measure_views(root: Path, out: Path, half_m: float, say: Callable[[str], obj
     mask, photograph = torch.from_numpy(known[box]), truth[box]
     for method, picture in shown.items():
         fitted = fit_colours(torch.from_numpy(picture[box]), photograph, mask)
-        cv2.imwrite(str(out / f"{method.split()[0]}.png"), cv2.cvtColor(fitted.numpy(), cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(runs / f"{method.split()[0]}.png"), cv2.cvtColor(fitted.numpy(), cv2.COLOR_RGB2BGR))
         result[method] = {
             "ssim": float(ssim_map(fitted, photograph)[mask].mean()),
             "flip": float(flip_map(fitted, photograph)[mask].mean()),
         }
-    cv2.imwrite(str(out / "photograph.png"), cv2.cvtColor(photograph.numpy(), cv2.COLOR_RGB2BGR))
+    cv2.imwrite(str(runs / "photograph.png"), cv2.cvtColor(photograph.numpy(), cv2.COLOR_RGB2BGR))
     result |= {"pixels": int(mask.sum()), **describe()}
-    write_json(out / "map_views.json", result)
-    return result
+    write_json(runs / "map_views.json", result)
+    show([table(result)])
 
 
 def warp(colour: np.ndarray, height: np.ndarray, view: View, grid: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -6,14 +6,14 @@ prepared scenes, one of each survey and mapper; what is measured is not repeated
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
-from benchmarks.records import store
-from benchmarks.surveys import photographs_of
-from tidefield.compare.run import Runner, tidefield
+from benchmarks.records import MEASURED, HiddenRunner, say, show, store
+from benchmarks.surveys import SURVEYS, photographs_of
+from tidefield.compare.run import run_measured, tidefield
 from tidefield.compare.tables import NOTHING, Table
 from tidefield.files import read_json
 from tidefield.survey.sfm.mapping import Mapper
@@ -23,25 +23,28 @@ AXES = ("horizontal", "vertical")
 RESIDUALS = {"gps": "GPS", "check": "control points left out in turn"}
 
 
-def measure_mappers(
-    photographs: Path, work: Path, runs: Path, surveys: Sequence[str], run: Runner, say: Callable[[str], object]
+def mappers(
+    photographs: Path,
+    work: Path,
+    runs: Path = MEASURED,
+    names: tuple[str, ...] = SURVEYS,
+    run: HiddenRunner = run_measured,
 ) -> dict[str, Any]:
     """Prepare each survey with each mapper.
 
     Args:
-        photographs: folder with the surveys' folders.
-        work: folder for scenes.
-        runs: folder of mappers.json.
-        surveys: their names.
-        run: runs a command.
-        say: reports progress.
+        photographs: Folder with the surveys' folders.
+        work: Folder for the prepared scenes.
+        runs: Store the figures in this folder's mappers.json; what it holds is not measured again.
+        names: Of the surveys.
+        run: Runs a command.
 
     Raises:
         SurveyError: a survey is missing.
         RunError: a command failed.
     """
     record = read_json(runs / MAPPERS_FILE) or {"surveys": {}}
-    for survey in surveys:
+    for survey in names:
         source = photographs_of(survey, photographs)
         for mapper in get_args(Mapper):
             measured = record["surveys"].setdefault(survey, {})
@@ -55,6 +58,7 @@ def measure_mappers(
             measured[mapper] = {**asdict(usage), **_facts(report)}
             figures = [one for of in record["surveys"].values() for one in of.values()]
             store(runs / MAPPERS_FILE, record, measured[mapper], figures, "python -m benchmarks mappers")
+    show([table(record)])
     return record
 
 

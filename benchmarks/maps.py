@@ -8,22 +8,25 @@ exact poses, as the map does.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from benchmarks.records import store
+from benchmarks.records import say, show, store
+from tidefield.compare.run import make_flat
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
-from tidefield.files import completed_folder, read_json, write_json
+from tidefield.files import read_json, write_json
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
-from tidefield.maps.grid import Grid, map_frame
+from tidefield.maps.grid import Grid, Tile, map_frame
 from tidefield.maps.make import CLASSES, DSM, DTM, MAP_FILE, ORTHOPHOTO, SIGMA
+from tidefield.maps.rasters import need, read_raster
 from tidefield.maps.surface import COARSEST, sparse_surface
+from tidefield.synthetic import CATEGORIES
 
 MAPS_FILE = "maps.json"
 SEED = 41
@@ -33,39 +36,38 @@ BASE = (0.12, 0.45)
 """Least and largest base of a pair, as a share of the height."""
 
 
-def measure_maps(
-    runs: Path, categories: Sequence[str], width: int, views: int, half_m: float, say: Callable[[str], object]
-) -> dict[str, Any]:
+def maps(
+    runs: Path = Path("runs/maps"),
+    categories: tuple[str, ...] = tuple(CATEGORIES),
+    width: int = 2000,
+    views: int = 20,
+    half: float = 12.0,
+) -> None:
     """Map the middle of a flat of each category, and compare with the truth; what was measured is kept.
 
     Args:
-        runs: folder for flats, maps and maps.json.
-        categories: of flats.
-        width: of the photographs, pixels.
-        views: photographs of each survey.
-        half_m: half the side of the square that is mapped.
-        say: reports progress.
+        runs: Folder for flats, maps and maps.json; what it holds is not measured again.
+        categories: Of flats.
+        width: Of the photographs in pixels.
+        views: Photographs of each survey.
+        half: Half the side of the square that is mapped, metres.
     """
-    from tidefield.synthetic import make_survey, write_survey
-
     record = read_json(runs / MAPS_FILE) or {"figures": {}}
-    area = write_square(runs, half_m)
+    area = write_square(runs, half)
     for category in categories:
         name = f"{category}, {width} px, {views} photographs"
         if name in record["figures"]:
             continue
         folder = runs / f"{category}_{width}_{views}"
-        if not (folder / "scene").exists():
-            say(f"{name}: photographs")
-            with completed_folder(folder / "scene") as partial:
-                write_survey(make_survey(category, seed=SEED, views=views, width=width), partial)
+        say(f"{name}: photographs")
+        make_flat(folder / "scene", category, SEED, views, width)
         say(f"{name}: map")
         made = made_map(folder / "scene", folder / "map", area=area)
         say(f"{name}: baselines")
         record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
-        command = f"python -m benchmarks maps --width {width} --views {views} --half {half_m:g}"
+        command = f"python -m benchmarks maps --width {width} --views {views} --half {half:g}"
         store(runs / MAPS_FILE, record, record["figures"][name], record["figures"].values(), command)
-    return record
+    show(tables(record))
 
 
 def write_square(folder: Path, half_m: float) -> Path:
@@ -96,32 +98,14 @@ def made_map(scene: Path, out: Path, **options: Any) -> dict[str, Any]:
 
 def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
     """Measure a map and the baselines against the truth of a built-in flat, on cells with a height in all of them."""
-    import rasterio
-
     scene = load_scene(root, hold_out=False)
-    with rasterio.open(out / DSM) as dataset:
-        height = dataset.read(1, masked=True).filled(np.nan)
-        transform = dataset.transform
-    with rasterio.open(out / SIGMA) as dataset:
-        sigma = dataset.read(1, masked=True).filled(np.nan)
-    with rasterio.open(out / DTM) as dataset:
-        terrain = dataset.read(1, masked=True).filled(np.nan)
-    with rasterio.open(out / ORTHOPHOTO) as dataset:
-        shown = dataset.read([1, 2, 3]).transpose(1, 2, 0).astype(np.float64)
-    assert scene.points is not None
-    middle = float(np.median(scene.points.xyz_world[:, 2].numpy()))
-    frame = map_frame(scene, None)
-    grid = Grid(frame, transform.c, transform.f, transform.a, height.shape[1], height.shape[0], middle)
+    grid, height, sparse, picture = read_map(scene, out)
+    (sigma, _), (terrain, _), (found_classes, _) = (read_raster(out / name) for name in (SIGMA, DTM, CLASSES))
     true, bare, colour, classes = _truth(root, grid)
-    with rasterio.open(out / CLASSES) as dataset:
-        found_classes = dataset.read(1)
-    # The grid of coarse cells begins at the same corner.
-    start = sparse_surface(scene, grid.coarser(COARSEST))
-    sparse = start.on(_whole(grid), 0)[: grid.rows, : grid.columns]
     stereo = semi_global(scene, grid)
     kept = np.isfinite(height) & np.isfinite(true) & np.isfinite(stereo)
     # The photographs' common exposure differs from the truth by a factor of each channel.
-    shown *= colour[kept].mean(0) / shown[kept].mean(0)
+    shown = picture * (colour[kept].mean(0) / picture[kept].mean(0))
     mse = ((shown[kept].clip(0, 255) - colour[kept]) ** 2).mean()
     found = {"map": height, "sparse points": sparse, "semi-global": stereo}
     return {
@@ -135,6 +119,23 @@ def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:
         "classes": overlaps(found_classes[kept], classes[kept]),
         "water": _levels(json.loads((out / MAP_FILE).read_text())["water"], true[kept & (classes == WATER)]),
     }
+
+
+def read_map(scene: Scene, out: Path) -> tuple[Grid, np.ndarray, np.ndarray, np.ndarray]:
+    """Read a map of a scene without a georeference.
+
+    Returns:
+        Its cells; their heights (rows x columns), NaN where there is none; those of the sparse points' surface; and the
+        orthophoto's colours (rows x columns x 3, 8 bits).
+    """
+    height, profile = read_raster(out / DSM)
+    with need("rasterio").open(out / ORTHOPHOTO) as dataset:
+        colour = dataset.read([1, 2, 3]).transpose(1, 2, 0)
+    at, (rows, columns) = profile["transform"], height.shape
+    grid = Grid(map_frame(scene, None), at.c, at.f, at.a, columns, rows, float(np.nanmedian(height)))
+    # The grid of coarse cells begins at the same corner.
+    sparse = sparse_surface(scene, grid.coarser(COARSEST)).on(whole(grid), 0)[:rows, :columns]
+    return grid, height, sparse, colour
 
 
 def overlaps(found: np.ndarray, true: np.ndarray) -> dict[str, dict[str, float | None]]:
@@ -165,9 +166,8 @@ def errors(error: np.ndarray) -> dict[str, float]:
     }
 
 
-def _whole(grid: Grid) -> Any:
-    from tidefield.maps.grid import Tile
-
+def whole(grid: Grid) -> Tile:
+    """A tile of all cells, and more where they are no square."""
     return Tile(grid, 0, 0, max(grid.rows, grid.columns), 0)
 
 
@@ -203,7 +203,7 @@ def semi_global(scene: Scene, grid: Grid) -> np.ndarray:
     assert scene.points is not None
     ground = scene.points.xyz_world.numpy()
     above = float(np.median(position[:, 2]) - np.median(ground[:, 2]))
-    middle = grid.frame.to_scene(np.array([[*_whole(grid).centre, grid.height]]))[0]
+    middle = grid.frame.to_scene(np.array([[*whole(grid).centre, grid.height]]))[0]
     pairs = [
         (np.linalg.norm((position[i] + position[j])[:2] / 2 - middle[:2]), i, j)
         for i in range(len(pose))

@@ -11,9 +11,10 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-from tidefield.compare.run import Runner, run_measured, tidefield
+from benchmarks.records import HiddenRunner, say
+from tidefield.compare.run import run_measured, tidefield
 from tidefield.files import write_json
 from tidefield.machine import describe
 
@@ -21,18 +22,23 @@ SURVEY_WIDTH = 400
 MEMORY_FILE = "memory.json"
 
 
-def measure_memory(
+def memory(
     runs: Path,
-    preset: str,
-    width: int,
-    photographs: int,
-    device: str,
-    run: Runner = run_measured,
-) -> dict[str, Any]:
-    """Render in a process of its own, store its time and memory as RUNS/memory.json and return them.
+    preset: Literal["swift", "paper"] = "swift",
+    width: int = 4000,
+    photographs: int = 12,
+    device: str = "cpu",
+    run: HiddenRunner = run_measured,
+) -> None:
+    """Render in a process of its own, and store its time and memory. The scene lies in `runs` as long as it is needed.
 
-    The scene lies in `runs` as long as it is needed. The height of photographs and frame is three quarters of their
-    width. `run` runs the command.
+    Args:
+        runs: Store the figures in this folder's memory.json.
+        preset: Which network.
+        width: Width of photographs and frame in pixels; the height is three quarters of it.
+        photographs: How many the scene has.
+        device: auto, cpu, cuda, cuda:N or mps; the figure is of main memory in any case.
+        run: Runs the command.
     """
     runs.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=runs, prefix=".memory-") as folder:
@@ -53,7 +59,7 @@ def measure_memory(
         **describe(),
     }
     write_json(runs / MEMORY_FILE, record)
-    return record
+    say(f"{record['peak_memory_bytes'] / 1e9:.2f} GB, {record['seconds']:.0f} s")
 
 
 def make_run(work: Path, preset: str, width: int, photographs: int) -> str:

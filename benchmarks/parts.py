@@ -6,17 +6,19 @@ variants of the preset, are compared as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
+from tyro.conf import Positional
 
-from benchmarks.records import distinct_names, store
+from benchmarks.records import MEASURED, say, show, store
+from tidefield.compare.run import named
 from tidefield.compare.tables import Table
 from tidefield.config import Config, config_from_json
 from tidefield.data.load import load_scene
+from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.evaluation.evaluate import evaluate
 from tidefield.files import read_json
@@ -28,30 +30,29 @@ PARTS_FILE = "parts.json"
 METRICS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "flip": "{:.4f}"}
 
 
-def measure_parts(
-    files: Sequence[Path],
-    scenes: Sequence[Path],
-    runs: Path,
-    width: int,
-    device: torch.device,
-    say: Callable[[str], object],
+def parts(
+    weights: Positional[tuple[Path, ...]],
+    scenes: tuple[Path, ...] = (),
+    runs: Path = MEASURED,
+    width: int = 400,
+    device: str = "auto",
 ) -> dict[str, Any]:
     """Compare weights files on the held-out photographs of scenes; what was measured is kept.
 
     Args:
-        files: weights of `tidefield pretrain`.
-        scenes: folders.
-        runs: folder for parts.json.
-        width: of the pictures, pixels.
-        device: to render on.
-        say: reports progress.
+        weights: Files of `tidefield pretrain`, trained alike but for their parts.
+        scenes: Folders.
+        runs: Store the figures in this folder's parts.json; what it holds is not measured again.
+        width: Of the pictures in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
 
     Raises:
-        RunError: a file is damaged, or holds no weights of a preset, or two scenes have one name.
+        SceneError: two scenes have one name.
+        RunError: a file is damaged, or holds no weights of a preset.
     """
-    named = distinct_names(scenes)
+    folders, where = named(scenes), choose_device(device)
     record, quiet = read_json(runs / PARTS_FILE) or {"files": {}, "figures": {}}, make_console(quiet=True)
-    for file in files:
+    for file in weights:
         header, _ = read_weights_file(file)
         config = config_from_json(header["config"], f"{file}: config")
         if not isinstance(config, Config):
@@ -62,19 +63,20 @@ def measure_parts(
             "preset": config.preset,
             "without": list(config.network.without),
         }
-        for name, folder in named.items():
+        for name, folder in folders.items():
             place = record["figures"].setdefault(f"{name}, {width} px", {})
             if own in place:
                 continue
             say(f"{name}, {width} px: {file}")
             scene = load_scene(folder, width=width)
-            render, _ = zero_shot(config, file, scene, device)
+            render, _ = zero_shot(config, file, scene, where)
             with TemporaryDirectory() as temporary:
                 mean = evaluate(render, scene, Path(temporary) / "out", configuration={}, console=quiet).mean
             place[own] = {metric: mean[f"{metric}_seen_cc"] for metric in METRICS}
             figures = [one for of in record["figures"].values() for one in of.values()]
             command = "python -m benchmarks parts WEIGHTS... --scenes SCENE..."
             store(runs / PARTS_FILE, record, place[own], figures, command)
+    show(tables(record))
     return record
 
 

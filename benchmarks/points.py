@@ -7,15 +7,17 @@ COLMAP's features and exhaustive matches, its triangulation with the poses held.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from tyro.conf import Positional
 
-from benchmarks.records import NETWORK, distinct_names, network_of, require_same, store
+from benchmarks.records import MEASURED, NETWORK, HiddenRunner, network_of, require_same, say, show, store
+from tidefield.compare.run import named, run_measured, tidefield
 from tidefield.compare.tables import Table
 from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.load import own_lens, read_posed
@@ -32,31 +34,30 @@ TRANSFORMS_FILE = "transforms.json"
 """Its split counts, next to a COLMAP model."""
 
 
-def measure_points(
-    scenes: Sequence[Path],
-    work: Path,
-    runs: Path,
-    widths: Iterable[int],
-    device: str,
-    run: Callable[[list[str]], None],
-    say: Callable[[str], object],
+def points(
+    scenes: Positional[tuple[Path, ...]],
+    work: Path = Path("runs/points"),
+    runs: Path = MEASURED,
+    widths: tuple[int, ...] = (400,),
+    device: str = "auto",
+    run: HiddenRunner = run_measured,
 ) -> dict[str, Any]:
     """Evaluate scenes with and without their points; what was measured is kept.
 
     Args:
-        scenes: folders of scenes.
-        work: folder for the scenes without points.
-        runs: folder for points.json.
-        widths: of the pictures.
-        device: to render on.
-        run: runs a command of Tidefield's, given without "tidefield".
-        say: reports progress.
+        scenes: With COLMAP models, or posed photographs only, which get COLMAP's points first.
+        work: Folder for the scenes without points.
+        runs: Store the figures in this folder's points.json; what it holds is not measured again.
+        widths: Of the pictures in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+        run: Runs a command.
 
     Raises:
-        RunError: two scenes have one name, or a figure that is kept is of other weights.
+        SceneError: two scenes have one name.
+        RunError: a figure that is kept is of other weights.
     """
     record = read_json(runs / POINTS_FILE) or {"figures": {}}
-    for name, scene in distinct_names(scenes).items():
+    for name, scene in named(scenes).items():
         network = {NETWORK: network_of(scene)}
         folders = {"with": scene, "without": work / name}
         if find_colmap(scene, *MODELS) is None:
@@ -77,8 +78,8 @@ def measure_points(
                 say(f"{name}, {width} px, {way} points")
                 with TemporaryDirectory() as temporary:
                     out = Path(temporary) / "out"
-                    words = ["evaluate", str(folders[way]), str(out), "--zero-shot", "--width", str(width)]
-                    run([*words, "--device", device])
+                    words = ["evaluate", folders[way], out, "--zero-shot", "--width", width, "--device", device]
+                    run(tidefield(*words), {})
                     found = read_json(out / "evaluation.json")
                 place[way] = {metric: found["mean"][metric] for metric in METRICS}
                 place[way] |= {**network, "held_out": found["split"]["test"]}
@@ -86,6 +87,7 @@ def measure_points(
                 assert len(held_out) == 1, f"{name} with and without points holds out other photographs: {held_out}"
                 figures = [one for of in record["figures"].values() for ways in of.values() for one in ways.values()]
                 store(runs / POINTS_FILE, record, place[way], figures, "python -m benchmarks points SCENE...")
+    show(tables(record))
     return record
 
 

@@ -1,29 +1,38 @@
-"""Records of figures that are measured one after another: what each was measured with, and what it is of."""
+"""What commands share: how they report, and records of figures that are measured one after another.
+
+A record has what each figure was measured with, and what it is of. torch and the rest are imported inside.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from tyro.conf import Fixed, Suppress
+
+from tidefield.compare.run import Runner
 from tidefield.errors import RunError
 from tidefield.files import file_sha256, write_json
 from tidefield.machine import describe
 
+if TYPE_CHECKING:
+    from tidefield.compare.tables import Table
+
+MEASURED = Path("docs/measured")
+STRICT_400 = tuple(MEASURED / f"strict_400{rest}.json" for rest in ("", "_scenes"))
+HiddenRunner = Suppress[Fixed[Runner]]
+"""What runs commands, a parameter that is no option: tests give one that runs nothing."""
+say = partial(print, flush=True)
 NETWORK = "network"
 """Entry of a figure with the SHA-256 of the weights that it is of."""
 
 
-def distinct_names(folders: Sequence[Path]) -> dict[str, Path]:
-    """Folders by their names, by which figures are kept.
-
-    Raises:
-        RunError: two have one name.
-    """
-    named = {folder.resolve().name: folder for folder in folders}
-    if len(named) < len(folders):
-        raise RunError(f"two of {', '.join(map(str, folders))} have one name: expected different ones; rename a folder")
-    return named
+def show(tables: Iterable[Table]) -> None:
+    """Print tables as Markdown."""
+    for table in tables:
+        say(table.markdown(), end="\n\n")
 
 
 def store(

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from benchmarks.fuzz import FUZZ_FILE, MOST_BYTES
-from benchmarks.kills import KILLS_FILE
+from benchmarks.fuzz import FUZZ_FILE, MOST_BYTES, fuzz_table
+from benchmarks.kills import KILLS_FILE, kills_table
 from benchmarks.readers import CPU_SECONDS
+from benchmarks.records import MEASURED, say
 from benchmarks.table import circumstances
-from tidefield.compare.tables import Table
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_text
 
 
-def write_robustness(runs: Path, out: Path) -> None:
+def robustness(runs: Path = MEASURED, out: Path = Path("docs/robustness.md")) -> None:
     """Read the stored counts and write the page as Markdown.
+
+    Args:
+        runs: Folder of fuzz.json and kills.json.
+        out: The Markdown file to write; replaced if it is there.
 
     Raises:
         RunError: when there are none.
@@ -58,29 +60,4 @@ def write_robustness(runs: Path, out: Path) -> None:
         "\n".join(f"    {record['command']}" for _, record in records),
     ]
     write_text(out, "\n\n".join(parts) + "\n")
-
-
-def fuzz_table(readers: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What happened to the damaged files of every reader, and of all."""
-    rows = [
-        (
-            name,
-            *(f"{count[key]:,}" for key in ("files", "accepted", "refused")),
-            str(sum(count["findings"].values())),
-            f"{count['slowest_seconds']:.2f}",
-        )
-        for name, count in readers.items()
-    ]
-    sums = [sum(count[key] for count in readers.values()) for key in ("files", "accepted", "refused")]
-    found = sum(sum(count["findings"].values()) for count in readers.values())
-    slowest = max((count["slowest_seconds"] for count in readers.values()), default=0.0)
-    rows.append(("all", *(f"{total:,}" for total in sums), str(found), f"{slowest:.2f}"))
-    return Table("Damaged files", ["reader", "files", "accepted", "refused", "findings", "slowest, s"], rows)
-
-
-def kills_table(kills: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What killed commands completed when they were repeated, and what they left behind."""
-    keys = ("kills", "identical", "processes", "files")
-    rows = [(f"tidefield {name}", *(str(record[key]) for key in keys)) for name, record in kills.items()]
-    columns = ["command", "kills", "identical results", "processes left", "partial files left"]
-    return Table("Killed commands", columns, rows)
+    say(out)

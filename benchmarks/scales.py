@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import torch
+from tyro.conf import Positional
 
-from benchmarks.records import NETWORK, distinct_names, network_of, require_same, stamp
+from benchmarks.records import MEASURED, NETWORK, HiddenRunner, network_of, require_same, say, stamp
 from benchmarks.table import circumstances
+from tidefield.compare.run import named, run_measured, tidefield
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.pictures import decode
@@ -32,39 +33,37 @@ WAYS = {
 METRICS = ("psnr_seen", "psnr_seen_cc", "ssim_seen", "flip_seen")
 SHOWN = {"points": "photographs read at one width", "cones": "photographs read by cones"}
 """What a picture shows beside the photograph, with its labels."""
-Run = Callable[[list[str]], None]
 
 
-def measure_scales(
-    sources: Sequence[Path],
-    runs: Path,
-    widths: Sequence[int],
-    width: int,
-    device: str,
-    run: Run,
-    say: Callable,
+def scales(
+    sources: Positional[tuple[Path, ...]],
+    runs: Path = MEASURED,
+    widths: tuple[int, ...] = (100, 200, 400, 800, 1600),
+    width: int = 400,
+    device: str = "auto",
+    out: Path = Path("docs/scales.md"),
     pictures: Path | None = None,
-) -> dict[str, Any]:
-    """Evaluate runs, or scenes with the trained weights, at several widths in every way; what was measured is kept.
+    run: HiddenRunner = run_measured,
+) -> None:
+    """Evaluate runs, or scenes with the trained weights, in every way; what was measured is kept. Writes the page.
 
     Args:
-        sources: folders of runs, or of scenes.
-        runs: folder of scales.json.
-        widths: of the pictures.
-        width: that scenes are opened at; runs have their own.
-        run: runs a command of Tidefield's, given without "tidefield".
-        say: reports progress.
-        pictures: folder for a detail of the first held-out photograph, at the largest width, beside how it is rendered.
-
-    Returns:
-        By source, its figures by width and way, how it was opened, and where and when it was measured last.
+        sources: Runs, or scenes for the trained weights, such as those of `python -m benchmarks flight --scene`.
+        runs: Store the figures in this folder's scales.json, after each; a repeated command continues.
+        widths: Of the pictures in pixels.
+        width: That scenes are opened at; a run has its own.
+        device: auto, cpu, cuda, cuda:N or mps.
+        out: The Markdown file to write; replaced if it is there.
+        pictures: Folder for a detail of each source's first held-out photograph at the largest width, beside renderings
+            by points and by cones; the page shows those that lie beside it.
+        run: Runs a command.
 
     Raises:
-        RunError: two sources have one name, or figures that are kept are of other weights, or were measured at another
-            width or on another device.
+        SceneError: two sources have one name.
+        RunError: figures that are kept are of other weights, or were measured at another width or on another device.
     """
     record, device = read_json(runs / SCALES_FILE) or {}, str(choose_device(device))
-    for name, source in distinct_names(sources).items():
+    for name, source in named(sources).items():
         is_run = (source / RUN_FILE).exists()
         asked = {NETWORK: network_of(source), "opened_px": None if is_run else width, "device": device}
         measured = record.setdefault(name, {"figures": {}, **asked})
@@ -78,12 +77,13 @@ def measure_scales(
                     continue
                 say(f"{name}, {picture} px, {way}")
                 with TemporaryDirectory() as folder:
-                    out = Path(folder) / "out"
-                    of = [] if is_run else ["--zero-shot", "--opened-width", str(width)]
-                    run(["evaluate", str(source), str(out), *of, "--width", str(picture), *options, "--device", device])
-                    found = read_json(out / "evaluation.json")
+                    made = Path(folder) / "out"
+                    words = [] if is_run else ["--zero-shot", "--opened-width", width]
+                    words += ["--width", picture, *options, "--device", device]
+                    run(tidefield("evaluate", source, made, *words), {})
+                    found = read_json(made / "evaluation.json")
                     if detail:
-                        file = min((out / "renderings").rglob("*.png"))
+                        file = min((made / "renderings").rglob("*.png"))
                         shown[SHOWN[way]] = torch.from_numpy(decode(file).copy())
                 trained = found["configuration"].get("trained")
                 measured["opened"] = (
@@ -99,7 +99,8 @@ def measure_scales(
                 write_json(runs / SCALES_FILE, record)
         if pictures is not None:
             _write_detail(source, shown, pictures / f"scales-{name}.png")
-    return record
+    write_page(runs, out)
+    say(out)
 
 
 def _write_detail(source: Path, renderings: Mapping[str, Image8], picture: Path) -> None:

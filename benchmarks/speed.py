@@ -13,12 +13,15 @@ What is counted:
 
 from __future__ import annotations
 
+import os
 import statistics
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -27,13 +30,22 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from tidefield.config import Config
+from benchmarks.records import say, show
+from tidefield.compare.tables import NOTHING, Table
+from tidefield.config import PRESETS, Config
+from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.device import choose_device
+from tidefield.errors import RunError
+from tidefield.files import write_json
 from tidefield.geometry.cameras import Cameras
+from tidefield.machine import describe
 from tidefield.model.renderer import Renderer
 from tidefield.parallel import sequential
+from tidefield.synthetic import make_survey, write_survey
 from tidefield.train.loop import Budget, SceneTrainer
 
+SPEED_FILE = "speed.json"
 SQUARE_PX = 32
 """Renderings are timed on whole squares of so many pixels, as tiles are."""
 BUDGET = Budget(steps=1000)
@@ -64,9 +76,52 @@ class Effort:
 QUICK = Effort(seconds=0.1, least=1, rays=1024)
 
 
-def measure_speed(
-    scene: Scene, configs: Mapping[str, Config], device: torch.device, effort: Effort, say: Callable[[str], object]
-) -> dict[str, Any]:
+def speed(
+    runs: Path | None = None,
+    scene: Path | None = None,
+    width: int | None = None,
+    device: str = "cpu",
+    quick: bool = False,
+) -> None:
+    """Measure, print and store.
+
+    Args:
+        runs: Store the figures in this folder's speed.json.
+        scene: Measure on this scene instead of the built-in one.
+        width: Width of its photographs in pixels.
+        device: auto, cpu, cuda, cuda:N or mps.
+        quick: A few seconds, to check that it works; the figures are not meaningful.
+    """
+    if quick and runs is not None:
+        raise RunError("--quick was given with --runs: such figures are not worth storing; leave one of them out")
+    where = choose_device(device)
+    with tempfile.TemporaryDirectory() as folder:
+        loaded = _scene(scene, width, quick, Path(folder))
+        configs = {name: PRESETS[name] for name in ("paper", "swift")}
+        report = measure_speed(loaded, configs, where, QUICK if quick else Effort())
+    options = [] if scene is None else ["--scene SCENE", *([] if width is None else [f"--width {width}"])]
+    command = " ".join(["python -m benchmarks speed --runs RUNS", *options, f"--device {device}"])
+    report |= {"command": command, **describe()}
+    show(speed_tables(report))
+    if runs is not None:
+        write_json(runs / SPEED_FILE, report)
+
+
+def _scene(folder: Path | None, width: int | None, quick: bool, work: Path) -> Scene:
+    """The scene that is asked for, or the built-in one, made small."""
+    if folder is not None:
+        return load_scene(folder, width=width)
+    if width is not None:
+        raise RunError(
+            "--width was given without --scene: the built-in scene has its size; name a scene, or leave it out"
+        )
+    os.environ["XDG_CACHE_HOME"] = str(work / "cache")
+    survey = make_survey("river_mouths", seed=7, views=9 if quick else 16, width=64 if quick else 256)
+    write_survey(survey, work / "scene")
+    return load_scene(work / "scene")
+
+
+def measure_speed(scene: Scene, configs: Mapping[str, Config], device: torch.device, effort: Effort) -> dict[str, Any]:
     """Everything, as JSON.
 
     Args:
@@ -74,7 +129,6 @@ def measure_speed(
         configs: of `paper` and `swift`.
         device: where to compute.
         effort: spent on each figure.
-        say: reports progress.
     """
     say("peak arithmetic of this machine ...")
     ceilings = {
@@ -108,6 +162,50 @@ def measure_speed(
         "presets": presets,
         "ratios": ratios,
     }
+
+
+def speed_tables(speed: Mapping[str, Any]) -> list[Table]:
+    """Rates and shares, stages, and the machine's peak."""
+    presets, ceilings = speed["presets"], speed["ceilings"]
+    rates: list[tuple[str, Callable[[Any], float], str]] = [
+        ("Training, rays/s", lambda p: p["training"]["rays_per_second"], "{:,.0f}"),
+        ("Rendering, rays/s, features encoded beforehand", lambda p: p["rendering"]["rays_per_second"], "{:,.0f}"),
+        ("Encoding a photograph for rendering, s", lambda p: p["encoding_seconds"], "{:.3f}"),
+    ]
+    rows = []
+    for title, read, style in rates:
+        ratio = read(presets["swift"]) / read(presets["paper"])
+        rows.append((title, *(style.format(read(presets[p])) for p in ("paper", "swift")), f"{ratio:.2f}"))
+    for kind in ("training", "rendering"):
+        for ceiling, title in (("float32", "float32 products"), ("bfloat16", "bfloat16 products")):
+            shares = (f"{presets[p]['shares'][kind][ceiling]:.1%}" for p in ("paper", "swift"))
+            rows.append((f"{kind.capitalize()}, share of the peak of {title}", *shares, ""))
+    photographs = speed["photographs"]
+    title = (
+        f"{photographs['count']} photographs, {photographs['width']} px, {speed['device']}, {speed['threads']} threads"
+    )
+    limits = (
+        ("float32 products", f"{ceilings['float32_flops'] / 1e9:,.0f} GFLOP/s"),
+        ("bfloat16 products", f"{ceilings['bfloat16_flops'] / 1e9:,.0f} GFLOP/s"),
+    )
+    return [
+        Table(title, ["", "paper", "swift", "swift / paper"], rows),
+        _stage_table(presets),
+        Table("Peak arithmetic of this machine, measured in the same run", ["", "measured"], limits),
+    ]
+
+
+def _stage_table(presets: Mapping[str, Any]) -> Table:
+    kinds = [(preset, kind) for kind in ("training", "rendering") for preset in ("paper", "swift")]
+    columns = [presets[preset][kind]["seconds_per_ray"] for preset, kind in kinds]
+    stages = dict.fromkeys(stage for column in columns for stage in column)
+    rows = [(stage, *(f"{1e6 * c[stage]:.1f}" if stage in c else NOTHING for c in columns)) for stage in stages]
+    rows.append(("sum", *(f"{sum(column.values()) * 1e6:.1f}" for column in columns)))
+    return Table(
+        "Where the time goes, microseconds per ray, with all cores on one task after another",
+        ["stage", *map(" ".join, kinds)],
+        rows,
+    )
 
 
 def measure_training(trainer: SceneTrainer, effort: Effort) -> dict[str, Any]:

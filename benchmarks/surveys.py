@@ -15,8 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from benchmarks.records import say
 from tidefield.compare.results import Result, read_results
-from tidefield.compare.run import WHOLE, Runner, tidefield
+from tidefield.compare.run import WHOLE, Runner, run_measured, tidefield
 from tidefield.compare.tables import NOTHING, Table, shown
 from tidefield.errors import SurveyError
 from tidefield.files import read_json, write_json, write_text
@@ -31,16 +32,40 @@ MEASURED = (
 )
 
 
-def measure_surveys(
-    photographs: Path, runs: Path, surveys: Sequence[str], run: Runner, say: Callable[[str], object]
+SURVEYS = ("brighton_beach", "turin_lot", "swindale")
+
+
+def surveys(
+    photographs: Path,
+    runs: Path,
+    names: tuple[str, ...] = SURVEYS,
+    prepared: Path | None = None,
+    ready: Path | None = None,
+    out: Path = Path("docs/surveys.md"),
 ) -> None:
+    """Measure and write the page.
+
+    Args:
+        photographs: Folder with the surveys' folders.
+        runs: Folder for the results, as RUNS/SURVEY.
+        names: Of the surveys.
+        prepared: Folder of a `tidefield compare` on the prepared scenes, by the surveys' names, for the page.
+        ready: Folder of a `tidefield compare` on ready-made scenes of these names, for the page.
+        out: The Markdown file to write; replaced if it is there.
+    """
+    measure_surveys(photographs, runs, names)
+    write_page(runs, names, prepared, ready, out)
+    say(out)
+
+
+def measure_surveys(photographs: Path, runs: Path, names: Sequence[str], run: Runner = run_measured) -> None:
     """Prepare every survey, and reconstruct it exhaustively.
 
     Raises:
         SurveyError: a survey is missing.
         RunError: a command failed.
     """
-    for survey in surveys:
+    for survey in names:
         source, folder = photographs_of(survey, photographs), runs / survey
         if read_json(folder / "prepare.json") is None:
             say(f"{survey}: prepare")
@@ -94,22 +119,17 @@ def reconstruct_exhaustively(photographs: Path, out: Path) -> None:
     write_json(out / "exhaustive.json", record)
 
 
-def write_page(runs: Path, surveys: Sequence[str], prepared: Path | None, ready: Path | None, out: Path) -> None:
-    """What `measure_surveys` and comparisons left, as Markdown.
+def write_page(runs: Path, names: Sequence[str], prepared: Path | None, ready: Path | None, out: Path) -> None:
+    """What `measure_surveys` and comparisons left, as Markdown; parameters are those of `surveys`.
 
-    Args:
-        runs: the folder of `measure_surveys`.
-        surveys: their names.
-        prepared: a comparison on prepared scenes by the surveys' names; SURVEY_uneven is one of `--colour off`.
-        ready: a comparison on ready-made scenes of these names.
-        out: the file.
+    In `prepared` SURVEY_uneven is the survey prepared with `--colour off`.
     """
-    records = {survey: _read(runs / survey) for survey in surveys}
+    records = {survey: _read(runs / survey) for survey in names}
     made = next((r["usage"] for r in records.values() if r["usage"] and "machine" in r["usage"]), describe())["machine"]
     parts = [
         "# Surveys",
         _model(records).markdown(),
-        *_trained(surveys, prepared, ready),
+        *_trained(names, prepared, ready),
         _time(records).markdown(),
         f"On {made['cores']} cores of {made['processor']}, without a GPU. Exhaustive means COLMAP's defaults, run by "
         "the same library (pycolmap): every photograph matched with every other, focal length free.",
@@ -132,7 +152,7 @@ def _run(comparison: Path | None, scene: str) -> Result | None:
     return None if comparison is None else read_results(comparison, [scene], [WHOLE]).by.get((scene, WHOLE))
 
 
-def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) -> list[str]:
+def _trained(names: Sequence[str], prepared: Path | None, ready: Path | None) -> list[str]:
     """What `swift` achieves on prepared scenes, on those without exposure correction, and on ready-made ones."""
     columns = {
         "prepared": (prepared, ""),
@@ -140,7 +160,7 @@ def _trained(surveys: Sequence[str], prepared: Path | None, ready: Path | None) 
         "ready-made": (ready, ""),
     }
     rows = []
-    for survey in surveys:
+    for survey in names:
         found = [_run(folder, survey + suffix) for folder, suffix in columns.values()]
         for metric, title, style in MEASURED:
             rows.append([f"{survey}: {title}", *(shown(result and result.metric(metric), style) for result in found)])

@@ -9,14 +9,15 @@ from typing import Any
 
 from benchmarks import depth, points
 from benchmarks import parts as paper_parts
-from benchmarks.frames import FRAMES_FILE
+from benchmarks.frames import FRAMES_FILE, frame_tables
 from benchmarks.memory import MEMORY_FILE
+from benchmarks.records import MEASURED, STRICT_400, say
+from benchmarks.speed import SPEED_FILE, speed_tables
 from tidefield.compare.ablation import ablation_tables, summarise
 from tidefield.compare.circumstances import code_and_machines, machines, short, when
 from tidefield.compare.results import Result, Results, read_figures
 from tidefield.compare.run import WHOLE
 from tidefield.compare.tables import (
-    NOTHING,
     REGIONS,
     TABLE_3,
     Mark,
@@ -42,7 +43,10 @@ from tidefield.files import read_json, write_text
 from tidefield.machine import describe
 from tidefield.methods import names
 
-SPEED_FILE = "speed.json"
+COMPARISON = tuple(MEASURED / f"{name}.json" for name in ("comparison", "nerf", "paper", "paper_zero_shot"))
+ABLATION = tuple(MEASURED / f"{name}.json" for name in ("ablation", "ablation_water"))
+LENGTHS = tuple(MEASURED / f"{name}.json" for name in ("minute", "scratch"))
+WIDTHS = (*STRICT_400, *(MEASURED / f"strict_{width}.json" for width in (800, 1600)))
 SHOWN_REGIONS = ("", "_seen_cc")
 """Of `REGIONS`, those on the page; docs/measured has all."""
 GPU_FOLDER, GPU_QUALITY, LARGE_FRAMES_FILE = "gpu", "strict_800.json", "frames_1920.json"
@@ -120,17 +124,23 @@ def read_gpu(folder: Path) -> OnGpu:
     return OnGpu(speed, frames, large, compared, record.get("remark", ""), record.get("settings", {}).get("width"))
 
 
-def write_page(
-    comparison: Sequence[Path],
-    ablation: Sequence[Path],
-    lengths: Sequence[Path],
-    widths: Sequence[Path],
-    runs: Path,
-    out: Path,
+def table(
+    comparison: tuple[Path, ...] = COMPARISON,
+    ablation: tuple[Path, ...] = ABLATION,
+    lengths: tuple[Path, ...] = LENGTHS,
+    widths: tuple[Path, ...] = WIDTHS,
+    runs: Path = MEASURED,
+    out: Path = Path("docs/results.md"),
 ) -> None:
     """Read the stored measurements and write the page as Markdown.
 
-    `widths` are comparisons of the same scenes at several widths, `lengths` such with other trainings at LENGTHS_PX.
+    Args:
+        comparison: Files of `tidefield compare`; of a result in several files the last one counts.
+        ablation: Files of `tidefield ablate`, likewise.
+        lengths: Files of `tidefield compare` at 400 px with other lengths of training, and from scratch.
+        widths: Files of `tidefield compare` with the scenes at several widths.
+        runs: Folder of speed, frames, memory, depth, points and parts.
+        out: The Markdown file to write; replaced if it is there.
 
     Raises:
         RunError: when there is no measurement at all.
@@ -147,6 +157,7 @@ def write_page(
             "run them"
         )
     write_text(out, page(compared, ablated, others, sized, stored, read_gpu(runs / GPU_FOLDER)))
+    say(out)
 
 
 def page(
@@ -441,65 +452,6 @@ def _speed(speed: Mapping[str, Any] | None) -> list[str]:
     return ["Medians, on the built-in scene unless the command names another; `paper` is the peer. " + bounds] + [
         table.markdown() for table in speed_tables(speed)
     ]
-
-
-def speed_tables(speed: Mapping[str, Any]) -> list[Table]:
-    """Rates and shares, stages, and the machine's peak."""
-    presets, ceilings = speed["presets"], speed["ceilings"]
-    rates: list[tuple[str, Callable[[Any], float], str]] = [
-        ("Training, rays/s", lambda p: p["training"]["rays_per_second"], "{:,.0f}"),
-        ("Rendering, rays/s, features encoded beforehand", lambda p: p["rendering"]["rays_per_second"], "{:,.0f}"),
-        ("Encoding a photograph for rendering, s", lambda p: p["encoding_seconds"], "{:.3f}"),
-    ]
-    rows = []
-    for title, read, style in rates:
-        ratio = read(presets["swift"]) / read(presets["paper"])
-        rows.append((title, *(style.format(read(presets[p])) for p in ("paper", "swift")), f"{ratio:.2f}"))
-    for kind in ("training", "rendering"):
-        for ceiling, title in (("float32", "float32 products"), ("bfloat16", "bfloat16 products")):
-            shares = (f"{presets[p]['shares'][kind][ceiling]:.1%}" for p in ("paper", "swift"))
-            rows.append((f"{kind.capitalize()}, share of the peak of {title}", *shares, ""))
-    photographs = speed["photographs"]
-    title = (
-        f"{photographs['count']} photographs, {photographs['width']} px, {speed['device']}, {speed['threads']} threads"
-    )
-    limits = (
-        ("float32 products", f"{ceilings['float32_flops'] / 1e9:,.0f} GFLOP/s"),
-        ("bfloat16 products", f"{ceilings['bfloat16_flops'] / 1e9:,.0f} GFLOP/s"),
-    )
-    return [
-        Table(title, ["", "paper", "swift", "swift / paper"], rows),
-        _stage_table(presets),
-        Table("Peak arithmetic of this machine, measured in the same run", ["", "measured"], limits),
-    ]
-
-
-def _stage_table(presets: Mapping[str, Any]) -> Table:
-    kinds = [(preset, kind) for kind in ("training", "rendering") for preset in ("paper", "swift")]
-    columns = [presets[preset][kind]["seconds_per_ray"] for preset, kind in kinds]
-    stages = dict.fromkeys(stage for column in columns for stage in column)
-    rows = [(stage, *(f"{1e6 * c[stage]:.1f}" if stage in c else NOTHING for c in columns)) for stage in stages]
-    rows.append(("sum", *(f"{sum(column.values()) * 1e6:.1f}" for column in columns)))
-    return Table(
-        "Where the time goes, microseconds per ray, with all cores on one task after another",
-        ["stage", *map(" ".join, kinds)],
-        rows,
-    )
-
-
-def frame_tables(frames: Mapping[str, Any]) -> list[Table]:
-    """Seconds of views."""
-    (width, height), first = frames["size_px"], frames["first"]
-    rows = [
-        ("the first, from the scene on disk, start of the program included", f"{first['seconds']:.1f}"),
-        ("each further view along a flight, median", f"{frames['further_seconds']:.2f}"),
-        *(
-            (f"the same view repeatedly, of a survey of {count} photographs", f"{seconds:.2f}")
-            for count, seconds in frames["by_photographs"].items()
-        ),
-    ]
-    title = f"Zero-shot views of {width} x {height} px, {frames['preset']}, {frames['device']}"
-    return [Table(title, ["view", "seconds"], rows)]
 
 
 def _frame(memory: Mapping[str, Any] | None) -> str:

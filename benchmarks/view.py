@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.records import say
 from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
@@ -19,22 +20,21 @@ from tidefield.machine import describe
 VIEW_FILE = "view.json"
 FIRST_BAR_SECONDS, SHARP_BAR_SECONDS = 0.3, 5.0
 """What the viewer is to reach on two cores with `swift`."""
+SIZE_PX = (800, 600)
+"""Of sharp pictures."""
 STEP_DEGREES = 3.0
 """Of a move: about 120 views around."""
 PATIENCE = 600.0
 
 
-def measure_view(
-    scene_folder: Path, runs: Path | None, width: int = 800, height: int = 600, moves: int = 100, rests: int = 5
-) -> dict[str, Any]:
-    """Measure a scene's viewer with the installed weights of `swift`, and store the figures as RUNS/view.json.
+def view(scene: Path, runs: Path | None = None, moves: int = 100, rests: int = 5) -> dict[str, Any]:
+    """Measure a scene's viewer, print and return the figures.
 
     Args:
-        scene_folder: a scene.
-        runs: where to store; None stores nothing.
-        width, height: of sharp pictures.
-        moves: without rest, one after another, each when the coarse picture of the one before is there.
-        rests: moves after which the sharp picture is waited for.
+        scene: Measure on this scene, with the installed weights of swift.
+        runs: Store the figures in this folder's view.json.
+        moves: Without rest, one after another.
+        rests: Moves after which the sharp picture is waited for.
     """
     from tidefield.config import PRESETS
     from tidefield.data.load import load_scene
@@ -47,11 +47,11 @@ def measure_view(
 
     if moves < 2 or rests < 1:
         raise RunError(f"{moves} moves and {rests} rests were asked for: expected at least 2 and 1; choose more")
-    scene = load_scene(scene_folder)
+    loaded, (width, height) = load_scene(scene), SIZE_PX
     config = PRESETS["swift"]
-    render, _ = zero_shot(config, given_or_shipped(None, "swift"), scene, choose_device("cpu"), SAMPLING)
-    cameras = make_trajectory("orbit", scene, frames=round(360 / STEP_DEGREES), width=width, height=height).cameras
-    preview = Preview(scene)
+    render, _ = zero_shot(config, given_or_shipped(None, "swift"), loaded, choose_device("cpu"), SAMPLING)
+    cameras = make_trajectory("orbit", loaded, frames=round(360 / STEP_DEGREES), width=width, height=height).cameras
+    preview = Preview(loaded)
     server = FrameServer(preview, render, preview.prepare)
     shown: list[Frame] = []
     changed = threading.Condition()
@@ -92,7 +92,7 @@ def measure_view(
     finally:
         server.close()
     record = {
-        "scene": scene_folder.resolve().name,
+        "scene": scene.resolve().name,
         "size_px": [width, height],
         "moves": moves,
         "first_ever": {"coarse_s": begin[0].seconds, "sharp_s": begin[-1].seconds},
@@ -108,12 +108,13 @@ def measure_view(
         "memory_mb": {"before_moves": before, "after_moves": after},
         "leaving_frees_s": freed,
         "load_of_the_machine": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "command": f"python -m benchmarks view --scene {scene_folder.name} --runs RUNS",
+        "command": f"python -m benchmarks view --scene {scene.name} --runs RUNS",
         **describe(),
     }
     if runs is not None:
         runs.mkdir(parents=True, exist_ok=True)
         write_json(runs / VIEW_FILE, record)
+    say("\n".join(lines(record)))
     return record
 
 

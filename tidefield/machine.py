@@ -73,6 +73,11 @@ def tune_process() -> None:
         mallopt(arena_max, 1)
 
 
+def peak_bytes(ru_maxrss: int) -> int:
+    """The peak memory of a process, in bytes: the system counts it in bytes on macOS, in kilobytes elsewhere."""
+    return ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 def release_memory() -> None:
     """Give memory back to the system that `tune_process` lets glibc keep; between stages that need it differently."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None

@@ -9,7 +9,7 @@ import pytest
 import torch
 from networks import SMALL
 
-from benchmarks.areas import _in_world, border_cameras, border_steps, measure_areas, slope_bytes, tables
+from benchmarks.areas import _in_world, areas, border_cameras, border_steps, slope_bytes, tables
 from tidefield.compare.run import Usage
 from tidefield.config import PRESETS, Budget
 from tidefield.data.areas import cut
@@ -96,7 +96,7 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path, monkeypatch: pytes
     compared = {"areas": 8, "seconds": 9.0, "psnr": 30.0, "borders": {"views": 4, **step}}
     monkeypatch.setattr("benchmarks.areas.compare", lambda *_: compared)
     for _ in range(2):
-        record = measure_areas(tmp_path, tmp_path / "runs", (500, 1000), 96, 5, 7, lambda _: None, run)
+        record = areas(tmp_path, tmp_path / "runs", (500, 1000), 96, 5, 7, run)
     assert [words[:2] for words in calls] == [["train", str(tmp_path / f"scene_{n}_96")] for n in (500, 1000)]
     assert slope_bytes(record) == pytest.approx(1000)
     memory, seams = (table.markdown() for table in tables(record))

@@ -18,8 +18,8 @@ import torch
 from scenes_on_disk import PINHOLE, survey, write_colmap
 from torch import nn
 
-from benchmarks import frames, memory, speed, table
-from benchmarks.__main__ import main
+from benchmarks import frames, memory, speed
+from benchmarks.__main__ import COMMANDS, main
 from tidefield import cli
 from tidefield.commands import render
 from tidefield.compare.run import Usage, run_measured
@@ -92,7 +92,7 @@ def test_speed_is_measured_stage_by_stage_and_leaves_no_trace() -> None:
     scene = wall.scene(wall.cameras(4))
     before = torch.Tensor.backward
     configs = {preset: tiny(preset) for preset in ("paper", "swift")}
-    report = speed.measure_speed(scene, configs, CPU, speed.Effort(0.0, least=1), lambda line: None)
+    report = speed.measure_speed(scene, configs, CPU, speed.Effort(0.0, least=1))
     assert torch.Tensor.backward is before
     assert set(report["ratios"]) == {"training", "rendering"}
     for preset in ("paper", "swift"):
@@ -105,7 +105,7 @@ def test_speed_is_measured_stage_by_stage_and_leaves_no_trace() -> None:
         assert training["flops_per_ray"] > rendering["flops_per_ray"] > 0
         assert report["presets"][preset]["encoding_seconds"] > 0
         assert all(0 < share < 1 for share in report["presets"][preset]["shares"]["training"].values())
-    text = "\n".join(part.markdown() for part in table.speed_tables(report))
+    text = "\n".join(part.markdown() for part in speed.speed_tables(report))
     assert "| ray transformer |" in text
 
 
@@ -140,7 +140,7 @@ def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkey
         assert folder.parent in Path(environment["XDG_CACHE_HOME"]).parents
         return Usage(1.0, 5_000_000_000)
 
-    memory.measure_memory(tmp_path, "swift", 96, 4, "cpu", run)
+    memory.memory(tmp_path, "swift", 96, 4, "cpu", run)
     assert len(asked) == 1
     assert json.loads((tmp_path / "memory.json").read_text())["size_px"] == [96, 72]
     assert {path.name for path in tmp_path.iterdir()} == {"cache", "memory.json"}
@@ -176,22 +176,30 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
         assert not Path(environment["XDG_CACHE_HOME"]).exists(), "nothing is decoded before"
         return Usage(12.5, 1)
 
-    record = frames.measure_frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", "cpu", (32, 24), run)
+    record = frames.frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", 32, 24, "cpu", run)
     assert record == json.loads((tmp_path / "frames.json").read_text())
     assert "--zero-shot" in asked
     assert record["first"]["seconds"] == 12.5
     assert list(record["by_photographs"]) == ["9", "12"]
-    assert all(len(made.rows) > 1 for made in table.frame_tables(record))
+    assert all(len(made.rows) > 1 for made in frames.frame_tables(record))
 
 
-def test_without_a_name_speed_is_measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+@pytest.fixture
+def untuned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process of all tests stays as it is."""
+    monkeypatch.setattr("benchmarks.__main__.tune_process", lambda: None)
+
+
+@pytest.mark.usefixtures("untuned")
+def test_without_a_name_speed_is_measured(tmp_path: Path, capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--quick", "--runs", str(tmp_path)])
     assert ended.value.code == 2
     assert "not worth storing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", ["--help", "speed --help", "frames --help", "memory --help", "table --help"])
+@pytest.mark.usefixtures("untuned")
+@pytest.mark.parametrize("words", ["--help", *(f"{name} --help" for name in COMMANDS)])
 def test_help_is_given(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(shlex.split(words))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shared_data import SHARED
 
-from benchmarks.change import measure_change, published, write_page
+from benchmarks.change import change, published, write_page
 from tidefield.change.surfaces import ChangeError
 
 DATA = SHARED / "change"
@@ -49,7 +49,7 @@ def test_cloudcompare_and_anderson_are_met(figures):
 
 def test_missing_data_are_told_of(tmp_path):
     with pytest.raises(ChangeError, match="bmx"):
-        measure_change(tmp_path, tmp_path, 0, print)
+        change(tmp_path, 0, tmp_path)
     with pytest.raises(ChangeError, match="benchmarks change"):
         write_page(tmp_path, tmp_path / "page.md")
 
@@ -65,9 +65,10 @@ def test_figures_that_an_earlier_version_stored_are_refused(tmp_path):
 
 @pytest.mark.thorough
 def test_the_command_is_measured_on_a_small_pair(tmp_path):
-    from benchmarks.change_size import measure_size
+    from benchmarks.change_size import change_size
 
-    found = measure_size(0.05, print)
+    found = change_size(0.05, tmp_path)
+    assert json.loads((tmp_path / "change.json").read_text())["size"]["found"] == found
     assert found["million_cells"] == pytest.approx(0.05, rel=0.02)
     # A process begins with the memory of the one that starts it, here of all tests so far.
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -90,7 +90,7 @@ def test_a_measurement_of_costs_that_was_interrupted_is_made_anew(tmp_path, monk
 
     monkeypatch.setattr(cost, "run_by_stage", run)
     monkeypatch.setattr(cost, "tidefield", lambda *words: words)
-    measure = partial(measure_costs, [tmp_path / "flight"], work, tmp_path, "cpu", lambda _: None)
+    measure = partial(measure_costs, [tmp_path / "flight"], work, tmp_path, "cpu")
     with pytest.raises(RunError, match="killed"):
         measure()
     fails.clear()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.depth import compare_depths, measure_depth, tables
+from benchmarks.depth import compare_depths, depth, tables
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
@@ -32,14 +32,15 @@ def test_known_errors_come_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     scenes: list[Scene] = []
 
-    def open_scene(scene: Scene) -> Render:
+    def zero_shot(config: object, file: Path, scene: Scene, device: object) -> tuple[Render, str]:
         scenes.append(scene)
-        return off_by(scene, 0.25)
+        return off_by(scene, 0.25), ""
 
-    def measure(method: str) -> dict:
-        return measure_depth(
-            tmp_path, tmp_path, ("tidal_trees",), 160, 8, 3, open_scene, {"method": method}, lambda _: None
-        )
+    monkeypatch.setattr("benchmarks.depth.zero_shot", zero_shot)
+
+    def measure(weights: str) -> dict:
+        monkeypatch.setattr("benchmarks.depth.weights_sha256", lambda _: weights)
+        return depth(tmp_path, tmp_path, ("tidal_trees",), 160, 8, 3)
 
     measure("first")
     record = measure("first")
@@ -53,7 +54,7 @@ def test_known_errors_come_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert figures["vegetation"]["points"]["rmse_m"] > 2 * figures["edges"]["points"]["rmse_m"]
     assert 0 < figures["edges"]["share"] < 0.5
     assert "| 25.0 | 0.0 | 25.0 |" in tables(record)[0].markdown()
-    assert measure("second")["method"] == {"method": "second"}
+    assert measure("second")["method"] == {"preset": "swift", "weights": "second"}
     assert len(scenes) == 2
     # A part that no pixel belongs to has no figures.
     classes = scenes[0].root / "truth" / "classes.png"

@@ -13,7 +13,7 @@ from benchmarks import fuzz
 from benchmarks.fuzz import measure_fuzz
 from benchmarks.mutations import mutate
 from benchmarks.readers import CPU_SECONDS, READERS, Reader
-from benchmarks.robustness import write_robustness
+from benchmarks.robustness import robustness
 from tidefield.errors import RunError, SceneError
 from tidefield.files import read_json, write_json
 
@@ -78,7 +78,7 @@ def test_a_finding_is_an_error_an_end_or_too_much_time_or_memory_and_does_not_en
         Reader(name, "seed", ("file",), read, cpu_seconds=1.0 if read is compute else CPU_SECONDS)
         for name, read in PLANTED.items()
     ]
-    counts = measure_fuzz(readers, 0.006, 0, tmp_path / "kept", tmp_path, print, make_seeds)
+    counts = measure_fuzz(readers, 0.006, 0, tmp_path / "kept", tmp_path, make_seeds)
     assert counts["accept"].accepted == counts["accept"].files > 0
     assert counts["refuse"].refused > 0
     kinds = {name: {place.partition(":")[0] for place in count.findings} for name, count in counts.items()}
@@ -95,21 +95,21 @@ def test_a_finding_is_an_error_an_end_or_too_much_time_or_memory_and_does_not_en
 @linux
 @pytest.mark.slow
 def test_every_reader_accepts_its_whole_files_and_no_damaged_one_is_a_finding(tmp_path: Path):
-    counts = measure_fuzz(READERS, 0.5, 1, tmp_path / "kept", None, print)
+    counts = measure_fuzz(READERS, 0.5, 1, tmp_path / "kept", None)
     assert all(count.files for count in counts.values())
     assert {name: count.findings for name, count in counts.items() if count.findings} == {}
 
 
 def test_the_page_shows_the_counts_of_damaged_files_and_of_killed_commands(tmp_path: Path):
     with pytest.raises(RunError, match="holds no counts"):
-        write_robustness(tmp_path, tmp_path / "page.md")
+        robustness(tmp_path, tmp_path / "page.md")
     machine = {"processor": "P", "cores": 2, "memory_bytes": 2**30, "system": "S", "python": "3", "torch": "2"}
     made = {"date": "2026-01-02", "version": "1", "machine": machine}
     count = {"files": 1200, "accepted": 200, "refused": 999, "slowest_seconds": 0.5, "findings": {"error: x": 1}}
     write_json(tmp_path / "fuzz.json", {"command": "fuzz it", "readers": {"PLY": count}, **made})
     killed = {"kills": 20, "identical": 19, "processes": 0, "files": 0}
     write_json(tmp_path / "kills.json", {"command": "kill it", "kills": {"train": killed}, **made})
-    write_robustness(tmp_path, tmp_path / "page.md")
+    robustness(tmp_path, tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "|" in line]
     assert ["PLY", "1,200", "200", "999", "1", "0.50"] in rows

@@ -8,7 +8,7 @@ import pytest
 import textured_wall as wall
 import torch
 
-from benchmarks.gaussians import METHOD, WAYS, compare_ways, measure_gaussians, tables
+from benchmarks.gaussians import METHOD, WAYS, compare_ways, gaussians, tables
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
@@ -51,12 +51,13 @@ def test_uncovered_pixels_are_black(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.thorough
-def test_a_scene_is_measured_once(tmp_path: Path) -> None:
+def test_a_scene_is_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_survey(make_survey("ground_textures", seed=5, views=9, width=64), tmp_path / "flat")
-    said: list[str] = []
+    lines: list[str] = []
+    monkeypatch.setattr("benchmarks.gaussians.say", lines.append)
     for _ in range(2):
-        record = measure_gaussians([tmp_path / "flat"], tmp_path, (48,), CPU, said.append)
-    assert said == ["flat, 48 px"]
+        record = gaussians((tmp_path / "flat",), tmp_path, (48,), "cpu")
+    assert lines == ["flat, 48 px"]
     (made,) = tables(record)
     assert [row[0] for row in made.rows] == [*WAYS, METHOD]
     assert all(len(row) == len(made.columns) for row in made.rows)
@@ -73,4 +74,4 @@ def test_a_scene_without_held_out_photographs_is_one_clear_error(
 
     monkeypatch.setattr("benchmarks.gaussians.open_source", opened)
     with pytest.raises(RunError, match="holds no photograph out: expected at least one"):
-        measure_gaussians([tmp_path], tmp_path, (48,), CPU, print)
+        gaussians((tmp_path,), tmp_path, (48,), "cpu")

@@ -67,7 +67,7 @@ def test_overlaps_are_intersections_over_unions():
 
 @pytest.mark.slow
 def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from benchmarks.map_memory import measure_memory
+    from benchmarks.map_memory import map_memory
     from tidefield.maps import make
 
     pytest.importorskip("laspy")
@@ -75,13 +75,14 @@ def test_a_large_map_repeats_the_middle_of_a_scene(tmp_path: Path, monkeypatch: 
     for name in ("LARGEST_TILE", "SMALLEST_TILE"):
         monkeypatch.setattr(make, name, 32)
     write_survey(make_survey("ground_textures", seed=4, views=9, width=240), tmp_path / "scene")
-    said: list[str] = []
-    found = measure_memory(tmp_path / "scene", tmp_path / "runs", 30.0, 0.3, said.append)
+    lines: list[str] = []
+    monkeypatch.setattr("benchmarks.map_memory.say", lines.append)
+    found = map_memory(tmp_path / "scene", tmp_path / "runs", 30.0, 0.3)
     assert found["cells"] == found["points"] == 100 * 100
     assert found["square_metres"] == pytest.approx(900)
     assert found["peak_memory_bytes"] >= found["peak_memory_tiles_bytes"] > 1e8
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {"map_memory.json"}
-    assert "16 tiles" in said[1]
+    assert "16 tiles" in lines[1]
 
 
 @pytest.mark.thorough

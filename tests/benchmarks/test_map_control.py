@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.map_control import measure_control, tables
+from benchmarks.map_control import map_control, tables
 from tidefield.data.georeference import Georeference, LeftOut, Residuals
 from tidefield.errors import RunError
+from tidefield.files import read_json
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
 from tidefield.synthetic import make_survey, write_survey
@@ -25,7 +26,7 @@ def test_the_surface_misses_points_by_what_they_were_moved(tmp_path: Path, monke
     survey = make_survey("ground_textures", seed=4, views=9, width=240)
     write_survey(survey, tmp_path / "scene")
     with pytest.raises(RunError, match="no ground control"):
-        measure_control(tmp_path / "scene", tmp_path / "gcp_list.txt")
+        map_control(tmp_path / "scene", tmp_path / "gcp_list.txt", tmp_path / "runs")
     places = np.array([[1.0, 2.0], [-3.0, 1.0], [2.0, -3.0]])
     heights = survey.flat.surface.sample(torch.from_numpy(places.T).float())[0].numpy()
     moved = np.array([0.0, 0.0, -1.0])  # the third point was surveyed a metre too low
@@ -44,7 +45,8 @@ def test_the_surface_misses_points_by_what_they_were_moved(tmp_path: Path, monke
     there = Similarity(1.0, np.eye(3), np.zeros(3))
     georeference = Georeference(FRAME, "ground control", there, Residuals(), with_it, without, refused, ())
     georeference.write(tmp_path / "scene")
-    record = measure_control(tmp_path / "scene", tmp_path / "gcp_list.txt")
+    record = map_control(tmp_path / "scene", tmp_path / "gcp_list.txt", tmp_path / "runs")
+    assert read_json(tmp_path / "runs" / "map_control.json") == record
     a, b, c = record["points"]
     for one, surface in ((a, 0.0), (b, 0.0), (c, 1.0)):
         assert one["surface"] == pytest.approx(surface, abs=0.15)  # pixels show 24 cm

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mappers import measure_mappers, table
+from benchmarks.mappers import mappers, table
 from tidefield.compare.run import Usage
 from tidefield.errors import SurveyError
 from tidefield.files import write_json
@@ -32,7 +32,7 @@ def test_each_mapper_prepares_each_survey_once(tmp_path: Path):
 
     (tmp_path / "creek").mkdir()
     for _ in range(2):
-        record = measure_mappers(tmp_path, tmp_path / "work", tmp_path, ["creek"], run, lambda words: None)
+        record = mappers(tmp_path, tmp_path / "work", tmp_path, ("creek",), run)
     assert asked == [["--mapper", "incremental"], ["--mapper", "global"]]
     end = ["12", "100", "1.30"]
     assert table(record).rows == [
@@ -40,4 +40,4 @@ def test_each_mapper_prepares_each_survey_once(tmp_path: Path):
         ["creek", "global", "78 of 79", "0.582", "-", "9.0 / 5.0", *end],
     ]
     with pytest.raises(SurveyError, match=r"elsewhere is missing: expected a folder of photographs; name others"):
-        measure_mappers(tmp_path, tmp_path / "work", tmp_path, ["elsewhere"], run, lambda words: None)
+        mappers(tmp_path, tmp_path / "work", tmp_path, ("elsewhere",), run)

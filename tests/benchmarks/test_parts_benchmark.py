@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.parts import measure_parts, tables
+from benchmarks.parts import parts, tables
 from tidefield.config import SWIFT, Config, vary
 from tidefield.model.network import make_network
 from tidefield.synthetic import make_survey, write_survey
@@ -15,7 +15,7 @@ from tidefield.train.checkpoint import write_weights
 
 
 @pytest.mark.thorough
-def test_weights_are_compared_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_weights_are_compared_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = tmp_path / "flat"
     write_survey(make_survey("ground_textures", seed=5, views=9, width=64), scene)
     files = []
@@ -26,10 +26,11 @@ def test_weights_are_compared_as_they_are(tmp_path: Path, capsys: pytest.Capture
         about = {"steps": 5, "seconds": 1.0, "seed": 0, "real": [], "validation": validation}
         files.append(tmp_path / f"{len(files)}.safetensors")
         write_weights(files[-1], make_network(config.network), config, about)
-    said: list[str] = []
+    lines: list[str] = []
+    monkeypatch.setattr("benchmarks.parts.say", lines.append)
     for _ in range(2):
-        record = measure_parts(files, [scene], tmp_path, 64, torch.device("cpu"), said.append)
-    assert len(said) == 2, "what was measured is not measured again"
+        record = parts(tuple(files), (scene,), tmp_path, 64, "cpu")
+    assert len(lines) == 2, "what was measured is not measured again"
     (figures,) = record["figures"].values()
     assert all(10 < found["psnr"] < 60 and 0 < found["ssim"] <= 1 for found in figures.values())
     held_out, validated = (table.markdown() for table in tables(record))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from benchmarks.points import METRICS, measure_points, tables, write_colmap, write_without_points
+from benchmarks.points import METRICS, points, tables, write_colmap, write_without_points
+from tidefield.compare.run import Usage
 from tidefield.data.holdout import Holdout
 from tidefield.data.load import load_scene, read_posed
 from tidefield.errors import RunError
@@ -30,15 +32,16 @@ def flat(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_scenes_lose_their_points_and_nothing_else(flat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     commands: list[list[str]] = []
 
-    def run(words: list[str]) -> None:
-        commands.append(words)
-        out = Path(words[2])
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        commands.append(list(command[3:]))
+        out = Path(commands[-1][2])
         out.mkdir()
         mean = dict.fromkeys(METRICS, 30.0 - len(commands))
         write_json(out / "evaluation.json", {"mean": mean, "split": {"train": ["b"], "test": ["a"]}})
+        return Usage(1.0, 1)
 
-    measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
-    record = measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
+    points((flat,), tmp_path, tmp_path, (100,), "cpu", run)
+    record = points((flat,), tmp_path, tmp_path, (100,), "cpu", run)
     assert [words[1] for words in commands] == [str(flat), str(tmp_path / "flat")]
     assert "| flat | 100 | 29.00 | 28.00 | 29.000 | 28.000 |" in tables(record)[0].markdown()
     before, after = read_posed(flat, False), read_posed(tmp_path / "flat", False)
@@ -51,7 +54,7 @@ def test_scenes_lose_their_points_and_nothing_else(flat: Path, tmp_path: Path, m
         assert first.tobytes() == second.tobytes()
     monkeypatch.setattr("benchmarks.points.network_of", lambda _: "other weights")
     with pytest.raises(RunError, match=r"flat, 100 px, with points with network .* expected other weights"):
-        measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
+        points((flat,), tmp_path, tmp_path, (100,), "cpu", run)
 
 
 def test_masks_split_and_gains_stay(flat: Path, tmp_path: Path):
@@ -74,13 +77,15 @@ def test_masks_split_and_gains_stay(flat: Path, tmp_path: Path):
 def test_a_split_that_differs_is_found(flat: Path, tmp_path: Path):
     splits = iter(("a", "b"))
 
-    def run(words: list[str]) -> None:
-        Path(words[2]).mkdir()
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        out = Path(command[5])
+        out.mkdir()
         found = {"mean": dict.fromkeys(METRICS, 30.0), "split": {"train": [], "test": [next(splits)]}}
-        write_json(Path(words[2]) / "evaluation.json", found)
+        write_json(out / "evaluation.json", found)
+        return Usage(1.0, 1)
 
     with pytest.raises(AssertionError, match="holds out other photographs"):
-        measure_points([flat], tmp_path, tmp_path, (100,), "cpu", run, lambda _: None)
+        points((flat,), tmp_path, tmp_path, (100,), "cpu", run)
 
 
 def test_posed_photographs_get_the_points_of_colmap(flat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -5,20 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
 from benchmarks import records
-from benchmarks.depth import measure_depth
-from benchmarks.gaussians import measure_gaussians
-from benchmarks.parts import measure_parts
-from benchmarks.points import measure_points
-from benchmarks.records import distinct_names, network_of, require_same, store
-from benchmarks.scales import measure_scales
-from tidefield.errors import RunError
+from benchmarks.depth import depth
+from benchmarks.gaussians import gaussians
+from benchmarks.parts import parts
+from benchmarks.points import points
+from benchmarks.records import network_of, require_same, store
+from benchmarks.scales import scales
+from tidefield.errors import RunError, SceneError
 from tidefield.files import read_json, write_json
 from tidefield.train.checkpoint import shipped_weights, weights_sha256
-
-CPU = torch.device("cpu")
 
 
 def test_a_new_figure_leaves_the_dates_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -36,13 +33,14 @@ def test_a_new_figure_leaves_the_dates_of_others(tmp_path: Path, monkeypatch: py
 
 def test_what_was_measured_before_is_not_dated_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("benchmarks.depth.load_scene", lambda folder: folder)
-    monkeypatch.setattr("benchmarks.depth.compare_depths", lambda *_: {"all": None})
+    monkeypatch.setattr("benchmarks.depth.compare_depths", lambda *_: dict.fromkeys(("all", "vegetation", "edges")))
+    monkeypatch.setattr("benchmarks.depth.zero_shot", lambda *_: (None, ""))
 
     def measure(day: str, *categories: str) -> dict:
         monkeypatch.setattr(records, "describe", lambda: {"date": day})
         for category in categories:
             (tmp_path / f"{category}_160_8_3").mkdir(exist_ok=True)
-        return measure_depth(tmp_path, tmp_path, categories, 160, 8, 3, lambda _: None, {}, print)
+        return depth(tmp_path, tmp_path, categories, 160, 8, 3, device="cpu")
 
     measure("monday", "vegetation")
     record = measure("tuesday", "vegetation", "deep_water")
@@ -51,16 +49,15 @@ def test_what_was_measured_before_is_not_dated_anew(tmp_path: Path, monkeypatch:
 
 
 def test_two_sources_of_one_name_are_refused(tmp_path: Path):
-    both = [tmp_path / "one" / "scene", tmp_path / "other" / "scene"]
-    assert distinct_names(both[:1]) == {"scene": both[0]}
+    both = tmp_path / "one" / "scene", tmp_path / "other" / "scene"
     asked = [
-        lambda: measure_points(both, tmp_path, tmp_path, (100,), "cpu", print, print),
-        lambda: measure_parts([], both, tmp_path, 100, CPU, print),
-        lambda: measure_gaussians(both, tmp_path, (100,), CPU, print),
-        lambda: measure_scales(both, tmp_path, (100,), 400, "cpu", print, print),
+        lambda: points(both, tmp_path, tmp_path, (100,), "cpu"),
+        lambda: parts((), both, tmp_path, 100, "cpu"),
+        lambda: gaussians(both, tmp_path, (100,), "cpu"),
+        lambda: scales(both, tmp_path, (100,), 400, "cpu"),
     ]
     for measure in asked:
-        with pytest.raises(RunError, match="have one name: expected different ones"):
+        with pytest.raises(SceneError, match="two scenes are named scene: expected different names"):
             measure()
 
 
@@ -88,7 +85,7 @@ def test_gaussians_of_other_weights_are_refused(tmp_path: Path, monkeypatch: pyt
 
     def measure(method: dict) -> None:
         write_json(tmp_path / "gaussians.json", {"figures": {"scene, 48 px": {"ways": {}, "method": method}}})
-        measure_gaussians([tmp_path / "scene"], tmp_path, (48,), CPU, print)
+        gaussians((tmp_path / "scene",), tmp_path, (48,), "cpu")
 
     for same in ({"weights": "new", "run": None}, {"weights": "started", "run": "id", "network": "new"}):
         measure(same)

@@ -108,7 +108,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     compared = read_json(runs / "gpu" / "strict_800.json")
     remarked = {"remark": "On one card.", "settings": {"width": 640}, **compared}
     write_json(runs / "gpu" / "strict_800.json", remarked)
-    table.write_page([comparison], [ablation], lengths, [], runs, out)
+    table.table([comparison], [ablation], lengths, [], runs, out)
     text = out.read_text()
     for line in (
         "A frame of 4000 x 3000 px from 12 photographs of that size, decoding and encoding included (swift, cpu): "
@@ -139,7 +139,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
     assert "1,024 rays a batch instead of its default of 4,096" in text
     assert "### FLIP" in text
     with pytest.raises(RunError, match="no results"):
-        table.write_page([], [ablation.with_name("none.json")], [], [], tmp_path / "docs", tmp_path / "other.md")
+        table.table([], [ablation.with_name("none.json")], [], [], tmp_path / "docs", tmp_path / "other.md")
 
 
 def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_widths_stand_one_after_another_each_with_all_its_files(tmp_path: Path) 
         for result in record["results"]:
             result["evaluation"] |= {"held_out_of_poses": width == 800, "commit": f"{width}abcdef"}
         write_json(file, record)
-    table.write_page([], [], [], [*files, tmp_path / "none.json"], tmp_path, out)
+    table.table([], [], [], [*files, tmp_path / "none.json"], tmp_path, out)
     text = out.read_text()
     narrow, wide = text.index("### 400 px\n"), text.index("### 800 px\n")
     assert (
@@ -176,7 +176,7 @@ def test_columns_of_different_commits_are_told_apart(tmp_path: Path) -> None:
         for result in record["results"]:
             result["evaluation"]["commit"] = "1234567890" if result[new] == value else "abcdefabcd"
         write_json(file, record)
-        table.write_page([], [], [], [file], tmp_path, out)
+        table.table([], [], [], [file], tmp_path, out)
         return out.read_text()
 
     keep_result(file, "fern", "tidefield", 24.0)
@@ -233,14 +233,14 @@ def test_a_page_of_a_gpu_says_what_ran_on_the_processor(tmp_path: Path) -> None:
 def test_the_page_tells_figures_that_are_older_than_the_strict_protocol(tmp_path: Path) -> None:
     file, out = tmp_path / "comparison.json", tmp_path / "page.md"
     keep_result(file, "swindale", "tidefield", 24.0)
-    table.write_page([file], [], [], [], tmp_path, out)
+    table.table([file], [], [], [], tmp_path, out)
     older = f"Measured with Tidefield {this_machine.describe()['version']}, with the networks and weights of that time"
     assert older in out.read_text()
     record = read_json(file)
     assert record is not None
     record["results"][0]["evaluation"]["protocol"] = "strict"
     write_json(file, record)
-    table.write_page([file], [], [], [], tmp_path, out)
+    table.table([file], [], [], [], tmp_path, out)
     assert older not in out.read_text()
 
 
@@ -249,12 +249,12 @@ def test_the_page_names_what_each_machine_measured(tmp_path: Path, monkeypatch: 
     keep_result(file, "swindale", "tidefield", 24.0)
     keep_result(file, "swindale", "nerfacto", 21.0)
     out = tmp_path / "results.md"
-    table.write_page([file], [], [minute], [], tmp_path, out)
+    table.table([file], [], [minute], [], tmp_path, out)
     machine = next(line for line in out.read_text().splitlines() if line.startswith("- Machine: "))
     assert machine.endswith(f"torch {torch.__version__}.")
     move_to_another_machine(monkeypatch)
     keep_result(minute, "swindale", "tidefield", 23.5, minutes=1)
-    table.write_page([file], [], [minute], [], tmp_path, out)
+    table.table([file], [], [minute], [], tmp_path, out)
     machines = [line for line in out.read_text().splitlines() if line.startswith("- Machine: ")]
     assert machines == [
         machine.removesuffix(".") + ": tidefield, nerfacto.",
@@ -267,7 +267,7 @@ def test_a_shorter_comparison_may_count_steps(tmp_path: Path, monkeypatch: pytes
     keep_result(file, "swindale", "tidefield", 24.0)
     move_to_another_machine(monkeypatch)
     keep_result(steps, "swindale", "tidefield", 23.5, minutes=None, steps=2000)
-    table.write_page([file], [], [steps], [], tmp_path, tmp_path / "results.md")
+    table.table([file], [], [steps], [], tmp_path, tmp_path / "results.md")
     assert ": 2000 steps." in (tmp_path / "results.md").read_text()
 
 
@@ -284,10 +284,10 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
     }
     write_weights(file, make_network(SWIFT.network), SWIFT, {**recorded, **this_machine.describe()})
     with pytest.raises(RunError, match="no zero-shot results"):
-        card.write_card(file, [tmp_path / "comparison.json"])
+        card.card(file, [tmp_path / "comparison.json"])
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
     keep_result(tmp_path / "comparison.json", "swindale", "nerfacto", 21.25)
-    text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()
+    text = card.card(file, [tmp_path / "comparison.json"]).read_text()
     for line in (
         "    torchrun --nproc-per-node 2 -m tidefield.cli pretrain OUT --real brighton_beach --preset swift "
         "--steps 1000 --seed 3",
@@ -304,7 +304,7 @@ def test_the_card_describes_the_weights(tmp_path: Path) -> None:
         file, make_network(SWIFT.network), SWIFT, {**recorded, "real": ["elsewhere"], **this_machine.describe()}
     )
     with pytest.raises(RunError, match="learned from elsewhere"):
-        card.write_card(file, [tmp_path / "comparison.json"])
+        card.card(file, [tmp_path / "comparison.json"])
 
 
 def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
@@ -313,7 +313,7 @@ def test_the_card_of_paper_warns_of_its_neighbours(tmp_path: Path) -> None:
     write_weights(file, make_network(PAPER.network), PAPER, {**recorded, **this_machine.describe()})
     keep_result(tmp_path / "comparison.json", "swindale", "paper-zero-shot", 20.5)
     keep_result(tmp_path / "comparison.json", "swindale", "zero-shot", 24.5)
-    text = card.write_card(file, [tmp_path / "comparison.json"]).read_text()
+    text = card.card(file, [tmp_path / "comparison.json"]).read_text()
     assert card.BY_DIRECTION in text
     assert "| swindale ² | 20.50 |" in text.splitlines()
 
@@ -327,7 +327,7 @@ def test_without_lpips_the_page_says_how_to_get_it(tmp_path: Path) -> None:
         del mean[name]
     mean["reasons"] = {}
     write_json(file, stored)
-    table.write_page([file], [file], [], [], tmp_path, out)
+    table.table([file], [file], [], [], tmp_path, out)
     assert table.NO_LPIPS in out.read_text()
     assert "LPIPS, VGG" not in out.read_text()
 

@@ -1,12 +1,14 @@
 """The page of scales: every way at every width, once; and a detail of what it shows."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.scales import METRICS, SCALES_FILE, SHOWN, WAYS, measure_scales, write_page
+from benchmarks.scales import METRICS, SCALES_FILE, SHOWN, WAYS, scales, write_page
+from tidefield.compare.run import Usage
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_json
 from tidefield.synthetic import make_survey, write_survey
@@ -18,7 +20,8 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path, mon
     (tmp_path / "run" / "run.json").write_text("{}")
     commands: list[list[str]] = []
 
-    def run(words: list[str]) -> None:
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        words = list(command[3:])
         commands.append(words)
         out = Path(words[2])
         out.mkdir()
@@ -27,21 +30,22 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path, mon
         found = {"mean": mean, "seconds_per_frame": 0.5, "protocol": "strict"}
         configuration = {} if "--zero-shot" in words else trained
         write_json(out / "evaluation.json", {**found, "configuration": configuration})
+        return Usage(1.0, 1)
 
-    sources = [tmp_path / "run", tmp_path / "scene"]
+    sources, page = (tmp_path / "run", tmp_path / "scene"), tmp_path / "page.md"
     for _ in range(2):
-        measure_scales(sources, tmp_path, (100, 400), 400, "cpu", run, lambda _: None)
+        scales(sources, tmp_path, (100, 400), 400, "cpu", page, run=run)
     assert len(commands) == 2 * 2 * len(WAYS)
     assert ("--zero-shot" in commands[0], "--zero-shot" in commands[-1]) == (False, True)
     assert commands[1][-4:] == ["--rays-per-pixel", "4", "--device", "cpu"]
     for words, expected in (((200, "cpu"), "scene with opened_px 400: expected 200"), ((400, "cuda"), "device cpu")):
         with pytest.raises(RunError, match=expected):
-            measure_scales(sources[::-1], tmp_path, (100,), *words, run, lambda _: None)
+            scales(sources[::-1], tmp_path, (100,), *words, page, run=run)
     record = read_json(tmp_path / SCALES_FILE)
     record["run"]["machine"]["processor"] = "another"
     write_json(tmp_path / SCALES_FILE, record)
-    write_page(tmp_path, tmp_path / "page.md")
-    lines = (tmp_path / "page.md").read_text().splitlines()
+    write_page(tmp_path, page)
+    lines = page.read_text().splitlines()
     assert "Trained at 400 px for 10.0 minutes, 1,833 steps." in lines
     assert "Opened at 400 px, with trained weights as they are." in lines
     machines = [line for line in lines if line.startswith("- Machine: ")]
@@ -55,21 +59,22 @@ def test_a_detail_shows_the_photograph_beside_both_ways(tmp_path: Path, monkeypa
     write_survey(make_survey("vegetation", seed=1, views=9, width=64, supersample=1), tmp_path / "flat")
     shades, ways = {"points": 100, "cones": 200}, list(WAYS)
 
-    def run(words: list[str]) -> None:
-        (Path(words[2]) / "renderings").mkdir(parents=True)
-        way = next(name for name in ways if all(option in words for option in WAYS[name]))
+    def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
+        made = Path(command[5])
+        (made / "renderings").mkdir(parents=True)
+        way = next(name for name in ways if all(option in command for option in WAYS[name]))
         grey = np.full((48, 64, 3), shades.get(way, 0), np.uint8)
-        Image.fromarray(grey).save(Path(words[2]) / "renderings" / "vegetation_0001.png")
+        Image.fromarray(grey).save(made / "renderings" / "vegetation_0001.png")
         found = {"mean": dict.fromkeys(METRICS, 1.0), "seconds_per_frame": 0.5, "protocol": "strict"}
-        write_json(Path(words[2]) / "evaluation.json", {**found, "configuration": {}})
+        write_json(made / "evaluation.json", {**found, "configuration": {}})
+        return Usage(1.0, 1)
 
-    asked = [tmp_path / "flat"], tmp_path, (32, 64), 32, "cpu", run, lambda _: None
-    measure_scales(*asked)
+    asked = (tmp_path / "flat",), tmp_path, (32, 64), 32, "cpu", tmp_path / "page.md"
+    scales(*asked, run=run)
     assert not (tmp_path / "scales-flat.png").exists()
-    measure_scales(*asked, pictures=tmp_path)
+    scales(*asked, pictures=tmp_path, run=run)
     sheet = np.asarray(Image.open(tmp_path / "scales-flat.png"))
     thirds = np.array_split(sheet[-12:], len(SHOWN) + 1, axis=1)
     assert [int(np.median(third)) for third in thirds[1:]] == [100, 200]
     assert thirds[0].std() > 1
-    write_page(tmp_path, tmp_path / "page.md")
     assert "(scales-flat.png)" in (tmp_path / "page.md").read_text()

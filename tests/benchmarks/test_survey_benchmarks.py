@@ -27,7 +27,7 @@ def test_every_survey_is_prepared_and_reconstructed_once(tmp_path: Path) -> None
 
     (tmp_path / "creek").mkdir()
     for _ in range(2):
-        measure_surveys(tmp_path, tmp_path / "runs", ["creek"], run, print)
+        measure_surveys(tmp_path, tmp_path / "runs", ["creek"], run)
     prepare, exhaustive = asked
     folder = tmp_path / "runs" / "creek"
     assert prepare[-3:] == ["prepare", str(tmp_path / "creek"), str(folder / "scene")]
@@ -40,7 +40,7 @@ def test_every_survey_is_prepared_and_reconstructed_once(tmp_path: Path) -> None
     ]
     assert read_json(folder / "prepare.json")["seconds"] == 100.0
     with pytest.raises(SurveyError, match="elsewhere is missing"):
-        measure_surveys(tmp_path, tmp_path / "runs", ["elsewhere"], run, print)
+        measure_surveys(tmp_path, tmp_path / "runs", ["elsewhere"], run)
 
 
 def test_the_page_shows_model_training_and_time(tmp_path: Path) -> None:

@@ -3,14 +3,16 @@
 import json
 from pathlib import Path
 
+import pytest
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
-from benchmarks.view import lines, measure_view
+from benchmarks.view import lines, view
 
 
-def test_moves_and_rests_are_measured_and_stored(tmp_path: Path):
+def test_moves_and_rests_are_measured_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("benchmarks.view.SIZE_PX", (64, 48))
     write_colmap(tmp_path / "scene", survey(PINHOLE))
-    record = measure_view(tmp_path / "scene", tmp_path / "runs", width=64, height=48, moves=4, rests=2)
+    record = view(tmp_path / "scene", tmp_path / "runs", moves=4, rests=2)
     assert json.loads((tmp_path / "runs" / "view.json").read_text())["moves"] == 4
     assert len(record["after_a_move"]["sharp_s"]) == 2
     for coarse, sharp in zip(record["after_a_move"]["coarse_s"], record["after_a_move"]["sharp_s"], strict=True):

@@ -30,7 +30,7 @@ from tidefield.config import PROTOCOL
 from tidefield.errors import RunError, SceneError
 from tidefield.evaluation import EVALUATION_FILE
 from tidefield.files import completed_folder, only_writer, read_json, write_json
-from tidefield.machine import describe
+from tidefield.machine import describe, peak_bytes
 from tidefield.methods import METHODS, UNTRAINED_DEVICE
 from tidefield.processes import Ended, end_with_parent
 
@@ -166,7 +166,7 @@ def tidal_flats(folder: Path, width: int, real: Sequence[Path]) -> dict[str, Pat
     Raises:
         SceneError: two scenes have the same name.
     """
-    from tidefield.synthetic import CATEGORIES, make_survey, write_survey
+    from tidefield.synthetic import CATEGORIES
 
     surveys, scenes = named(real), {}
     for category in surveys.keys() & set(CATEGORIES):
@@ -176,10 +176,17 @@ def tidal_flats(folder: Path, width: int, real: Sequence[Path]) -> dict[str, Pat
         )
     for category in CATEGORIES:
         scenes[category] = scene = folder / f"{category}-{width}"
-        if not scene.exists():
-            with completed_folder(scene) as partial:
-                write_survey(make_survey(category, seed=11, views=40, width=width), partial)
+        make_flat(scene, category, seed=11, views=40, width=width)
     return scenes | surveys
+
+
+def make_flat(scene: Path, category: str, seed: int, views: int, width: int) -> None:
+    """Make the survey of a built-in flat in a folder, unless that is there; photographs are `width` pixels wide."""
+    from tidefield.synthetic import make_survey, write_survey
+
+    if not scene.exists():
+        with completed_folder(scene) as partial:
+            write_survey(make_survey(category, seed=seed, views=views, width=width), partial)
 
 
 def named(scenes: Sequence[Path]) -> dict[str, Path]:
@@ -216,8 +223,7 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str], output:
             # The usage of this one child; getrusage(RUSAGE_CHILDREN) is the largest of all so far.
             _, status, usage = os.wait4(process.pid, 0)
             process.returncode = os.waitstatus_to_exitcode(status)
-            # Kilobytes on Linux, bytes on macOS.
-            peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+            peak = peak_bytes(usage.ru_maxrss)
         else:
             process.wait()
     except KeyboardInterrupt as error:

@@ -31,7 +31,7 @@ from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, require_writable, write_json
-from tidefield.machine import commit
+from tidefield.machine import commit, peak_bytes
 from tidefield.model.rendering import Render, Rendering, to_8_bit
 from tidefield.progress import ProgressBar, make_console
 
@@ -175,8 +175,7 @@ def _peak_memory() -> dict[str, int | None]:
     if sys.platform != "win32":
         import resource
 
-        # Kilobytes on Linux, bytes on macOS.
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        peak = peak_bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     return {
         "peak_memory_bytes": peak,
