@@ -1,7 +1,7 @@
 """Difference, level of detection, outlines and volumes against known changes."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,11 +13,12 @@ from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
-from tidefield.change.measure import Change, Options, Register, _sampled, _slopes, measure
+from tidefield.change.measure import Change, Options, Register, _slopes, measure
 from tidefield.change.page import limits
 from tidefield.change.regions import Region, read_regions
 from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
+from tidefield.change.stable import sampled
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.change.write import volume_rows
@@ -343,7 +344,7 @@ def test_a_tilt_is_found(tmp_path: Path):
     found = measured(earlier, later, options=Options(register="tilt"))
     np.testing.assert_allclose(
         found.stable_before_dz - found.stable_dz,
-        _sampled(found.errors.registration.plane(found.grid, slice(0, 200)), found.stable),
+        sampled(found.errors.registration.plane(found.grid, slice(0, 200)), found.stable),
         atol=1e-5,
     )
     _, gx, gy = found.errors.registration.coefficients
@@ -406,6 +407,7 @@ def test_an_error_of_the_shift_adds_up_over_a_slope_and_cancels_out_over_a_hill(
     on_hill = ErrorModel(0.05, UNCORRELATED, registration, grid, slopes=hill)
     assert on_hill.volume(dz, every).systematic_m3 == pytest.approx(0.003 * every.sum() * AREA)
     assert on_hill.systematic_of_sum(part[box], box) == pytest.approx(on_hill.systematic_of_sum(part))
+    assert asdict(on_hill.volume(dz[box], part[box], box=box)) == pytest.approx(asdict(on_hill.volume(dz, part)))
     assert on_hill.cell_sigma(slice(0, 1))[0, 0] == pytest.approx(math.hypot(0.05, 0.003, slope * error * math.sqrt(2)))
 
 

@@ -16,7 +16,8 @@ from tidefield.maps import surface
 from tidefield.maps.grid import Grid, MapFrame, Tile, map_frame
 from tidefield.maps.orthophoto import prior_of
 from tidefield.maps.stereo import Pairs, Rectified, choose_pairs, fill_gaps
-from tidefield.maps.surface import COARSEST, GreyPhotographs, View, choose_views, match, sparse_surface
+from tidefield.maps.surface import COARSEST, choose_views, match, sparse_surface
+from tidefield.maps.views import GreyPhotographs, View
 from tidefield.synthetic import make_survey, write_survey
 
 pytest.importorskip("rasterio")

@@ -70,7 +70,6 @@ def repeat_choice(
     variogram: Variogram,
     cell_m: float,
     outlines: Outlines,
-    seed: int = 0,
 ) -> tuple[Choice, Choice]:
     """Bias and deviation of the sums of dz in the outlines of lower and of higher ground.
 
@@ -80,7 +79,7 @@ def repeat_choice(
     tiles, share = _tiles(outlines.labels)
     sums = np.zeros((2, _REPEATS))
     for number, box in enumerate(tiles):
-        random = np.random.default_rng([seed, number])
+        random = np.random.default_rng([0, number])
         part, labels = dz[box], outlines.labels[box]
         known = np.isfinite(part)
         own, near = (of[box] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))

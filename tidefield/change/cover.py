@@ -21,10 +21,11 @@ from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 from scipy.ndimage import label
 
 from tidefield.change.errors import nmad
-from tidefield.change.light import greenness, light_gains, smoothed, with_light
+from tidefield.change.light import greenness, light_gains, with_light
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import STRIP_CELLS, ChangeError, Grid
+from tidefield.maps.smoothing import smoothed
 
 MARGIN = 0.035
 """Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""

@@ -19,13 +19,12 @@ from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
 from tidefield.change.water import Waterline
 from tidefield.maps.figures import INCHES, INK, RULE, SOFT, Extent, figure_of, map_of, png
+from tidefield.maps.terrain import hillshade
 
 LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
 GAINED, LOST = "#1a7a3c", "#b8742a"
 _SIDE = 1400
 """Longest side of a map, cells."""
-_SUN = np.array([-1, 1, 1.4]) / np.linalg.norm([-1, 1, 1.4])
-"""From the north-west."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +48,14 @@ def thinned(change: Change) -> Thinned:
     """Take every second, third, ... cell of a large change."""
     grid = change.grid
     step = -(-max(grid.shape) // _SIDE)
-    rows, columns = len(range(0, grid.rows, step)), len(range(0, grid.columns, step))
-    heights = np.empty((rows, columns), np.float32)
+    small = grid.thinned(step)
+    heights = np.empty(small.shape, np.float32)
     with change.earlier.on_grid(grid) as read:
         for part in grid.strips():
             first = -(-part.start // step) * step
             heights[first // step : -(-part.stop // step)] = read(part.start, part.stop)[
                 first - part.start :: step, ::step
             ]
-    small = Grid(grid.crs, grid.west_m, grid.north_m, grid.cell_m * step, columns, rows)
     lookup = np.concatenate([[0], change.outlines.signs])
     return Thinned(
         small,
@@ -66,19 +64,6 @@ def thinned(change: Change) -> Thinned:
         lookup[change.outlines.labels[::step, ::step]],
         change.stable[::step, ::step],
     )
-
-
-def hillshade(heights: Float32[np.ndarray, "rows columns"], cell_m: float) -> Float32[np.ndarray, "rows columns"]:
-    """Shade heights with the light from the north-west, in [0, 1]; NaN where unknown. Flats are exaggerated."""
-    north, east = np.gradient(heights, cell_m)
-    known = np.isfinite(north) & np.isfinite(east)
-    if not known.any():
-        return np.full(heights.shape, np.nan, np.float32)
-    steep = float(np.quantile(np.hypot(north, east)[known], 0.9))
-    scale = min(8.0, 0.35 / max(steep, 1e-6))
-    normal = np.stack([-east * scale, north * scale, np.ones_like(east)])
-    light = np.tensordot(_SUN, normal, 1) / np.sqrt((normal**2).sum(axis=0))
-    return np.where(known, light.clip(0, 1), np.nan).astype(np.float32)
 
 
 def draw_change(small: Thinned, limit_m: float, what: str) -> Markup:
@@ -111,12 +96,12 @@ def draw_stable(small: Thinned, what: str) -> Markup:
 def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
     """The map of plants gained, lost and at both dates over the earlier survey's relief."""
     step = -(-max(cover.grid.shape) // _SIDE)
-    classes = cover.classes[::step, ::step]
+    classes, extent = cover.classes[::step, ::step], _extent(cover.grid.thinned(step))
     figure, axes = _map(small)
     handles = []
     for code, colour, label in ((2, "#b9c8a0", "plants at both dates"), (1, GAINED, "gained"), (-1, LOST, "lost")):
         shown = np.where(classes == code, 1.0, np.nan)
-        axes.imshow(shown, cmap=ListedColormap([colour]), extent=_extent(cover.grid), interpolation="nearest")
+        axes.imshow(shown, cmap=ListedColormap([colour]), extent=extent, interpolation="nearest")
         handles.append(Patch(color=colour, label=label))
     axes.legend(handles=handles, loc="lower left", framealpha=0.9)
     return png(figure, what)
@@ -196,9 +181,12 @@ def draw_section(change: Change, row: int, what: str) -> Markup:
 
 
 def _map(small: Thinned) -> tuple[Figure, Axes]:
-    """A map of the earlier survey's relief."""
+    """A map of the earlier survey's relief, exaggerated where it is flat."""
     figure, axes = map_of(*small.grid.shape)
-    shade = hillshade(small.heights, small.grid.cell_m)
+    steepness = np.hypot(*np.gradient(small.heights, small.grid.cell_m))
+    known = steepness[np.isfinite(steepness)]
+    scale = min(8.0, 0.35 / max(float(np.quantile(known, 0.9)), 1e-6)) if len(known) else 1.0
+    shade = np.where(np.isfinite(small.heights), hillshade(scale * small.heights, small.grid.cell_m), np.nan)
     axes.imshow(0.45 + 0.5 * shade, cmap="gray", vmin=0, vmax=1, extent=_extent(small.grid), interpolation="nearest")
     return figure, axes
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
@@ -50,17 +49,6 @@ def with_light(
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """A picture with its channels multiplied."""
     return np.round((picture + _DARK) * gains - _DARK).clip(0, 255).astype(np.uint8)
-
-
-def smoothed(
-    picture: UInt8[np.ndarray, "rows columns bands"] | Float32[np.ndarray, "rows columns bands"],
-    known: Bool[np.ndarray, "rows columns"],
-    sigma_px: float,
-) -> Float32[np.ndarray, "rows columns bands"]:
-    """Gaussian means of the known pixels of a picture."""
-    values = np.where(known[..., None], picture, 0).astype(np.float32)
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma_px)
-    return cv2.GaussianBlur(values, (0, 0), sigma_px) / np.maximum(weight, np.float32(1e-3))[..., None]
 
 
 def greenness(colours: Float32[np.ndarray, "*shape 3"]) -> Float32[np.ndarray, "*shape"]:

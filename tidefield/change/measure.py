@@ -16,24 +16,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32
 from pyproj import CRS
-from scipy.ndimage import maximum_filter, uniform_filter
 
 from tidefield.change.choice import repeat_choice
-from tidefield.change.errors import Z95, Variogram, deviation95, fit_variogram, nmad
+from tidefield.change.errors import Z95
 from tidefield.change.outlines import WINDOWS, Outlines, find_outlines
 from tidefield.change.regions import Region, rasterised
-from tidefield.change.registration import (
-    LEAST_STABLE,
-    Model,
-    Registration,
-    centre,
-    covariance,
-    fit,
-    lowered,
-    statistics,
-)
-from tidefield.change.repeats import repeated, rounding_m
+from tidefield.change.registration import LEAST_STABLE, Model
+from tidefield.change.repeats import leave_out_repeated, rounding_m
 from tidefield.change.shift import Shift, find_shift
+from tidefield.change.stable import MOST_SAMPLED, false_alarms, sampled, settle
 from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_datums, warped
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.errors import list_names
@@ -43,17 +34,8 @@ from tidefield.maps.classes import WATER
 log = logging.getLogger(__name__)
 
 Register = Literal["auto", "none", "vertical", "tilt"]
-_TURNS = 4
-_STANDS_OUT = 3.0
-"""Deviations of a window's mean."""
-_MOST_SAMPLED = 2_000_000
-"""Cells that quantiles are computed from."""
-_MOST_REPEATED = 0.5
-"""Of more cells that are the same in both surveys, what is left is too little to tell change from a shift."""
 _WHOLE = 0.99
 """Share of a polygon that is all of it but for its edges."""
-_NMAD_CELLS = 1000
-"""With fewer cells of stable ground their 95% quantile is uncertain, and the NMAD is used if it is larger."""
 
 
 @dataclass(frozen=True)
@@ -268,12 +250,13 @@ def measure(
     unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)[0]
     unmoved[wet] = np.nan
     steps = rounding_m(earlier), rounding_m(later)
-    _leave_out_repeated(dz, unmoved, max(steps), given, area, remarks)
+    leave_out_repeated(dz, unmoved, max(steps), given, area, remarks)
     del unmoved
     rounding = math.hypot(*steps) / math.sqrt(12)  # each error is uniform within a step
     model: Model = "vertical" if options.register == "auto" else options.register
-    settled = _settle(dz, own, grid, given, model, options, rounding, remarks)
-    registration, variogram, sigma, ground = settled
+    registration, variogram, sigma, ground = settle(
+        dz, own, grid, given, model, options.windows, options.datum_error_m, rounding, remarks
+    )
     slopes = None
     shift_error_m = shift.error_m if shift is not None and shift.known else options.shift_error_m
     if shift is not None:
@@ -284,16 +267,16 @@ def measure(
         slopes = _slopes(earlier, grid)
         if model != "none":
             # The mean over stable ground of what an error of the shift does was subtracted there.
-            slopes -= np.stack([_sampled(part, ground).mean() for part in slopes])[:, None, None]
-    shown_before = _sampled(dz, ground)
+            slopes -= np.stack([sampled(part, ground).mean() for part in slopes])[:, None, None]
+    shown_before = sampled(dz, ground)
     for rows in grid.strips():
         dz[rows] -= registration.plane(grid, rows)
     if len(on_water):
         on_water -= np.concatenate([registration.plane(grid, rows)[wet[rows]] for rows in grid.strips()])
     degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
     errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
-    alarms = _false_alarms(dz, errors, ground)
-    shown = _sampled(dz, ground), shown_before
+    alarms = false_alarms(dz, errors, ground)
+    shown = sampled(dz, ground), shown_before
     if area is not None:
         dz[~area] = np.nan
         on_water[~area[wet]] = np.nan
@@ -374,180 +357,6 @@ def _slopes(surface: Surface, grid: Grid) -> Float32[np.ndarray, "2 rows columns
     return np.nan_to_num(out, copy=False)
 
 
-def _settle(
-    dz: Float32[np.ndarray, "rows columns"],
-    own: Float32[np.ndarray, "rows columns"] | None,
-    grid: Grid,
-    given: Bool[np.ndarray, "rows columns"] | None,
-    model: Model,
-    options: Options,
-    rounding: float,
-    remarks: list[str],
-) -> tuple[Registration, Variogram, Float32[np.ndarray, "rows columns"] | float, Bool[np.ndarray, "rows columns"]]:
-    """Stable ground, what is subtracted, and the errors, in turns where stable ground is not given.
-
-    Args:
-        rounding: one sigma of what the rounding of heights does to dz, metres; errors are at least as large.
-    """
-    ground = guess = _unchanged(dz, own, grid, model, rounding) if given is None else given
-    turns = _TURNS if given is None else 1
-    found = None
-    for turn in range(turns):
-        cells = int(ground.sum())
-        if cells < LEAST_STABLE:
-            raise ChangeError(
-                f"the surveys have {cells} cells of stable ground: expected at least {LEAST_STABLE} to measure shift "
-                "and errors on; give more polygons of ground that did not change (--stable), or a smaller --cell"
-            )
-        coefficients = fit(dz, ground, grid, model, rounding)
-        before = statistics(_sampled(dz, ground))
-        residual = lowered(dz, coefficients, grid)
-        residual[~ground] = np.nan
-        left = fit(residual, ground, grid, "vertical", rounding)[0] if model == "none" else 0.0
-        after = statistics(_sampled(residual, ground))
-        if own is not None:
-            residual /= own
-        values = _sampled(residual, ground)
-        middle = np.float32(np.median(values))
-        values = values - middle
-        size = deviation95(values)
-        if len(values) < _NMAD_CELLS:
-            size = max(size, nmad(values))
-        size = max(size, 1e-6)
-        residual -= middle
-        if own is None:
-            sigma = max(size, rounding)
-            residual /= np.float32(sigma)
-        else:
-            sigma = np.maximum(own * np.float32(size), np.float32(rounding))
-            residual *= own / sigma
-        is_last = given is not None or turn == turns - 1
-        if is_last and rounding > np.median(_sampled(own, ground) * size if own is not None else size):
-            remarks.append(
-                f"heights are rounded, by which they are off by {rounding:.3g} m (one sigma): errors are taken to be "
-                "at least that"
-            )
-        variogram = fit_variogram(residual, grid.cell_m)
-        del residual
-        found = Registration(
-            model,
-            coefficients,
-            covariance(model, ground, sigma, variogram, grid, left, options.datum_error_m),
-            centre(grid),
-            cells,
-            before,
-            after,
-        )
-        if is_last:
-            return found, variogram, sigma, ground
-        moved = lowered(dz, coefficients, grid)
-        outlines = find_outlines(moved, sigma, found.near(grid), variogram, grid.cell_m, options.windows)
-        del moved
-        ground = guess & ~dilated(outlines.labels > 0, max(options.windows) // 2)
-    raise AssertionError("the last turn returns")
-
-
-def _leave_out_repeated(
-    dz: Float32[np.ndarray, "rows columns"],
-    unmoved: Float32[np.ndarray, "rows columns"],
-    step_m: float,
-    given: Bool[np.ndarray, "rows columns"] | None,
-    area: Bool[np.ndarray, "rows columns"] | None,
-    remarks: list[str],
-) -> None:
-    """Leave out cells that one survey has from the other, which were not measured twice, and say so.
-
-    Args:
-        unmoved: dz without a horizontal shift, which interpolates: only there are the cells the same.
-        step_m: what heights are rounded to.
-        given: stable ground, if the user named it.
-        area: that the comparison is limited to, likewise.
-    """
-    same, share = repeated(unmoved, step_m)
-    if not share:
-        return
-    if unmoved is not dz:
-        same = dilated(same, 1)
-    alike = f"{100 * share:.0f}% of the cells have the same height in both surveys, as if one had them from the other"
-    if share == 1:
-        remarks.append(
-            "all heights are the same in both surveys, so that no errors can be measured: intervals have none"
-        )
-    elif (
-        share > _MOST_REPEATED
-        or (given is not None and np.count_nonzero(given & ~same) < LEAST_STABLE)
-        or (area is not None and not (area & np.isfinite(dz) & ~same).any())
-    ):
-        remarks.append(
-            f"{alike}: errors are too small if these cells were not measured twice; limit the comparison to what was "
-            "(--within), and name stable ground there (--stable)"
-        )
-    else:
-        dz[same] = np.nan
-        if given is not None:
-            given &= ~same
-        remarks.append(f"{alike}: left out, since they were not measured twice")
-
-
-def _unchanged(
-    dz: Float32[np.ndarray, "rows columns"],
-    own: Float32[np.ndarray, "rows columns"] | None,
-    grid: Grid,
-    model: Model,
-    rounding: float,
-) -> Bool[np.ndarray, "rows columns"]:
-    """Ground where no change stands out from what most of it has in common, as a first guess."""
-    if model != "tilt":
-        return _even_part(dz, own, rounding)
-    # A change may be less than what a tilt does at the edges, and moves the plane until it is left out.
-    ground = np.isfinite(dz)
-    for _ in range(_TURNS):
-        ground = _even_part(lowered(dz, fit(dz, ground, grid, model, rounding), grid), own, rounding)
-    return ground
-
-
-def _even_part(
-    dz: Float32[np.ndarray, "rows columns"], own: Float32[np.ndarray, "rows columns"] | None, rounding: float
-) -> Bool[np.ndarray, "rows columns"]:
-    """Ground where no window's mean stands out from what most windows have in common."""
-    known = np.isfinite(dz)
-    ground = known
-    least = rounding if own is None else rounding / float(np.median(_sampled(own, known)))
-    for window in (5, 11):
-        mean = np.where(known, dz if own is None else dz / own, np.float32(0))
-        uniform_filter(mean, window, output=mean, mode="constant")
-        mean /= np.maximum(uniform_filter(known.astype(np.float32), window, mode="constant"), np.float32(1e-6))
-        middle, spread = 0.0, math.inf
-        for _ in range(_TURNS):
-            some = _sampled(mean, ground)
-            middle, spread = float(np.median(some)), nmad(some)
-            ground = known & (np.abs(mean - middle) <= _STANDS_OUT * max(spread, least / window))
-    return ground
-
-
-def dilated(region: Bool[np.ndarray, "rows columns"], cells: int) -> Bool[np.ndarray, "rows columns"]:
-    """A region with a margin of this many cells, a square around each."""
-    if cells == 0:
-        return region
-    return np.asarray(maximum_filter(region.view(np.uint8), 2 * cells + 1, mode="constant"), np.uint8).view(bool)
-
-
-def _false_alarms(
-    dz: Float32[np.ndarray, "rows columns"], errors: ErrorModel, ground: Bool[np.ndarray, "rows columns"]
-) -> float:
-    """Share of stable cells that are significant by themselves."""
-    alarms = 0
-    for rows in errors.grid.strips():
-        alarms += int((np.abs(dz[rows]) > Z95 * errors.cell_sigma(rows)).sum(where=ground[rows]))
-    return alarms / int(ground.sum())
-
-
-def _sampled(values: Float32[np.ndarray, "rows columns"], region: Bool[np.ndarray, "rows columns"]) -> np.ndarray:
-    """Values in a region; of a large one every second, third, ... in both directions."""
-    step = 1 + math.isqrt(max(0, int(region.sum()) - 1) // _MOST_SAMPLED)
-    return values[::step, ::step][region[::step, ::step]]
-
-
 def _summed(
     earlier: Surface,
     later: Surface,
@@ -569,7 +378,7 @@ def _summed(
         significant = np.abs(dz[rows]) > Z95 * sigma
         beyond[0] -= float(dz[rows].sum(where=significant & (dz[rows] < 0), dtype=np.float64))
         beyond[1] += float(dz[rows].sum(where=significant & (dz[rows] > 0), dtype=np.float64))
-        detection.append(sigma[known[rows]][:: max(1, grid.columns * grid.rows // _MOST_SAMPLED)])
+        detection.append(sigma[known[rows]][:: max(1, grid.columns * grid.rows // MOST_SAMPLED)])
     low, middle, high = (Z95 * np.quantile(np.concatenate(detection), (0.05, 0.5, 0.95))).tolist()
     lower, higher = outlines.cells(-1), outlines.cells(1)
     choices = None
@@ -592,7 +401,8 @@ def _summed(
     cut, fill = chosen(known)
     each = []
     for k, (box, sign) in enumerate(zip(outlines.boxes, outlines.signs.tolist(), strict=True), start=1):
-        each.append((k, *_in_box(dz, errors, outlines.labels, k, box, sign)))
+        part, inside = dz[box], outlines.labels[box] == k
+        each.append((k, errors.volume(part, inside, float(sign), box), float(np.abs(part[inside]).max())))
     per_region, empty = [], []
     for region in regions:
         cells = region.cells(grid)
@@ -625,29 +435,4 @@ def _summed(
         float(beyond[1]) * grid.cell_area_m2,
         (low, middle, high),
         remarks,
-    )
-
-
-def _in_box(
-    dz: np.ndarray, errors: ErrorModel, labels: np.ndarray, number: int, box: tuple[slice, slice], sign: int
-) -> tuple[Volume, float]:
-    """Volume of one outline as a positive number, and its largest |dz|."""
-    from tidefield.change.errors import region_error
-
-    inside = labels[box] == number
-    values = dz[box][inside].astype(np.float64)
-    sigma = errors.sigma[box] if isinstance(errors.sigma, np.ndarray) else errors.sigma
-    own = region_error(sigma, inside, errors.variogram, errors.grid.cell_m)
-    area = errors.grid.cell_area_m2
-    return (
-        Volume(
-            sign * float(values.sum()) * area,
-            own.random * area,
-            own.correlated * area,
-            errors.systematic_of_sum(inside, box) * area,
-            len(values) * area,
-            degrees_of_freedom=errors.degrees_of_freedom,
-            datum_m3=errors.stated_of_sum(inside, box) * area,
-        ),
-        float(np.abs(values).max()),
     )

@@ -13,6 +13,7 @@ import shapely
 from jaxtyping import Bool
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
+from scipy.ndimage import maximum_filter
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.change.surfaces import ChangeError, Grid, is_local, require_rasterio
@@ -160,3 +161,10 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
             f"nothing in {path} is where both surveys are: expected polygons there; check its coordinates"
         )
     return found
+
+
+def dilated(region: Bool[np.ndarray, "rows columns"], cells: int) -> Bool[np.ndarray, "rows columns"]:
+    """A region with a margin of this many cells, a square around each."""
+    if cells == 0:
+        return region
+    return np.asarray(maximum_filter(region.view(np.uint8), 2 * cells + 1, mode="constant"), np.uint8).view(bool)

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import binary_dilation, binary_opening
 
+from tidefield.change.regions import dilated
+from tidefield.change.registration import LEAST_STABLE
 from tidefield.change.surfaces import Surface
 
 _SIDE = 3
@@ -22,6 +24,50 @@ _LEAST_STEP_M = 0.0005
 """Of what matters: numbers of 32 bits are rounded, too."""
 _READ = 1024
 """Rows and columns of the part of a surface that is read to see what it is rounded to."""
+_MOST_REPEATED = 0.5
+"""Of more cells that are the same in both surveys, what is left is too little to tell change from a shift."""
+
+
+def leave_out_repeated(
+    dz: Float32[np.ndarray, "rows columns"],
+    unmoved: Float32[np.ndarray, "rows columns"],
+    step_m: float,
+    given: Bool[np.ndarray, "rows columns"] | None,
+    area: Bool[np.ndarray, "rows columns"] | None,
+    remarks: list[str],
+) -> None:
+    """Leave out cells that one survey has from the other, which were not measured twice, and say so.
+
+    Args:
+        unmoved: dz without a horizontal shift, which interpolates: only there are the cells the same.
+        step_m: what heights are rounded to.
+        given: stable ground, if the user named it.
+        area: that the comparison is limited to, likewise.
+    """
+    same, share = repeated(unmoved, step_m)
+    if not share:
+        return
+    if unmoved is not dz:
+        same = dilated(same, 1)
+    alike = f"{100 * share:.0f}% of the cells have the same height in both surveys, as if one had them from the other"
+    if share == 1:
+        remarks.append(
+            "all heights are the same in both surveys, so that no errors can be measured: intervals have none"
+        )
+    elif (
+        share > _MOST_REPEATED
+        or (given is not None and np.count_nonzero(given & ~same) < LEAST_STABLE)
+        or (area is not None and not (area & np.isfinite(dz) & ~same).any())
+    ):
+        remarks.append(
+            f"{alike}: errors are too small if these cells were not measured twice; limit the comparison to what was "
+            "(--within), and name stable ground there (--stable)"
+        )
+    else:
+        dz[same] = np.nan
+        if given is not None:
+            given &= ~same
+        remarks.append(f"{alike}: left out, since they were not measured twice")
 
 
 def repeated(dz: Float32[np.ndarray, "rows columns"], step_m: float) -> tuple[Bool[np.ndarray, "rows columns"], float]:

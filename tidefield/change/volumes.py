@@ -165,26 +165,25 @@ class ErrorModel:
         dz: Float32[np.ndarray, "rows columns"],
         region: Bool[np.ndarray, "rows columns"],
         scale: float = 1.0,
+        box: tuple[slice, slice] | None = None,
     ) -> Volume:
         """Sum dz over a region.
 
         Args:
             region: cells that are summed; dz is known in all of them.
             scale: -1 for cut, which is given as a positive number.
+            box: the rows and columns of the grid that dz and the region cover; all if None.
         """
         area = self.grid.cell_area_m2
-        cells, total = 0, 0.0
-        for rows in self.grid.strips():
-            inside = region[rows]
-            cells += int(inside.sum())
-            total += float(dz[rows].sum(where=inside, dtype=np.float64))
-        own = region_error(self.sigma, region, self.variogram, self.grid.cell_m)
+        total = float(dz.sum(where=region, dtype=np.float64))
+        sigma = self.sigma[box] if box is not None and isinstance(self.sigma, np.ndarray) else self.sigma
+        own = region_error(sigma, region, self.variogram, self.grid.cell_m)
         return Volume(
             scale * total * area + 0.0,  # no minus before a cut of nothing
             own.random * area,
             own.correlated * area,
-            self.systematic_of_sum(region) * area,
-            cells * area,
+            self.systematic_of_sum(region, box) * area,
+            int(region.sum()) * area,
             degrees_of_freedom=self.degrees_of_freedom,
-            datum_m3=self.stated_of_sum(region) * area,
+            datum_m3=self.stated_of_sum(region, box) * area,
         )

@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float32
@@ -23,6 +22,7 @@ from tidefield.change.cover import small_patches
 from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
+from tidefield.maps.smoothing import smoothed
 
 _SMOOTH = 5
 """Cells along each side of the window whose mean height is compared with a level."""
@@ -213,9 +213,7 @@ def _edges(wet: Bool[np.ndarray, "rows columns"], known: Bool[np.ndarray, "rows 
         return []
     # A line that unknown cells touch follows these, not the water.
     sure = np.asarray(minimum_filter(known.astype(np.uint8), 3, mode="nearest"), np.uint8).view(bool)
-    share = cv2.GaussianBlur((wet & known).astype(np.float32), (0, 0), _ROUNDED)
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), _ROUNDED)
-    masked = np.ma.masked_array(share / np.maximum(weight, np.float32(1e-6)), ~sure)
+    masked = np.ma.masked_array(smoothed(wet, known, _ROUNDED), ~sure)
     east = grid.west_m + (np.arange(wet.shape[1]) + 0.5) * grid.cell_m
     north = grid.north_m - (np.arange(wet.shape[0]) + 0.5) * grid.cell_m
     generator = contour_generator(east, north, masked, line_type=LineType.Separate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,17 @@ from jaxtyping import Bool
 from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 
-from tidefield import SOFTWARE, __version__
+from tidefield import __version__
 from tidefield.change.cover import LEAST_M2, Cover
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import PLAIN, ChangeError, Grid, Surface, opened, require_rasterio
+from tidefield.change.surfaces import PLAIN, Grid, Surface, opened, require_rasterio
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water, Waterline
 from tidefield.files import plain_cell, write_json, write_text
+from tidefield.maps.rasters import Raster, RasterWriter, cog_writer
+from tidefield.maps.vectors import Layer, write_geopackage
 
-BLOCK = 512
 MOST_OUTLINES = 5000
 """Polygons that are written, the largest volumes first."""
 _MOST_POLYGONS_OF_GROUND = 2000
@@ -46,60 +47,15 @@ SIGNIFICANT_BANDS = (
 
 @contextmanager
 def cog(
-    path: Path, grid: Grid, bands: Sequence[str], dtype: str, nodata: float, tags: Mapping[str, str] | None = None
-) -> Iterator[Callable[[slice, np.ndarray], None]]:
-    """A function that writes rows of a raster, which becomes a Cloud-Optimized GeoTIFF when the block ends.
-
-    The function takes rows and an array of bands, rows and columns.
-    """
-    rasterio = require_rasterio()
-    from rasterio.shutil import copy
-    from rasterio.windows import Window
-
-    plain = path.with_suffix(".plain.tif")
-    profile = {
-        "driver": "GTiff",
-        "width": grid.columns,
-        "height": grid.rows,
-        "count": len(bands),
-        "dtype": dtype,
-        "nodata": nodata,
-        "crs": grid.crs,
-        "transform": grid.transform,
-        "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
-        "interleave": "band",
-        "bigtiff": "if_safer",
-    }
-    try:
-        with rasterio.Env(GDAL_CACHEMAX=256):
-            with rasterio.open(plain, "w", **profile) as file:
-                file.update_tags(TIFFTAG_SOFTWARE=SOFTWARE, **(tags or {}))
-                for k, text in enumerate(bands, start=1):
-                    file.set_band_description(k, text)
-
-                def write(rows: slice, values: np.ndarray) -> None:
-                    window = Window(0, rows.start, grid.columns, rows.stop - rows.start)  # type: ignore[call-arg]
-                    file.write(values.astype(dtype, copy=False), window=window)
-
-                yield write
-            copy(
-                plain,
-                path,
-                driver="COG",
-                COMPRESS="DEFLATE",
-                PREDICTOR="YES",
-                LEVEL=6,
-                BLOCKSIZE=BLOCK,
-                OVERVIEW_RESAMPLING="AVERAGE" if dtype == "float32" else "NEAREST",
-                BIGTIFF="IF_SAFER",
-                NUM_THREADS="ALL_CPUS",
-            )
-    except rasterio.errors.RasterioError as error:
-        raise ChangeError(f"{path} cannot be written ({error}): expected free space; make room") from error
-    finally:
-        plain.unlink(missing_ok=True)
+    path: Path, grid: Grid, bands: tuple[str, ...], kind: str, nodata: float, tags: Mapping[str, str] | None = None
+) -> Iterator[RasterWriter]:
+    """Write a raster of a grid by rows; it is there, as a Cloud-Optimized GeoTIFF, when the block ends."""
+    raster = Raster(path, bands, kind, nodata, tags=tags or {})
+    with (
+        require_rasterio().Env(GDAL_CACHEMAX=256),
+        cog_writer(raster, grid.columns, grid.rows, grid.crs, grid.transform[:6], fast=True) as writer,
+    ):
+        yield writer
 
 
 def write_rasters(change: Change, folder: Path) -> None:
@@ -107,17 +63,17 @@ def write_rasters(change: Change, folder: Path) -> None:
     tags = {"EARLIER": change.earlier.name, "LATER": change.later.name}
     lookup = np.concatenate([[0], change.outlines.signs]).astype(np.int8)
     with (
-        cog(folder / "change.tif", change.grid, CHANGE_BANDS, "float32", math.nan, tags) as write,
-        cog(folder / "significant.tif", change.grid, SIGNIFICANT_BANDS, "int8", UNKNOWN, tags) as write_signs,
+        cog(folder / "change.tif", change.grid, CHANGE_BANDS, "float32", math.nan, tags) as numbers,
+        cog(folder / "significant.tif", change.grid, SIGNIFICANT_BANDS, "int8", UNKNOWN, tags) as signs,
     ):
         for rows in change.grid.strips():
             dz = change.dz[rows]
             known = np.isfinite(dz)
             sigma, shared = (np.where(known, each, np.float32(np.nan)) for each in change.errors.cell_sigmas(rows))
-            write(rows, np.stack([dz, sigma, p_values(dz / sigma), shared]))
+            numbers.write(rows.start, np.stack([dz, sigma, p_values(dz / sigma), shared]))
             alone = np.where(np.abs(dz) > Z95 * sigma, np.sign(np.where(known, dz, 0)), 0).astype(np.int8)
             outlined = lookup[change.outlines.labels[rows]]
-            write_signs(rows, np.where(known, np.stack([alone, outlined]), np.int8(UNKNOWN)))
+            signs.write(rows.start, np.where(known, np.stack([alone, outlined]), np.int8(UNKNOWN)))
 
 
 def polygons_of(
@@ -186,9 +142,9 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 
 def write_cover(cover: Cover, folder: Path) -> None:
     """Write cover.tif and cover.csv."""
-    with cog(folder / "cover.tif", cover.grid, COVER_BANDS, "int8", UNKNOWN) as write:
+    with cog(folder / "cover.tif", cover.grid, COVER_BANDS, "int8", UNKNOWN) as writer:
         for rows in cover.grid.strips():
-            write(rows, cover.classes[rows][None])
+            writer.write(rows.start, cover.classes[rows][None])
     table = [
         {"region": region, "cover": what, "area_m2": area.value_m2, "low_m2": area.low_m2, "high_m2": area.high_m2}
         for region, of in cover.areas.items()
@@ -197,8 +153,12 @@ def write_cover(cover: Cover, folder: Path) -> None:
     write_csv(folder / "cover.csv", table)
 
 
-Layer = tuple[str, list[BaseGeometry], list[dict[str, Any]]]
-"""Name, geometries, and a row for each of them."""
+def _layer(name: str, shapes: list[BaseGeometry], rows: list[dict[str, Any]]) -> Layer:
+    """A layer with a row of fields for each shape."""
+    shapes = _multi(shapes)
+    kinds = {shape.geom_type for shape in shapes}
+    kind = kinds.pop() if kinds in ({"MultiPolygon"}, {"LineString"}) else "Unknown"
+    return Layer(name, kind, shapes, {key: [row[key] for row in rows] for key in rows[0]} if rows else {})
 
 
 def _cover_layer(cover: Cover) -> Layer:
@@ -209,7 +169,7 @@ def _cover_layer(cover: Cover) -> Layer:
         if shape.area >= LEAST_M2
     ]
     shapes = sorted(shapes, key=lambda pair: -pair[0].area)[:MOST_OUTLINES]
-    return "cover", [shape for shape, _ in shapes], [row for _, row in shapes]
+    return _layer("cover", [shape for shape, _ in shapes], [row for _, row in shapes])
 
 
 def _water_layer(water: Waterline) -> Layer:
@@ -218,27 +178,24 @@ def _water_layer(water: Waterline) -> Layer:
         for date, level, lines in zip(("earlier", "later"), water.levels_m, water.lines, strict=True)
         for line in lines
     ]
-    return "waterlines", [line for line, _ in rows], [row for _, row in rows]
+    return _layer("waterlines", [line for line, _ in rows], [row for _, row in rows])
 
 
-def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, water: Water | None = None) -> None:
+def write_layers(change: Change, folder: Path, cover: Cover | None = None, water: Water | None = None) -> None:
     """Write change.gpkg with the outlines, stable ground, the user's polygons, cover that moved, and waterlines."""
-    from pyogrio import raw
-
-    path = folder / "change.gpkg"
     rows = {row["id"]: row for row in outline_rows(change)[:MOST_OUTLINES]}
     shapes: dict[int, list[BaseGeometry]] = {}
     for number, polygon in polygons_of(change.outlines.labels, change.grid, change.outlines.labels > 0):
         if number in rows:
             shapes.setdefault(number, []).append(polygon)
-    layers: list[Layer] = [("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
+    layers = [_layer("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
     step = 1 + math.isqrt(change.stable.size // 4_000_000)
     thin = change.stable[::step, ::step]
     ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), change.grid.thinned(step), thin)]
     ground = sorted(ground, key=lambda shape: -shape.area)[:_MOST_POLYGONS_OF_GROUND]
-    layers.append(("stable ground", ground, [{"area_m2": shape.area} for shape in ground]))
+    layers.append(_layer("stable_ground", ground, [{"area_m2": shape.area} for shape in ground]))
     layers.append(
-        (
+        _layer(
             "polygons",
             [one.region.geometry for one in change.per_region],
             [
@@ -263,22 +220,7 @@ def write_geopackage(change: Change, folder: Path, cover: Cover | None = None, w
         layers.append(_cover_layer(cover))
     if water is not None and water.waterline is not None:
         layers.append(_water_layer(water.waterline))
-    for name, geometries, table in layers:
-        if not geometries:
-            continue
-        shapes_of = _multi(geometries)
-        polygons = all(shape.geom_type == "MultiPolygon" for shape in shapes_of)
-        raw.write(
-            path,
-            geometry=shapely.to_wkb(np.array(shapes_of, dtype=object)),
-            field_data=[np.array([row[key] for row in table]) for key in table[0]],
-            fields=list(table[0]),
-            layer=name.replace(" ", "_"),
-            driver="GPKG",
-            geometry_type="LineString" if name == "waterlines" else "MultiPolygon" if polygons else "Unknown",
-            crs=change.grid.crs or PLAIN,
-            append=path.exists(),
-        )
+    write_geopackage(folder / "change.gpkg", [layer for layer in layers if layer.shapes], change.grid.crs or PLAIN)
 
 
 def _multi(shapes: list[BaseGeometry]) -> list[BaseGeometry]:
@@ -389,7 +331,7 @@ def write_all(
     """Write all files of a change but its page; returns the numbers."""
     write_rasters(change, folder)
     write_tables(change, folder)
-    write_geopackage(change, folder, cover, water)
+    write_layers(change, folder, cover, water)
     numbers = summary(change, command)
     numbers["cover"] = None if cover is None else cover.to_json()
     numbers["water"] = None if water is None else water.to_json()

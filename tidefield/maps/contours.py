@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from shapely.geometry import LineString
@@ -15,6 +14,7 @@ from shapely.geometry import LineString
 from tidefield.files import write_text
 from tidefield.maps.grid import Grid, MapFrame
 from tidefield.maps.rasters import need
+from tidefield.maps.smoothing import smoothed
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
 ABOUT = 20
@@ -60,11 +60,8 @@ def contours(
     known = np.isfinite(height)
     if not known.any():
         return []
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), smooth_cells)
     base = float(np.median(height[known]))
-    values = np.where(known, height - base, 0).astype(np.float32)
-    smooth = cv2.GaussianBlur(values, (0, 0), smooth_cells) / np.maximum(weight, 1e-6)
-    masked = np.ma.masked_array(smooth.astype(np.float64) + base, ~known)
+    masked = np.ma.masked_array(smoothed(height - base, known, smooth_cells).astype(np.float64) + base, ~known)
     east = grid.west + (np.arange(grid.columns) + 0.5) * grid.cell
     north = grid.north - (np.arange(grid.rows) + 0.5) * grid.cell
     generator = contour_generator(east, north, masked, line_type=LineType.Separate)
@@ -109,7 +106,7 @@ def write_contours(lines: Sequence[tuple[float, LineString]], frame: MapFrame, f
     """Write contours.gpkg, contours.geojson (WGS 84; a local frame as it is) and contours.dxf into a folder."""
     paths = [folder / f"contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")]
     layer = Layer(LAYER, "LineString", [line for _, line in lines], {"height": [height for height, _ in lines]})
-    write_geopackage(paths[0], [layer], frame)
+    write_geopackage(paths[0], [layer], frame.horizontal_wkt)
     write_geojson(paths[1], layer, frame)
     write_text(paths[2], dxf(lines))
     return paths

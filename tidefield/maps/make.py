@@ -36,9 +36,10 @@ from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import BLOCK, NODATA, Raster, RasterWriter, need, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
-from tidefield.maps.surface import COARSEST, GreyPhotographs, Matched, match, sparse_surface
+from tidefield.maps.surface import COARSEST, Matched, match, sparse_surface
 from tidefield.maps.terrain import blocks, write_hillshade, write_terrain
 from tidefield.maps.vectors import lost_in_geojson
+from tidefield.maps.views import GreyPhotographs
 from tidefield.model.rendering import Render
 from tidefield.parallel import in_parallel
 

@@ -27,6 +27,7 @@ from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.contours import read_reduced
 from tidefield.maps.grid import Grid
 from tidefield.maps.rasters import NODATA, Raster, need, raster_writer
+from tidefield.maps.smoothing import smoothed
 from tidefield.maps.terrain import blocks
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
@@ -187,10 +188,14 @@ class _Signs:
 def _signs(
     height: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], agreement: np.ndarray, cell: float
 ) -> _Signs:
-    mean = _smooth(height, known, LEVEL_M / cell)
-    rough = np.sqrt(np.maximum(_smooth(height**2, known, LEVEL_M / cell) - mean**2, 0))
+    def mean_of(values: np.ndarray, sigma_m: float) -> np.ndarray:
+        # Holes of a body are judged where nothing is known, too.
+        return smoothed(values, known, max(sigma_m / cell, 1.0), least=1e-6)
+
+    mean = mean_of(height, LEVEL_M)
+    rough = np.sqrt(np.maximum(mean_of(height**2, LEVEL_M) - mean**2, 0))
     south, east = np.gradient(mean, cell)
-    agree = _smooth(np.nan_to_num(agreement), known, AGREEMENT_M / cell)
+    agree = mean_of(np.nan_to_num(agreement), AGREEMENT_M)
     seed = known & (agree < LEAST_AGREEMENT) & (np.hypot(south, east) < SLOPE) & (rough < ROUGHNESS_M)
     return _Signs(height, mean, agree, known, _components(_closed(seed)), cell)
 
@@ -214,13 +219,6 @@ def _grown(
         if not beyond:
             return (rows, columns), body
         pad *= 3
-
-
-def _smooth(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
-    """Mean of known values in Gaussian windows of at least a cell."""
-    sigma = max(sigma, 1.0)
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma)
-    return cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), sigma) / np.maximum(weight, 1e-6)
 
 
 def _closed(mask: np.ndarray) -> np.ndarray:
@@ -360,7 +358,7 @@ def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
         Layer("water", "Polygon", [shape for shape, _ in wet], fields),
         _waterline(wet, ~np.isfinite(values), reduced),
     ]
-    write_geopackage(folder / "masks.gpkg", layers, grid.frame)
+    write_geopackage(folder / "masks.gpkg", layers, grid.frame.horizontal_wkt)
     for layer in layers:
         write_geojson(folder / f"{layer.name}.geojson", layer, grid.frame)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,7 +15,9 @@ from jaxtyping import Float64
 from tidefield import SOFTWARE
 from tidefield.errors import RunError
 from tidefield.files import completed_file
-from tidefield.maps.grid import Grid
+
+if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
+    from tidefield.maps.grid import Grid
 
 NODATA = -9999.0
 BLOCK = 512
@@ -78,7 +80,7 @@ class RasterWriter:
         height = values.shape[1]
         window = ((row, row + height), (0, values.shape[2]))
         try:
-            self._dataset.write(values.astype(self.raster.kind), window=window)
+            self._dataset.write(values.astype(self.raster.kind, copy=False), window=window)
         except RasterioError as error:
             reason = error.__cause__ or error
             raise OSError(28, f"writing failed: {reason}", str(self.raster.path)) from error
@@ -86,7 +88,27 @@ class RasterWriter:
 
 @contextmanager
 def raster_writer(raster: Raster, grid: Grid) -> Iterator[RasterWriter]:
+    """Write a raster of a map with `cog_writer`; its tags name the map's coordinates.
+
+    Raises:
+        RunError: its folder cannot be written to, or is full.
+    """
+    tags = {"VERTICAL_DATUM": grid.frame.heights, "COORDINATES": grid.frame.name, **raster.tags}
+    with cog_writer(replace(raster, tags=tags), grid.columns, grid.rows, grid.frame.wkt, grid.transform) as writer:
+        yield writer
+
+
+@contextmanager
+def cog_writer(
+    raster: Raster, columns: int, rows: int, wkt: str | None, transform: Sequence[float], fast: bool = False
+) -> Iterator[RasterWriter]:
     """Write a raster by rows; it is there, as a cloud-optimised GeoTIFF, when the block ends.
+
+    Args:
+        columns, rows: of cells.
+        wkt: its coordinate system; None for none.
+        transform: affine coefficients from column and row to its coordinates, in rasterio's order.
+        fast: on all processors, and with a file in between that is not compressed, as large as the raster.
 
     Raises:
         RunError: its folder cannot be written to, or is full.
@@ -98,23 +120,18 @@ def raster_writer(raster: Raster, grid: Grid) -> Iterator[RasterWriter]:
 
     kind = np.dtype(raster.kind)
     profile: dict[str, Any] = {
-        "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": len(raster.bands), "dtype": raster.kind,
-        "crs": rasterio.crs.CRS.from_wkt(grid.frame.wkt), "transform": Affine(*grid.transform), "tiled": True,
-        "blockxsize": BLOCK, "blockysize": BLOCK, "compress": "DEFLATE", "zlevel": 1, "bigtiff": "IF_SAFER",
+        "driver": "GTiff", "width": columns, "height": rows, "count": len(raster.bands), "dtype": raster.kind,
+        "crs": None if wkt is None else rasterio.crs.CRS.from_wkt(wkt), "transform": Affine(*transform), "tiled": True,
+        "blockxsize": BLOCK, "blockysize": BLOCK, "bigtiff": "IF_SAFER",
     }  # fmt: skip
+    profile |= {"interleave": "band"} if fast else {"compress": "DEFLATE", "zlevel": 1}
     if raster.nodata is not None:
         profile["nodata"] = raster.nodata
-    about = {
-        "TIFFTAG_SOFTWARE": SOFTWARE,
-        "VERTICAL_DATUM": grid.frame.heights,
-        "COORDINATES": grid.frame.name,
-        **raster.tags,
-    }
     with completed_file(raster.path, overwrite=True) as partial:
         rough = partial.with_name(partial.name.replace(".partial", ".rough.partial"))
         try:
             with rasterio.open(rough, "w", **profile) as dataset:
-                dataset.update_tags(**about)
+                dataset.update_tags(TIFFTAG_SOFTWARE=SOFTWARE, **raster.tags)
                 for band, name in enumerate(raster.bands, start=1):
                     dataset.set_band_description(band, name)
                     if raster.unit:
@@ -125,7 +142,7 @@ def raster_writer(raster: Raster, grid: Grid) -> Iterator[RasterWriter]:
             shutil.copy(
                 str(rough), str(partial), driver="COG", COMPRESS="DEFLATE", PREDICTOR="YES", BLOCKSIZE=BLOCK,
                 OVERVIEW_RESAMPLING="AVERAGE" if raster.average and kind.kind != "i" else "NEAREST",
-                BIGTIFF="IF_SAFER", NUM_THREADS="1",
+                BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS" if fast else "1",
             )  # fmt: skip
         except rasterio.errors.RasterioError as error:
             raise OSError(None, str(error), str(raster.path)) from error

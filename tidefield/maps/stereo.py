@@ -13,14 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-if TYPE_CHECKING:
-    from tidefield.maps.surface import GreyPhotographs, View
+from tidefield.maps.views import GreyPhotographs, View
 
 PAIRS = 12
 """Pairs of photographs that are matched on a tile."""
@@ -45,7 +43,7 @@ UNIQUE, SPECKLE, SPECKLE_RANGE = 10, 100, 2
 
 
 def choose_pairs(
-    views: Sequence[View], sees: np.ndarray, off_nadir_deg: np.ndarray, height: float, count: int = PAIRS
+    views: Sequence[View], sees: np.ndarray, off_nadir_deg: np.ndarray, height: float
 ) -> list[tuple[int, int]]:
     """Choose pairs of photographs to match on a tile, the ones that add most at a few places of it first.
 
@@ -54,7 +52,6 @@ def choose_pairs(
         sees: which of the places each of them sees, V x P.
         off_nadir_deg: angle from the vertical at which it does, V x P.
         height: of the surface in the middle of the tile.
-        count: of pairs.
 
     Returns:
         Pairs of indices of `views`.
@@ -76,7 +73,7 @@ def choose_pairs(
     chosen: list[int] = []
     covered = np.zeros(sees[0].size)
     gains = np.array(worth).reshape(len(pairs), covered.size)
-    while len(chosen) < min(count, len(pairs)):
+    while len(chosen) < min(PAIRS, len(pairs)):
         total = (gains / (1 + covered)).sum(1)
         total[chosen] = -1
         chosen.append(int(total.argmax()))

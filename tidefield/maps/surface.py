@@ -21,30 +21,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 from scipy.spatial import KDTree
 
-from tidefield.data.neighbours import ANGLE_SCALE_RAD, BORDER
 from tidefield.data.scene import Scene
-from tidefield.data.surface import interpolate_on_pixels
-from tidefield.geometry.cameras import Cameras
-from tidefield.maps.grid import STEEPEST_DEG, Grid, Tile
+from tidefield.data.surface import agree_with_neighbours, interpolate_on_pixels
+from tidefield.maps.grid import Grid, Tile
+from tidefield.maps.smoothing import smoothed
 from tidefield.maps.stereo import Pairs, choose_pairs, fill_gaps
-from tidefield.parallel import SharedValues
+from tidefield.maps.views import GreyPhotographs, View, positions_from, stands_above
 
 COARSEST = 8
 """Cells, along a side, of the coarse cells that the sparse points' surface is interpolated on."""
+AROUND = 12
+"""Nearest points whose median height the surface has outside of all points."""
 PAD = 32
 """Cells around a tile that are matched with it: windows and the paths of semi-global matching reach beyond the tile."""
 VIEWS = 8
 """Photographs that are compared with each other; more add little and take as long each."""
-BORDER_PX = 4.0
-"""Pixels along a photograph's border that are not used."""
 STEP_PX = 0.7
 """Parallax between heights that are tried, of the photographs farthest apart, in cells."""
 SWEEPS = ((1.0, 3), (0.5, 3), (0.35, 3))
@@ -86,8 +83,6 @@ FLOOR = 3.0
 """Standard deviation of windows, in grey values of 255, below which they count as blank: noise of a photograph."""
 PULL = 0.02
 """Score that is lost at the ends of the search range: blank and moving surfaces stay where they are expected."""
-KEPT_BYTES = 600_000_000
-"""Memory for grey photographs."""
 
 Height = Float32[np.ndarray, "H W"]
 
@@ -109,30 +104,6 @@ class Matched:
     score: Height
     count: Int[np.ndarray, "H W"]
     main: Int[np.ndarray, "H W"]
-
-
-class GreyPhotographs:
-    """The photographs of a scene in grey, reduced to the size of coarse cells; those not read for long go first.
-
-    Args:
-        scene: at the size to match at.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self._kept: SharedValues[tuple[int, int], np.ndarray] = SharedValues(KEPT_BYTES, lambda grey: grey.nbytes)
-
-    def read(self, index: int, factor: int) -> UInt8[np.ndarray, "h w"]:
-        """Read a photograph at a `factor`-th of its size."""
-        return self._kept.get((index, factor), self._reduced)
-
-    def _reduced(self, key: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
-        index, factor = key
-        grey = cv2.cvtColor(self.scene.photographs[index].numpy(), cv2.COLOR_RGB2GRAY)
-        if factor > 1:
-            size = max(1, round(grey.shape[1] / factor)), max(1, round(grey.shape[0] / factor))
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        return grey
 
 
 @dataclass(frozen=True)
@@ -166,15 +137,15 @@ def _around(at: np.ndarray, side: int) -> slice:
     return slice(first, int(np.clip(math.ceil(at.max()), first, side - 1)) + 1)
 
 
-def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:
+def sparse_surface(scene: Scene, grid: Grid) -> Start:
     """Interpolate the sparse points on a grid of coarse cells.
 
-    Points that differ from their 16 nearest neighbours by more than 12 times their spread are left out, as in
-    `data.surface`. Outside of the points the surface is that of the nearest ones.
+    Points that do not agree with their neighbours are left out. Outside of all points the surface is that of the
+    nearest ones.
     """
     assert scene.points is not None, "make_grid refuses scenes without points"
     xyz = grid.frame.to_map(scene.points.xyz_world.double().numpy())
-    xyz = xyz[_agree(xyz)]
+    xyz = xyz[agree_with_neighbours(xyz[:, :2], xyz[:, 2])]
     uv = np.column_stack([(xyz[:, 0] - grid.west) / grid.cell, (grid.north - xyz[:, 1]) / grid.cell])
     inside = ((uv > -50) & (uv < [grid.columns + 50, grid.rows + 50])).all(1)
     if inside.sum() >= 3:
@@ -183,118 +154,11 @@ def sparse_surface(scene: Scene, grid: Grid, around: int = 12) -> Start:
     high = np.maximum(uv.max(0), [grid.columns, grid.rows]) + 1.0
     along = np.linspace(0, 1, 9)
     frame = np.array([(a, b) for a in along for b in along if a in (0, 1) or b in (0, 1)]) * (high - low) + low
-    near = np.asarray(KDTree(uv).query(frame, k=min(around, len(uv)))[1]).reshape(len(frame), -1)
+    near = np.asarray(KDTree(uv).query(frame, k=min(AROUND, len(uv)))[1]).reshape(len(frame), -1)
     heights = np.concatenate([xyz[:, 2], np.median(xyz[near, 2], axis=1)])
     # Rounded positions may coincide, which Delaunay's triangles leave out.
     height = interpolate_on_pixels(np.concatenate([uv, frame]), heights - grid.height, grid.columns, grid.rows)
     return Start(grid, (height + grid.height).astype(np.float32))
-
-
-def _agree(xyz: Float[np.ndarray, "N 3"], neighbours: int = 16, spreads: float = 12.0) -> Bool[np.ndarray, " N"]:
-    if len(xyz) <= neighbours:
-        return np.ones(len(xyz), dtype=bool)
-    near = np.asarray(KDTree(xyz[:, :2]).query(xyz[:, :2], k=neighbours + 1)[1])[:, 1:]
-    median = np.median(xyz[near, 2], axis=1)
-    spread = np.median(np.abs(xyz[near, 2] - median[:, None]), axis=1)
-    return np.abs(xyz[:, 2] - median) <= spreads * np.maximum(spread, np.median(spread))
-
-
-def positions_from(tile: Tile, cameras: Cameras) -> Float64[np.ndarray, "V 3"]:
-    """East, north (horizontal units) and height above `Grid.height` of cameras, from the middle of a tile."""
-    affine = tile.affine()
-    away = cameras.T_world_camera[:, :, 3].double().numpy() - affine[:, 3]
-    return away @ np.linalg.inv(affine[:, :3]).T
-
-
-def _above(
-    position: np.ndarray, east: np.ndarray, north: np.ndarray, height: np.ndarray, up: float
-) -> Bool[np.ndarray, "*shape"]:
-    """Whether a camera stands within `STEEPEST_DEG` from the vertical above cells; the shapes broadcast.
-
-    Args:
-        up: horizontal units in a vertical one.
-    """
-    above = (position[2] - height) * up
-    across = (position[0] - east) ** 2 + (position[1] - north) ** 2
-    return (above > 0) & (across <= (math.tan(math.radians(STEEPEST_DEG)) * above) ** 2)
-
-
-class View:
-    """One photograph's projection of a tile's cells.
-
-    Args:
-        camera: of the photograph.
-        tile: the cells.
-        used: pixels of the photograph that are not masked; None where it has no mask.
-    """
-
-    def __init__(self, camera: Cameras, tile: Tile, used: Bool[np.ndarray, "h w"] | None = None) -> None:
-        affine = tile.affine()
-        # Exact positions in double precision: single precision would cost a hundredth of a pixel.
-        pose = camera.T_world_camera[0].double().numpy()
-        rotation = pose[:, :3].T
-        focal, principal = camera.focal_px[0].double().numpy(), camera.principal_px[0].double().numpy()
-        k = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]])
-        there = affine.copy()
-        there[:, 3] -= pose[:, 3]
-        self.matrix = (k @ rotation @ there).astype(np.float64)
-        self.size = camera.width, camera.height
-        self.camera = camera
-        self.used = used
-        self.position = positions_from(tile, camera)[0]
-        """East, north and height above `Grid.height` of the photograph, from the middle of the tile."""
-        self.up = tile.grid.frame.up
-
-    @cached_property
-    def gain(self) -> float:
-        """Of the photograph where it shows the middle of the tile."""
-        uv = torch.tensor([[[*(self.matrix[:2, 3] / self.matrix[2, 3])]]]).float()
-        return float(self.camera.gain_at(uv).mean())
-
-    def base(self, east: np.ndarray, north: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Homogeneous pixels (3 x H x W) of cells at heights above `Grid.height`."""
-        m = self.matrix.astype(np.float32)
-        return np.stack([m[i, 2] * height + (m[i, 0] * east + (m[i, 1] * north + m[i, 3])) for i in range(3)])
-
-    def displacement(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """How far the lens' residual moves pixels; None without a residual."""
-        if self.camera.residual is None:
-            return None
-        uv = torch.from_numpy(np.stack([u, v], -1).reshape(1, -1, 2))
-        moved = (self.camera.displaced(uv) - uv)[0].numpy().reshape(*u.shape, 2)
-        return np.ascontiguousarray(moved[..., 0]), np.ascontiguousarray(moved[..., 1])
-
-    def pixels(
-        self, east: np.ndarray, north: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels u and v of cells, and their z-depth."""
-        q = self.base(east, north, height)
-        z = np.where(np.abs(q[2]) < 1e-6, 1e-6, q[2])
-        u, v = q[0] / z, q[1] / z
-        moved = self.displacement(u, v)
-        return (u, v, q[2]) if moved is None else (u + moved[0], v + moved[1], q[2])
-
-    def sees(
-        self, u: np.ndarray, v: np.ndarray, z: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray
-    ) -> np.ndarray:
-        """Whether cells lie in the photograph, not masked, at no more than `STEEPEST_DEG` from the vertical."""
-        inside = (z > 0) & self.shows(u, v, BORDER_PX)
-        return inside & _above(self.position, east, north, height, self.up)
-
-    def shows(self, u: np.ndarray, v: np.ndarray, border_px: float) -> Bool[np.ndarray, "*shape"]:
-        """Whether pixels lie in the photograph, so far from its border, and are not masked."""
-        width, height = self.size
-        inside = (u > border_px) & (v > border_px) & (u < width - border_px) & (v < height - border_px)
-        if self.used is not None:
-            inside[inside] = self.used[v[inside].astype(np.int64), u[inside].astype(np.int64)]
-        return inside
-
-    def rank(self, u: np.ndarray, v: np.ndarray, height: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """How well cells are seen, as a network's neighbours of a view straight down are ranked (`data.neighbours`)."""
-        across = np.hypot(self.position[0] - east, self.position[1] - north)
-        angle = np.arctan2(across, (self.position[2] - height) * self.up)
-        inner = np.minimum(np.minimum(u, self.size[0] - u), np.minimum(v, self.size[1] - v))
-        return np.exp(-angle / ANGLE_SCALE_RAD) * np.clip(inner / (BORDER * self.size[0]), 0, 1)
 
 
 @dataclass(frozen=True)
@@ -314,7 +178,7 @@ class Choice:
     pairs: list[tuple[int, int]]
 
 
-def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> Choice:
+def choose_views(tile: Tile, scene: Scene, start: Start) -> Choice:
     """Choose photographs to compare on a tile.
 
     Each time the photograph that adds most at a few places of the tile: where few photographs were chosen, not too far
@@ -327,7 +191,7 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
     views, indices, seen, direction = [], [], [], []
     # Projecting the cells into each of thousands of photographs would take most of a tile's time.
     up, positions = tile.grid.frame.up, positions_from(tile, scene.cameras)
-    near = _above(positions.T[..., None, None], east, north, height, up).any((1, 2))
+    near = stands_above(positions.T[..., None, None], east, north, height, up).any((1, 2))
     for index in np.flatnonzero(near).tolist():
         (mask,) = scene.photographs.masks_of([index]) or (None,)
         view = View(scene.cameras[index], tile, None if mask is None else mask.numpy())
@@ -348,7 +212,7 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
     chosen: list[int] = []
     covered = np.zeros(sees.shape[1:])
     nearest = np.full(sees.shape, 1.0)
-    most = count
+    most = VIEWS
     while len(chosen) < min(most, len(views)):
         gain = (quality * nearest / (1 + covered) ** 1.5).sum((1, 2))
         gain[chosen] = -1
@@ -360,7 +224,7 @@ def choose_views(tile: Tile, scene: Scene, start: Start, count: int = VIEWS) -> 
         between = np.degrees(np.arccos(np.clip((to * to[best]).sum(1), -1, 1)))
         apart = 1 - np.exp(-((between / 8.0) ** 2))
         nearest = np.where(sees[best], np.minimum(nearest, apart), nearest)
-        if len(chosen) == most and most < 2 * count and (covered[sees.sum(0) >= 4] < 4).any():
+        if len(chosen) == most and most < 2 * VIEWS and (covered[sees.sum(0) >= 4] < 4).any():
             most += 1
     places = (len(views), -1)
     pairs = choose_pairs(views, sees.reshape(places), angle.reshape(places), float(np.median(height)))
@@ -480,9 +344,7 @@ def _likelier(
     fits = []
     for start in (filled, expected):
         score = _sweep(used, grey, factor, east, north, start, offsets)[2]
-        there = (np.isfinite(score) & gaps).astype(np.float32)
-        mean = cv2.GaussianBlur(np.nan_to_num(score) * there, (0, 0), GAP_CELLS)
-        fits.append(mean / np.maximum(cv2.GaussianBlur(there, (0, 0), GAP_CELLS), 1e-3))
+        fits.append(smoothed(score, np.isfinite(score) & gaps, GAP_CELLS))
     better = (gaps & (fits[1] > fits[0] + LIKELIER)).astype(np.float32)
     weight = gaps * cv2.GaussianBlur(better, (0, 0), GAP_CELLS / 2)
     return (filled + weight * (expected - filled)).astype(np.float32)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -15,8 +15,10 @@ from shapely.geometry.base import BaseGeometry
 
 from tidefield.files import completed_file, write_text
 from tidefield.geometry.geodesy import WGS84, lost_in_conversion
-from tidefield.maps.grid import MapFrame
 from tidefield.maps.rasters import need
+
+if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
+    from tidefield.maps.grid import MapFrame
 
 
 @dataclass(frozen=True)
@@ -25,29 +27,36 @@ class Layer:
 
     Attributes:
         name: of the layer.
-        kind: of the shapes, such as "Polygon".
+        kind: of the shapes, such as "Polygon"; "Unknown" of several.
         shapes: in map coordinates.
-        fields: numbers of each shape.
+        fields: numbers or texts of each shape.
     """
 
     name: str
     kind: str
     shapes: Sequence[BaseGeometry]
-    fields: Mapping[str, Sequence[float]]
+    fields: Mapping[str, Sequence[float | int | str]]
 
 
-def write_geopackage(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
-    """Write layers in map coordinates into one GeoPackage."""
+def write_geopackage(path: Path, layers: Sequence[Layer], wkt: str) -> None:
+    """Write layers into one GeoPackage.
+
+    Args:
+        wkt: the horizontal coordinate system of all.
+
+    Raises:
+        RunError: its folder cannot be written to.
+    """
     with completed_file(path, overwrite=True) as partial:
         partial.unlink()  # GDAL makes its own
         for number, layer in enumerate(layers):
             need("pyogrio").raw.write(
                 partial,
                 geometry=np.array([shapely.to_wkb(shape) for shape in layer.shapes], dtype=object),
-                field_data=[np.array(values, dtype=np.float64) for values in layer.fields.values()],
+                field_data=[np.array(values) for values in layer.fields.values()],
                 fields=list(layer.fields),
                 geometry_type=layer.kind,
-                crs=frame.horizontal_wkt,
+                crs=wkt,
                 driver="GPKG",
                 layer=layer.name,
                 append=number > 0,
