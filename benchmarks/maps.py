@@ -20,11 +20,12 @@ from tidefield.compare.run import make_flat
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
+from tidefield.errors import need
 from tidefield.files import read_json, write_json
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, Tile, map_frame
 from tidefield.maps.make import CLASSES, DSM, DTM, MAP_FILE, ORTHOPHOTO, SIGMA
-from tidefield.maps.rasters import need, read_raster
+from tidefield.maps.rasters import read_raster
 from tidefield.maps.surface import COARSEST, sparse_surface
 from tidefield.synthetic import CATEGORIES
 

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, no_type_check
 
-from tidefield.errors import RunError
+from tidefield.errors import RunError, need
 from tidefield.machine import cores
 
 log = logging.getLogger(__name__)
@@ -45,12 +45,7 @@ def connected(address: str) -> Iterator[Any]:
     Raises:
         RunError: Ray is not installed, or does not answer.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise RunError(
-            "--cluster needs Ray, which is not installed: expected the extra; pip install 'tidefield[cluster]'"
-        ) from error
+    ray = need("ray", "cluster")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's default from its next version on
     # Where a cluster was found is none of a user's business, and --quiet leaves out warnings, too.
     start = partial(ray.init, log_to_driver=False, logging_level=max(logging.WARNING, log.getEffectiveLevel()))

@@ -6,6 +6,8 @@ Every message says what was found, what was expected and what to do.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
 
 
 class TidefieldError(Exception):
@@ -26,6 +28,21 @@ class RunError(TidefieldError):
 
 class DeviceError(TidefieldError):
     """The requested device is not on this machine."""
+
+
+def need(module: str, extra: str = "maps") -> ModuleType:
+    """Import a library of one of this package's extras.
+
+    Raises:
+        RunError: it is not installed, or cannot be imported.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise RunError(
+            f"{module.partition('.')[0]} cannot be imported ({error}): expected the extra `{extra}`; install it with "
+            f"`pip install 'tidefield[{extra}]'`"
+        ) from error
 
 
 def list_names(names: Sequence[str], shown: int = 5) -> str:

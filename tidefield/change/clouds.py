@@ -17,6 +17,7 @@ from pyproj.exceptions import CRSError
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.registration import Registration
 from tidefield.change.surfaces import ChangeError, Grid, is_local, system_of_ground, unstated_unit
+from tidefield.errors import need
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
     FOOT_M,
@@ -30,7 +31,7 @@ from tidefield.geometry.geodesy import (
 from tidefield.maps.classes import NOISE, WATER
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    pass
 
 _MOST_POINTS = 200_000_000
 _POINTS_PER_CELL = 10.0
@@ -66,21 +67,6 @@ class Cloud:
     remarks: tuple[str, ...] = ()
 
 
-def require_laspy() -> ModuleType:
-    """Import laspy.
-
-    Raises:
-        ChangeError: it is not installed.
-    """
-    try:
-        import laspy
-    except ImportError as error:
-        raise ChangeError(
-            "laspy is not installed: point clouds are read with it; install it with `pip install 'tidefield[maps]'`"
-        ) from error
-    return laspy
-
-
 def read_cloud(path: Path) -> Cloud:
     """Read the points of a LAS or LAZ file without those that are withheld or classified as noise or water.
 
@@ -89,7 +75,7 @@ def read_cloud(path: Path) -> Cloud:
     Raises:
         ChangeError: the file is damaged, empty or too large, in degrees, geocentric, or outside of its system.
     """
-    laspy = require_laspy()
+    laspy = need("laspy")
     expected = "expected a LAS or LAZ file with points; name another"
     with reading_from(path):
         size = path.stat().st_size
@@ -275,7 +261,7 @@ def compare_clouds(
 
 def write_distances(found: Distances, crs: CRS | None, path: Path) -> None:
     """Write distances as a LAZ file with the names that CloudCompare gives them."""
-    laspy = require_laspy()
+    laspy = need("laspy")
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.offsets, header.scales = found.cores.mean(axis=0).round(), np.full(3, 0.001)
     if crs is not None:

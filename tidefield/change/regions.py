@@ -16,7 +16,8 @@ from pyproj.exceptions import ProjError
 from scipy.ndimage import maximum_filter
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.change.surfaces import ChangeError, Grid, is_local, require_rasterio
+from tidefield.change.surfaces import ChangeError, Grid, is_local
+from tidefield.errors import need
 from tidefield.geometry.geodesy import lost_in_conversion
 
 _log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ class Region:
 
 def rasterised(regions: list[Region], grid: Grid) -> Bool[np.ndarray, "rows columns"]:
     """Cells that are in any of the regions."""
-    require_rasterio()
+    need("rasterio")
     from rasterio.features import rasterize
 
     shapes = [region.geometry for region in regions]
@@ -94,13 +95,10 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
     Raises:
         ChangeError: it cannot be read, is empty or too large, has several layers, or has no geometry on the grid.
     """
-    try:
-        from pyogrio import list_layers, raw, read_info
-        from pyogrio.errors import DataLayerError, DataSourceError
-    except ImportError as error:
-        raise ChangeError(
-            "pyogrio is not installed: polygons are read with it; install it with `pip install 'tidefield[maps]'`"
-        ) from error
+    need("pyogrio")
+    from pyogrio import list_layers, raw, read_info
+    from pyogrio.errors import DataLayerError, DataSourceError
+
     expected = "expected polygons as GeoJSON, GeoPackage or shapefile; name another file"
     asked = None
     if not path.is_file() and ":" in path.name:

@@ -16,7 +16,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.change.nodata import IMPOSSIBLE_M, cleared, is_masked, undeclared
-from tidefield.errors import TidefieldError
+from tidefield.errors import TidefieldError, need
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
     FOOT_M,
@@ -30,8 +30,6 @@ from tidefield.geometry.geodesy import (
 )
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from affine import Affine
 
 STRIP_CELLS = 1 << 22
@@ -58,21 +56,6 @@ Read = Callable[[int, int], Float32[np.ndarray, "rows columns"]]
 
 class ChangeError(TidefieldError):
     """Surveys cannot be compared, or not as asked."""
-
-
-def require_rasterio() -> ModuleType:
-    """Import rasterio.
-
-    Raises:
-        ChangeError: it is not installed.
-    """
-    try:
-        import rasterio
-    except ImportError as error:
-        raise ChangeError(
-            "rasterio is not installed: surfaces are read with it; install it with `pip install 'tidefield[maps]'`"
-        ) from error
-    return rasterio
 
 
 @dataclass(frozen=True)
@@ -229,7 +212,7 @@ def warped(
     Raises:
         ChangeError: the file cannot be read to its end.
     """
-    rasterio = require_rasterio()
+    rasterio = need("rasterio")
     from rasterio.enums import MaskFlags, Resampling
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
@@ -288,7 +271,7 @@ def warped(
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """A raster file, opened."""
-    rasterio = require_rasterio()
+    rasterio = need("rasterio")
     with reading_from(path):
         path.open("rb").close()
     try:

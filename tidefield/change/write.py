@@ -20,9 +20,10 @@ from tidefield import __version__
 from tidefield.change.cover import LEAST_M2, Cover
 from tidefield.change.errors import Z95, p_values
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import PLAIN, Grid, Surface, opened, require_rasterio
+from tidefield.change.surfaces import PLAIN, Grid, Surface, opened
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water, Waterline
+from tidefield.errors import need
 from tidefield.files import plain_cell, write_json, write_text
 from tidefield.maps.rasters import Raster, RasterWriter, cog_writer
 from tidefield.maps.vectors import Layer, write_geopackage
@@ -52,7 +53,7 @@ def cog(
     """Write a raster of a grid by rows; it is there, as a Cloud-Optimized GeoTIFF, when the block ends."""
     raster = Raster(path, bands, kind, nodata, tags=tags or {})
     with (
-        require_rasterio().Env(GDAL_CACHEMAX=256),
+        need("rasterio").Env(GDAL_CACHEMAX=256),
         cog_writer(raster, grid.columns, grid.rows, grid.crs, grid.transform[:6], fast=True) as writer,
     ):
         yield writer
@@ -80,7 +81,7 @@ def polygons_of(
     labels: np.ndarray, grid: Grid, mask: Bool[np.ndarray, "rows columns"]
 ) -> Iterator[tuple[int, BaseGeometry]]:
     """Outlines of equal labels along the edges of cells."""
-    require_rasterio()
+    need("rasterio")
     from rasterio.features import shapes
 
     for shape, value in shapes(labels, mask=mask, connectivity=8, transform=grid.transform):

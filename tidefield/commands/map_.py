@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Cluster, Device, Verbosity, ZeroShot, open_source
-from tidefield.errors import RunError
+from tidefield.errors import RunError, need
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,7 +64,6 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
     from tidefield.maps.make import TileMaker, delete_tiles, finish_map, make_tiles
-    from tidefield.maps.rasters import need
     from tidefield.progress import ProgressBar
 
     for library in ("rasterio", "laspy", "pyogrio"):

@@ -22,7 +22,7 @@ from tidefield.config import (
     checked_seed,
     vary,
 )
-from tidefield.errors import RunError, SceneError
+from tidefield.errors import RunError, SceneError, need
 from tidefield.files import delete_files, delete_partials, is_empty, only_writer, require_writable
 from tidefield.methods import configuration, make_trainer
 from tidefield.processes import Ended
@@ -112,10 +112,9 @@ def _train(options: Train, console: Console, again: str) -> None:
 
     budget, folder, weights = options.budget.checked(), options.run, None
     if options.view:
-        from tidefield.viewer.page import need_viser
         from tidefield.viewer.ports import require_port
 
-        need_viser()
+        need("viser", "view")
         require_port("127.0.0.1", options.port)
     device = choose_device(options.device)
     if options.resume:

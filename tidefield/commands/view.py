@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AllowMissing, Device, Verbosity, ZeroShot, open_source
-from tidefield.errors import RunError
+from tidefield.errors import RunError, need
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,9 +67,9 @@ def view(options: View, console: Console) -> None:
         _view_maps(options, console)
         return
     from tidefield.viewer.frames import SAMPLING
-    from tidefield.viewer.page import ScenePage, need_viser
+    from tidefield.viewer.page import ScenePage
 
-    need_viser()
+    need("viser", "view")
     source = options.sources[0]
     if len(options.sources) > 1:
         raise RunError(f"{len(options.sources)} scenes were named: expected one at a time; leave the others out")

@@ -13,9 +13,9 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from tidefield import __version__
+from tidefield.errors import need
 from tidefield.files import completed_file
 from tidefield.maps.grid import Grid
-from tidefield.maps.rasters import need
 
 SCALE = 0.001
 """Coordinates are rounded to so many units, or, in local frames, whose unit may be any, to a twentieth of a cell."""

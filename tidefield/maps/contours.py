@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from shapely.geometry import LineString
 
+from tidefield.errors import need
 from tidefield.files import write_text
 from tidefield.maps.grid import Grid, MapFrame
-from tidefield.maps.rasters import need
 from tidefield.maps.smoothing import smoothed
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 

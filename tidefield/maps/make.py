@@ -22,7 +22,7 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from tidefield.data.scene import Scene
-from tidefield.errors import RunError
+from tidefield.errors import RunError, need
 from tidefield.files import completed_file, delete_files, delete_partials, read_json, write_json
 from tidefield.machine import cores, release_memory
 from tidefield.maps.area import inside, touches
@@ -33,7 +33,7 @@ from tidefield.maps.contours import contours, interval_of, read_reduced, write_c
 from tidefield.maps.grid import Grid, Tile, feather, ground_sampling_distance
 from tidefield.maps.masks import Body, level_water, read_water, write_classes, write_masks
 from tidefield.maps.orthophoto import render_tile
-from tidefield.maps.rasters import BLOCK, NODATA, Raster, RasterWriter, need, raster_writer
+from tidefield.maps.rasters import BLOCK, NODATA, Raster, RasterWriter, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
 from tidefield.maps.surface import COARSEST, Matched, match, sparse_surface

@@ -23,10 +23,11 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
+from tidefield.errors import need
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.contours import read_reduced
 from tidefield.maps.grid import Grid
-from tidefield.maps.rasters import NODATA, Raster, need, raster_writer
+from tidefield.maps.rasters import NODATA, Raster, raster_writer
 from tidefield.maps.smoothing import smoothed
 from tidefield.maps.terrain import blocks
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage

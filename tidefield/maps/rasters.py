@@ -6,14 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from tidefield import SOFTWARE
-from tidefield.errors import RunError
+from tidefield.errors import RunError, need
 from tidefield.files import completed_file
 
 if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
@@ -21,23 +20,6 @@ if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
 
 NODATA = -9999.0
 BLOCK = 512
-
-
-def need(module: str) -> ModuleType:
-    """Import a library of the extra `maps`.
-
-    Raises:
-        RunError: it is not installed.
-    """
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise RunError(
-            f"{module.partition('.')[0]} is not installed: maps need it; install it with `pip install "
-            "'tidefield[maps]'`"
-        ) from error
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from markupsafe import Markup
 from matplotlib.patches import Patch
 
 from tidefield import __version__
+from tidefield.errors import need
 from tidefield.files import write_text
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.figures import INCHES, Extent, map_of, png
-from tidefield.maps.rasters import need
 from tidefield.pages import command_line, template_environment
 
 WIDEST = 900

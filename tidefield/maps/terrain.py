@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from tidefield.maps.rasters import NODATA, Raster, need, raster_writer
+from tidefield.errors import need
+from tidefield.maps.rasters import NODATA, Raster, raster_writer
 
 COARSE_M = 0.25
 """Coarse cells are about as large, or as the map's own, in metres."""

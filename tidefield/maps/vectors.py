@@ -13,9 +13,9 @@ import shapely
 from pyproj import CRS, Transformer
 from shapely.geometry.base import BaseGeometry
 
+from tidefield.errors import need
 from tidefield.files import completed_file, write_text
 from tidefield.geometry.geodesy import WGS84, lost_in_conversion
-from tidefield.maps.rasters import need
 
 if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
     from tidefield.maps.grid import MapFrame

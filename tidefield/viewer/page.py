@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from tidefield.data.scene import Scene
-from tidefield.errors import RunError
+from tidefield.errors import need
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render
 from tidefield.render.camera_paths import layout_of, path_cameras
@@ -51,22 +51,6 @@ THUMBNAIL_PX = 96
 LAYERS = ("Colour", "Depth")
 
 
-def need_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        RunError: it is not installed.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise RunError(
-            f"viewing needs viser, which is not installed ({error}): expected the extra `view`; install it with "
-            "`pip install 'tidefield[view]'`"
-        ) from error
-    return viser
-
-
 class ScenePage:
     """Serves the page of one scene.
 
@@ -89,7 +73,7 @@ class ScenePage:
         width: int = LARGEST_WIDTH,
         source: Sequence[str] = (),
     ) -> None:
-        viser = need_viser()
+        viser = need("viser", "view")
         require_port(host, port)
         self.scene, self.source, self.width = scene, source or (name,), width
         layout = layout_of(scene)
