@@ -256,10 +256,12 @@ class _Model:
         photograph, (count, each) = self.seen.photograph, self.columns.shape
         order = np.argsort(photograph, kind="stable")
         ends = np.cumsum(np.bincount(photograph, minlength=count))
-        of_each = [(terms := self.terms[own]).T @ (weight[own, None] * terms) for own in np.split(order, ends[:-1])]
+        sums = np.empty((count, each, each))
+        for product, own in zip(sums, np.split(order, ends[:-1]), strict=True):
+            product[:] = self.terms[own].T @ (weight[own][:, None] * self.terms[own])
         where = np.repeat(self.columns, each, axis=1).ravel(), np.tile(self.columns, each).ravel()
-        unknowns = self.design.shape[1]
-        return sparse.csr_array((np.stack(of_each).ravel(), where), shape=(unknowns, unknowns))
+        unknowns = int(self.columns.max()) + 1
+        return sparse.csr_array((sums.ravel(), where), shape=(unknowns, unknowns))
 
     def solve(
         self,
