@@ -2,6 +2,7 @@
 
 import logging
 import os
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 import scenes_on_disk as disk
 import torch
 from numpy.testing import assert_allclose
+from PIL import Image
 
 import tidefield as tf
 from tidefield.baselines.untrained import sparse_depth
@@ -100,6 +102,40 @@ def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, ca
 @pytest.mark.parametrize("used", [(), (4,)])
 def test_fewer_than_two_photographs_give_no_points(hills: Path, used: tuple[int, ...]):
     assert triangulate.triangulate(read_posed(hills, False), used) is None
+
+
+def test_features_and_pairs_of_many_photographs_take_little_memory(hills: Path):
+    posed = read_posed(hills, False)
+    found = triangulate.find_photograph_features(posed.paths[0], posed.lenses[0])
+    assert found.descriptors.nbytes == 128 * len(found.xy)
+    poses = np.tile(posed.T_world_camera[:1], (1000, 1, 1))
+    poses[:, :, 3] = np.random.default_rng(0).normal(size=(1000, 3))
+    tracemalloc.start()
+    pairs = triangulate.neighbouring_pairs(poses)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(pairs) > 5000
+    assert peak < 8 * 1000**2 / 2
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_masked_and_transparent_pixels_leave_the_number_of_features_as_it_is(
+    hills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transparent: bool
+):
+    posed = read_posed(hills, False)
+    monkeypatch.setattr(triangulate, "FEATURES", 100)
+    lens, path, mask = posed.lenses[0], posed.paths[0], tmp_path / "mask.png"
+    used = np.zeros((lens.height, lens.width), dtype=np.uint8)
+    used[:, lens.width // 2 :] = 255
+    if transparent:
+        with Image.open(path) as picture:
+            Image.fromarray(np.dstack([np.asarray(picture.convert("RGB")), used])).save(tmp_path / "photograph.png")
+        path, mask = tmp_path / "photograph.png", None
+    else:
+        Image.fromarray(used).save(mask)
+    found = triangulate.find_photograph_features(path, lens, mask)
+    assert len(found.uv_px) == 100
+    assert (found.uv_px[:, 0] >= lens.width // 2).all()
 
 
 def test_points_are_placed_by_the_observations_of_the_photographs_used_alone(tmp_path: Path):

@@ -15,6 +15,7 @@ from tidefield.survey.colour import estimate_correction, to_common_exposure
 
 FALLOFF = np.array([-0.9, 0.3, 0.0])
 GAINS = np.exp(np.random.default_rng(1).normal(0, 0.2, (12, 3)))
+MORE_GAINS = np.exp(np.random.default_rng(1).normal(0, 0.2, (16, 3)))
 
 
 def tangent(scene: Scene, index: int) -> np.ndarray:
@@ -25,16 +26,17 @@ def tangent(scene: Scene, index: int) -> np.ndarray:
 
 def shaded(gains: np.ndarray, falloff: np.ndarray) -> Scene:
     """The wall at moderate brightness, each photograph with its gain and all with the lens' falloff."""
-    cameras = wall.cameras(12, width=160, height=120, step=0.12)
+    count = len(gains)
+    cameras = wall.cameras(count, width=160, height=120, step=0.12)
     pictures = []
-    for k in range(12):
+    for k in range(count):
         r = tangent(wall.scene(cameras), k) if k == 0 else r
         shade = np.exp(np.stack([r**2, r**4, r**6], -1) @ falloff)[..., None] * gains[k]
         light = wall.photograph(cameras[k]).numpy() * 0.55
         pictures.append(torch.from_numpy(np.clip(np.rint(light * shade), 0, 255).astype(np.uint8)))
     scene = wall.scene(cameras)
     points = wall.points(cameras, 1500)
-    return replace(scene, photographs=Photographs(tuple(pictures)), points=points, train=tuple(range(12)), test=())
+    return replace(scene, photographs=Photographs(tuple(pictures)), points=points, train=tuple(range(count)), test=())
 
 
 def test_gains_and_falloff_are_found():
@@ -105,13 +107,20 @@ def test_corners_brighter_than_the_centre_are_no_falloff_and_do_not_make_the_cor
 
 
 def test_each_lens_has_its_own_falloff():
-    light, dark = shaded(GAINS, np.zeros(3)), shaded(GAINS, FALLOFF)
-    mixed = tuple((dark if k % 2 else light).photographs[k] for k in range(12))
-    correction = estimate_correction(replace(light, photographs=Photographs(mixed)), [k % 2 for k in range(12)])
+    light, dark = shaded(MORE_GAINS, np.zeros(3)), shaded(MORE_GAINS, FALLOFF)
+    mixed = tuple((dark if k % 2 else light).photographs[k] for k in range(16))
+    correction = estimate_correction(replace(light, photographs=Photographs(mixed)), [k % 2 for k in range(16)])
     assert correction.sees_falloff
     r = 0.5
     without, with_falloff = (correction.falloff[k] @ [r**2, r**4, r**6] for k in (0, 1))
     assert with_falloff - without == pytest.approx(FALLOFF @ [r**2, r**4, r**6], abs=0.04)
+
+
+def test_a_lens_of_few_photographs_has_no_falloff():
+    correction = estimate_correction(shaded(MORE_GAINS, FALLOFF), [0] * 9 + [1] * 7)
+    assert correction.sees_falloff
+    assert (correction.falloff[:9] @ [0.5**2, 0.5**4, 0.5**6] < -0.1).all()
+    np.testing.assert_array_equal(correction.falloff[9:], 0)
 
 
 def test_held_out_photographs_have_gain_one_and_change_nothing():

@@ -10,6 +10,7 @@ import textured_wall as wall
 from located_surveys import unlocated_photograph
 from PIL import Image
 
+from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
 from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, initial_camera, lens_groups
 from tidefield.survey.survey import LensPrior, Photograph
@@ -144,6 +145,21 @@ def test_masked_and_transparent_pixels_have_no_features(
             count.append(len(keypoints))
     assert left[0] == 0 < count[0]
     assert min(left[1:]) > 0
+
+
+def test_masked_pixels_leave_the_number_of_features_as_it_is(wall_photographs: list[Photograph]):
+    grey = np.asarray(Image.open(wall_photographs[0].path).convert("L"))
+    everything, _ = find_features(grey, 10_000, CPU)
+    count = len(everything) // 3
+    used = np.zeros((180, 240), dtype=bool)
+    used[:, 120:] = True
+    inside = everything[everything[:, 0] >= 120]
+    assert len(inside) > count
+    keypoints, descriptors = find_features(grey, count, CPU, used)
+    np.testing.assert_array_equal(keypoints, inside[:count])
+    assert len(descriptors) == count
+    for one, other in zip(find_features(grey, count, CPU), find_features(grey, count, CPU, used | True), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("height", [102, 100])

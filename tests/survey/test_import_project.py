@@ -1,3 +1,4 @@
+import io
 import json
 import logging
 import os
@@ -13,6 +14,7 @@ import torch
 from opensfm_projects import reconstruction, tracks_of, write_opensfm, write_tracks
 from PIL import Image
 from PIL.ExifTags import Base
+from rich.console import Console
 from scenes_on_disk import (
     BARREL,
     PINHOLE,
@@ -27,6 +29,7 @@ from scenes_on_disk import (
 )
 
 from tidefield.change.views import Site
+from tidefield.commands import import_
 from tidefield.data.georeference import read_georeference
 from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.posed import Observations
@@ -235,6 +238,22 @@ def test_points_are_found_in_training_photographs_only(tmp_path: Path, monkeypat
     monkeypatch.setattr(convert, "find_points", lambda posed, train, root: used.extend(train))
     import_project(tmp_path / "theirs", tmp_path / "ours")
     assert used == list(range(3, len(names)))
+
+
+@pytest.mark.parametrize("listed", [3, None])
+def test_the_command_counts_the_held_out_photographs_without_reading_the_whole_scene_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: int | None
+) -> None:
+    truth = survey(BARREL)
+    names = [f"./images/{name}" for name in truth.names]
+    split = {"train_filenames": names[listed:], "test_filenames": names[:listed]} if listed else {}
+    write_transforms(tmp_path / "theirs", truth, **split)
+    console = Console(file=io.StringIO())
+    with monkeypatch.context() as patch:
+        patch.setattr("tidefield.data.load.read_posed", lambda *_: pytest.fail("read again"))
+        import_.import_project(import_.Import(tmp_path / "theirs", tmp_path / "ours"), console)
+    assert f"9 photographs, {listed or 2} of them held out; 1 camera;" in console.file.getvalue()
+    assert len(read_posed(tmp_path / "ours", False).train_and_test[1]) == (listed or 2)
 
 
 def test_the_georeference_of_a_project_is_imported(tmp_path: Path) -> None:

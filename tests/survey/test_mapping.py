@@ -1,13 +1,17 @@
 """A lens gets the terms of distortion that it has, and none that would make the model curved."""
 
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
 import pytest
 from located_surveys import FOCAL, HEIGHT, WIDTH, Flight, fly, quiet
 
+from tidefield.errors import RunError
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, solve
 from tidefield.survey.sfm.mapping import (
     MIN_SPREAD_DEG,
@@ -20,6 +24,7 @@ from tidefield.survey.sfm.mapping import (
     choose_lens,
     lens_notes,
     reconstruct,
+    registered_names,
 )
 from tidefield.survey.sfm.model_files import write_model
 from tidefield.survey.survey import LensPrior
@@ -211,13 +216,33 @@ def test_ground_above_the_cameras_gives_no_flight_heights():
     assert _compare_heights(model, photographs) is None
 
 
-def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):
+def simulated_matches(path: Path) -> list[str]:
+    """Write a database of simulated photographs, and return their names."""
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D, noise.point2D_stddev = 1, 5, 5500, 0.5
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
+    with pycolmap.Database.open(path) as database:
         truth = pycolmap.synthesize_dataset(options, database)
         pycolmap.synthesize_noise(noise, truth, database)
-    names = [image.name for image in truth.images.values()]
+    return [image.name for image in truth.images.values()]
+
+
+def test_ctrl_c_ends_the_global_mapper_because_it_has_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    names = simulated_matches(tmp_path / "database.db")
+    monkeypatch.setattr(pycolmap, "global_mapping", Mock(side_effect=AssertionError("not in this process")))
+    (model,) = reconstruct(tmp_path / "database.db", tmp_path / "models", names, quiet, known=False, mapper="global")
+    assert registered_names(model) == sorted(names)
+
+
+def test_a_killed_process_of_the_global_mapper_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", Mock(side_effect=BrokenProcessPool("terminated")))
+    with pytest.raises(RunError, match=r"poses of 3 photographs was killed, .*: expected memory for .*; give fewer"):
+        reconstruct(tmp_path / "database.db", tmp_path, list("abc"), quiet, known=False, mapper="global")
+
+
+def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):
+    names = simulated_matches(tmp_path / "database.db")
 
     def points(number: int) -> bytes:
         (model,) = reconstruct(tmp_path / "database.db", tmp_path / str(number), names, quiet, known=False)

@@ -1,12 +1,13 @@
 """Pairs are chosen by positions, times and their largest features; they are matched and verified once."""
 
 import shutil
+import tracemalloc
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,14 +18,13 @@ import torch
 from located_surveys import unlocated_photograph
 from torch import Tensor
 
+from tidefield.data.sift import MAX_ANGLE_RAD, MAX_RATIO
 from tidefield.errors import RunError
 from tidefield.survey.sfm import features, matching
 from tidefield.survey.sfm.matching import match
 from tidefield.survey.sfm.pairs import (
     EXHAUSTIVE,
-    MAX_ANGLE_RAD,
     MAX_PAIRS,
-    MAX_RATIO,
     MIN_PAIRS,
     NEIGHBOURS,
     PREVIEW,
@@ -120,6 +120,48 @@ def test_a_long_pause_ends_the_sequence():
     assert not [pair for pair in candidate_pairs([*field, *later]) if pair[0] < 30 <= pair[1]]
     timeless = [replace(one, time_s=float("nan")) for one in (*field, *later)]
     assert {(28, 30), (29, 30), (29, 31)} <= set(candidate_pairs(timeless))
+
+
+def test_photographs_without_a_time_leave_the_order_of_the_others_as_it_is():
+    # Names run against the times, and of the photographs with a time every other one is far from all others.
+    flight = [replace(one, name=f"{99 - k:02d}.jpg") for k, one in enumerate(lawnmower(10, 10))][::-1]
+    for k in range(0, 100, 2):
+        flight[k] = replace(flight[k], time_s=float("nan"))
+    for k in range(1, 100, 4):
+        own = flight[k].position
+        assert own is not None
+        flight[k] = replace(flight[k], position=replace(own, latitude_deg=-10.0 - k))
+    timed = range(1, 100, 2)
+    assert {*pairwise(timed), *zip(timed, timed[2:], strict=False)} <= set(candidate_pairs(flight))
+
+
+def test_candidates_of_many_photographs_without_positions_take_little_memory():
+    count = 200
+    pairs = list(combinations(range(count), 2))
+    tracemalloc.start()
+    assert candidate_pairs([unlocated_photograph(k, None) for k in range(count)]) == pairs
+    chosen_from = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    kept = select_pairs(pairs, torch.ones(count, 1, 1), lambda done, whole: None)
+    selected_from = tracemalloc.get_traced_memory()[1] - before
+    tracemalloc.stop()
+    assert len(kept) < len(pairs) / 10
+    assert chosen_from < 110 * len(pairs)
+    assert selected_from < 60 * len(pairs)
+
+
+def test_the_best_pairs_of_each_photograph_are_selected_the_first_among_equals():
+    rng, count = np.random.default_rng(0), 50
+    shared = rng.integers(0, 3, (count, 3))
+    ground = rng.integers(0, 255, (3, 3, 128)).astype(np.uint8)
+    table = preview_descriptors([np.stack([ground[k, own[k]] for k in range(3)]) for own in shared])
+    matches = {(i, j): int((shared[i] == shared[j]).sum()) for i, j in combinations(range(count), 2)}
+    expected = set()
+    for k in range(count):
+        ranked = sorted((pair for pair in matches if k in pair), key=lambda pair: (-matches[pair], pair))
+        expected |= set(ranked[:MIN_PAIRS])
+    assert select_pairs(list(matches), table, lambda done, whole: None) == sorted(expected)
 
 
 def test_pairs_whose_largest_features_match_are_selected_with_the_best_of_each_photograph():
@@ -221,7 +263,8 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
     assert again[0] == 3
     assert calls[-1] == (3, 3)
     with pycolmap.Database.open(path) as db:
-        assert len(db.read_all_matches()[0]) == 3
+        assert len(db.read_two_view_geometries()[0]) == 3
+        assert db.num_matches() == 0, "mapping reads no others"
 
 
 def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -233,9 +276,8 @@ def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkey
         monkeypatch.setattr(matching, "BATCH", batch)
         match(tmp_path / name, list(combinations(names, 2)), pycolmap.Device.cpu, lambda *done: calls.append(done))
         with pycolmap.Database.open(tmp_path / name) as db:
-            numbers, matches = db.read_all_matches()
-            geometries = [geometry.inlier_matches.tolist() for geometry in db.read_two_view_geometries()[1]]
-            found.append((numbers, [np.asarray(own).tolist() for own in matches], geometries))
+            numbers, geometries = db.read_two_view_geometries()
+            found.append((numbers, [geometry.inlier_matches.tolist() for geometry in geometries]))
     assert found[0] == found[1]
     assert len(found[0][0]) == 6
     assert calls == [(6, 6), (2, 6), (4, 6), (6, 6)]
@@ -246,14 +288,19 @@ def test_pairs_without_matches_or_without_a_geometry_are_not_matched_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     names = write_database(tmp_path / "database.db", wrong={2: 0, 3: 30})
+    shutil.copy(tmp_path / "database.db", tmp_path / "raw.db")
     pairs = list(combinations(names, 2))
     found = match(tmp_path / "database.db", pairs, pycolmap.Device.cpu, lambda done, whole: None)
     with pycolmap.Database.open(tmp_path / "database.db") as db:
         number = {image.name: image.image_id for image in db.read_all_images()}
         first, _, unlike, wrong = (number[name] for name in names)
+        for other in (unlike, wrong):
+            assert db.exists_two_view_geometry(first, other)
+            assert len(db.read_two_view_geometry(first, other).inlier_matches) == 0
+    matching._match(tmp_path / "raw.db", [(first, unlike), (first, wrong)], pycolmap.Device.cpu, 1)
+    with pycolmap.Database.open(tmp_path / "raw.db") as db:
         assert len(db.read_matches(first, unlike)) == 0
         assert len(db.read_matches(first, wrong)) > 0
-        assert len(db.read_two_view_geometry(first, wrong).inlier_matches) == 0
     monkeypatch.setattr(pycolmap, "match_image_pairs", Mock(side_effect=AssertionError("matched again")))
     monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     assert match(tmp_path / "database.db", pairs, pycolmap.Device.cpu, lambda done, whole: None) == found

@@ -38,7 +38,7 @@ class Import:
 
 def import_project(options: Import, console: Console) -> None:
     """Run `tidefield import`."""
-    from tidefield.data.load import read_posed
+    from tidefield.data.readers.files import read_json
     from tidefield.progress import ProgressBar
     from tidefield.survey import import_project as importing
     from tidefield.survey.sfm.features import set_up_pycolmap
@@ -57,7 +57,7 @@ def import_project(options: Import, console: Console) -> None:
     photographs, cameras, observations = model.num_images(), model.num_cameras(), model.compute_num_observations()
     observed = f", observed {observations:,} times" if observations else ""
     frame = located and located.frame
-    held_out = len(read_posed(options.scene, False).train_and_test[1])
+    held_out = len(read_json(options.scene / "transforms.json")["test_filenames"])
     where = f"; in metres about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f} ({frame.crs})" if frame else ""
     console.print(
         f"{options.scene}: {photographs} photographs, {held_out} of them held out; {cameras} "

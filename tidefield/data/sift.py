@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,11 @@ from jaxtyping import Bool, Float32, UInt8
 
 if TYPE_CHECKING:
     import pycolmap
+
+MAX_RATIO, MAX_ANGLE_RAD = 0.8, 0.7
+"""Limits on the angle between matching descriptors, relative to the second nearest and absolute: COLMAP's values."""
+MOST_EXTRA = 4
+"""Times the number of features that is asked for at most, where much is masked."""
 
 
 def find_features(
@@ -25,7 +31,8 @@ def find_features(
 
     sift = pycolmap.FeatureExtractionOptions()
     sift.num_threads = 1
-    sift.sift.max_num_features = count
+    share = 1.0 if used is None else float(used.mean())
+    sift.sift.max_num_features = math.ceil(count / max(share, 1 / MOST_EXTRA))  # masked ones are found, too
     sift.sift.first_octave = 0
     found, descriptors = pycolmap.FeatureExtractor.create(sift, device=device).extract_from_uint8_array(grey)
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)[:, :4]

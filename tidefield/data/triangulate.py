@@ -24,7 +24,7 @@ from tidefield.data.images import Progress
 from tidefield.data.pictures import read_mask
 from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.data.readers.posed import Observations, PosedPhotographs
-from tidefield.data.sift import find_features
+from tidefield.data.sift import MAX_ANGLE_RAD, MAX_RATIO, find_features
 from tidefield.geometry.cameras import project_with_slopes
 from tidefield.geometry.lenses import LensModel
 from tidefield.machine import cores
@@ -43,8 +43,6 @@ WIDEST_AXES_DEG = 60.0
 """Between the viewing directions of photographs that are matched."""
 OFF_LINE = 1 / 400
 """Of a match from its epipolar line, as a share of the longer side: poses of phones are good to some pixels."""
-MAX_RATIO, MAX_ANGLE_RAD = 0.8, 0.7
-"""Limits on the angle between matching descriptors, relative to the second nearest and absolute: COLMAP's values."""
 WORTH_PROCESSES_PX = 5_000_000
 """Pixels of all photographs above which it pays to start processes for them, which takes some seconds."""
 LEAST_ANGLE_DEG = 0.5
@@ -54,7 +52,7 @@ _STEPS = 5
 FEWEST = 100
 """Fewer points do not tell where a scene's surface is."""
 
-_VERSION = 1
+_VERSION = 2
 """Part of the key of kept points: to be raised when the same photographs would give others."""
 
 _log = logging.getLogger(__name__)
@@ -68,13 +66,13 @@ class Features:
         uv_px: pixels of the photograph at its lens's size.
         xy: on the plane z = 1 of the camera, without distortion.
         rgb: colours of the photograph there.
-        descriptors: RootSIFT, of unit length.
+        descriptors: RootSIFT, as pycolmap rounds it: a quarter of the memory that it takes at unit length.
     """
 
     uv_px: Float64[np.ndarray, "K 2"]
     xy: Float64[np.ndarray, "K 2"]
     rgb: UInt8[np.ndarray, "K 3"]
-    descriptors: Float32[np.ndarray, "K 128"]
+    descriptors: UInt8[np.ndarray, "K 128"]
 
 
 def find_photograph_features(path: Path, lens: LensModel, mask: Path | None = None) -> Features:
@@ -83,7 +81,7 @@ def find_photograph_features(path: Path, lens: LensModel, mask: Path | None = No
 
     with quiet_pillow(), open_picture(path) as picture:
         rgba = np.asarray(picture.convert("RGBA"))
-    used = None if mask is None else read_mask(mask, (rgba.shape[1], rgba.shape[0]), path)
+    used = read_mask(mask, (rgba.shape[1], rgba.shape[0]), path) & (rgba[..., 3] > 0)
     scale = min(1.0, SIDE_PX / max(rgba.shape[:2]))
     if scale < 1:
         rgba = cv2.resize(rgba, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -94,20 +92,18 @@ def find_photograph_features(path: Path, lens: LensModel, mask: Path | None = No
     column, row = np.floor(uv).astype(int).T.clip(0, [[width - 1], [height - 1]])
     uv *= lens.width / width, lens.height / height
     xy = lens.unproject(uv)
-    kept = np.isfinite(xy).all(axis=1) & (rgba[row, column, 3] > 0)
-    rows = descriptors[kept].astype(np.float32)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-6)
-    return Features(uv[kept], xy[kept], rgba[row[kept], column[kept], :3], rows)
+    kept = np.isfinite(xy).all(axis=1)
+    return Features(uv[kept], xy[kept], rgba[row[kept], column[kept], :3], descriptors[kept])
 
 
 def neighbouring_pairs(T_world_camera: Float64[np.ndarray, "V 3 4"]) -> list[tuple[int, int]]:
     """Choose pairs of photographs to match: each with others near it (`RANKS`) that look in a similar direction."""
     position, forward = T_world_camera[:, :, 3], T_world_camera[:, :, 2]
-    similar = forward @ forward.T > np.cos(np.deg2rad(WIDEST_AXES_DEG))
+    limit = np.cos(np.deg2rad(WIDEST_AXES_DEG))
     pairs = set()
     for i in range(len(position)):
         distance = np.linalg.norm(position - position[i], axis=1)
-        others = np.flatnonzero(similar[i] & (distance > 0))
+        others = np.flatnonzero((forward @ forward[i] > limit) & (distance > 0))
         nearest = others[np.argsort(distance[others], kind="stable")]
         pairs |= {(min(i, j), max(i, j)) for j in nearest[[rank for rank in RANKS if rank < len(nearest)]].tolist()}
     return sorted(pairs)
@@ -130,7 +126,7 @@ def match_along_lines(
     """
     if not (len(first.xy) and len(second.xy)):
         return np.zeros((0, 2), dtype=np.int64)
-    cosine = first.descriptors @ second.descriptors.T
+    cosine = _unit(first.descriptors) @ _unit(second.descriptors).T
     best, rows = cosine.argmax(axis=1), np.arange(len(first.xy))
     mutual = cosine.argmax(axis=0)[best] == rows
     nearest = cosine[rows, best]
@@ -144,6 +140,11 @@ def match_along_lines(
     off = (line[:, :2] * second.xy[best]).sum(axis=1) + line[:, 2]
     on_line = np.abs(off) <= off_line * np.linalg.norm(line[:, :2], axis=1)
     return np.column_stack([rows, best])[on_line]
+
+
+def _unit(descriptors: UInt8[np.ndarray, "K 128"]) -> Float32[np.ndarray, "K 128"]:
+    rows = descriptors.astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-6)
 
 
 def triangulate(posed: PosedPhotographs, used: Sequence[int], progress: Progress | None = None) -> Observations | None:

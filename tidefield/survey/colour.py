@@ -17,6 +17,7 @@ from jaxtyping import Float, Float64, Int64, UInt8
 
 from tidefield.data.exposure import Seen, directional_terms, in_sequence, observe, robust_gains
 from tidefield.data.scene import Scene
+from tidefield.survey.georeference.bundle_adjustment import IMAGES_OF_A_LENS
 
 HELPS = 0.97
 """Gains are applied if they reduce the photographs' disagreement to this share, ..."""
@@ -43,7 +44,8 @@ class ExposureCorrection:
     Attributes:
         gain: brightness of each photograph relative to the common exposure, in the three channels; ones if `helps` is
             false.
-        falloff: k1, k2, k3 of f(r) of each photograph's lens; zeros if `sees_falloff` is false.
+        falloff: k1, k2, k3 of f(r) of each photograph's lens; zeros if `sees_falloff` is false, or if the lens took few
+            photographs.
         before, gains_alone, after: disagreement of the photographs about points that took no part in the estimate:
             uncorrected, after division by gains, and after division by gains and falloff. A standard deviation of log
             colours: 0.05 is 5% of a pixel's value. NaN without such points.
@@ -130,8 +132,14 @@ def _polynomial(tangent: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 3"]:
 
 
 def _fitted(seen: Seen, power: Float64[np.ndarray, "O 3"] | None, lens: Int64[np.ndarray, " V"]) -> _Fit:
-    """Gains of the photographs, and the falloff of each lens if the powers of `_polynomial` are given."""
+    """Gains of the photographs, and the falloff of each lens if the powers of `_polynomial` are given.
+
+    Few photographs show points at few distances from the axis, and between and beyond these, the polynomial would be
+    anything: as in bundle adjustment, their lenses have none.
+    """
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
+    few = np.bincount(lens[np.unique(seen.photograph)], minlength=lenses) < IMAGES_OF_A_LENS
+    own[few[own]] = -1
     terms = None
     if power is not None:
         terms = np.concatenate([np.where((own == k)[:, None], power, 0.0) for k in range(lenses)], axis=1)

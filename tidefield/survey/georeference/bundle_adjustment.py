@@ -41,7 +41,7 @@ _WORTH = 0.7
 """The model is adjusted if the distance from the positions left out falls below this share of what it was."""
 _CHECK_POINTS = 20_000
 _CHECK_POINTS_PER_IMAGE = 40
-_IMAGES_OF_A_LENS = 8
+IMAGES_OF_A_LENS = 8
 """A lens that took fewer photographs is kept."""
 _MISMATCH = 2.0
 """Observations whose error is this many times the median are removed."""
@@ -263,9 +263,9 @@ def _fix_rare_lenses(model: pycolmap.Reconstruction, config: pycolmap.BundleAdju
     """Fix the lenses of few photographs; return the cameras that took more."""
     taken = Counter(model.image(number).camera_id for number in model.reg_image_ids())
     for number, count in taken.items():
-        if count < _IMAGES_OF_A_LENS:
+        if count < IMAGES_OF_A_LENS:
             config.set_constant_cam_intrinsics(number)
-    return [number for number, count in taken.items() if count >= _IMAGES_OF_A_LENS]
+    return [number for number, count in taken.items() if count >= IMAGES_OF_A_LENS]
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

@@ -182,7 +182,7 @@ def _measure(
 def _neighbours(photographs: Sequence[Photograph]) -> list[list[int]]:
     """The nearest photographs of each; in time where its position is unknown."""
     count = min(NEIGHBOURS, len(photographs) - 1)
-    by_time = _capture_order(photographs)
+    by_time = capture_order(photographs)
     near: list[list[int]] = [[] for _ in photographs]
     for rank, index in enumerate(by_time):
         first = max(0, min(rank - count // 2, len(by_time) - count - 1))
@@ -321,7 +321,7 @@ def _find_duplicates(
     """
     coarse = np.array([_coarse(outline) for outline in outlines], np.float32).reshape(-1, _COARSE[0] * _COARSE[1])
     order = sorted(range(len(photographs)), key=lambda i: (-(sharpness[i] if sharpness[i] > 0 else 0.0), i))
-    rank = np.argsort(np.array(_capture_order(photographs), dtype=np.int64))
+    rank = np.argsort(np.array(capture_order(photographs), dtype=np.int64))
     xy_m = positions_m(photographs)
     kept: list[int] = []
     reasons = {}
@@ -348,7 +348,7 @@ def _find_duplicates(
     return reasons
 
 
-def _capture_order(photographs: Sequence[Photograph]) -> list[int]:
+def capture_order(photographs: Sequence[Photograph]) -> list[int]:
     """Indices of photographs by time of capture, then by name; those without time first."""
     times = [photograph.time_s if math.isfinite(photograph.time_s) else 0.0 for photograph in photographs]
     return sorted(range(len(photographs)), key=lambda i: (times[i], photographs[i].name))

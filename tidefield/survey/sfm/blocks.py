@@ -27,8 +27,8 @@ from tidefield.machine import cores
 from tidefield.processes import worker_processes
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, carry_over, thinned
 from tidefield.survey.sfm.features import copy_photographs, decode_name, set_up_pycolmap
-from tidefield.survey.sfm.mapping import Mapper, find_models
-from tidefield.survey.sfm.model_files import model_files, read_model, write_model
+from tidefield.survey.sfm.mapping import Mapper, write_models
+from tidefield.survey.sfm.model_files import model_files, read_model
 from tidefield.survey.survey import Photograph, Progress
 
 WHOLE = 400
@@ -179,10 +179,8 @@ def _split(database: Path, parts: Mapping[Path, Collection[str]]) -> None:
 def _reconstruct(folder: Path, names: list[str], known: bool, mapper: Mapper, threads: int) -> None:
     """Reconstruct one block, and write its models and then a file that says that they are complete."""
     work = folder / "work"
-    found = find_models(work / "database.db", work, names, lambda done, whole: None, known, mapper, threads)
-    for number, model in enumerate(found):
-        write_model(model, folder / str(number))
-    write_json(folder / DONE, {"models": len(found)})
+    count = write_models(work / "database.db", work, folder, names, known, mapper, threads)
+    write_json(folder / DONE, {"models": count})
     shutil.rmtree(work, ignore_errors=True)
 
 

@@ -20,18 +20,22 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotReady
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
 import pycolmap
 
-from tidefield.errors import SurveyError, list_names
+from tidefield.errors import RunError, SurveyError, list_names
 from tidefield.geometry.lenses import colmap_parameters, lens_from_colmap
+from tidefield.processes import worker_processes
 from tidefield.survey.georeference.bundle_adjustment import all_images, solve, thinned
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
-from tidefield.survey.sfm.features import decode_name, encode_name
+from tidefield.survey.sfm.features import decode_name, encode_name, set_up_pycolmap
+from tidefield.survey.sfm.model_files import read_model, write_model
 from tidefield.survey.survey import Photograph, Progress
 
 Result = TypeVar("Result")
@@ -143,8 +147,48 @@ def reconstruct(
 
     Raises:
         SurveyError: no three photographs fit together.
+        RunError: the process of the global mapper was killed.
     """
-    return large_enough(find_models(database, folder, names, progress, known, mapper), database, names)
+    find = _find_models_globally if mapper == "global" else find_models
+    return large_enough(find(database, folder, names, progress, known, mapper), database, names)
+
+
+def _find_models_globally(
+    database: Path, folder: Path, names: Collection[str], progress: Progress, known: bool, mapper: Mapper
+) -> list[pycolmap.Reconstruction]:
+    """Run `find_models` in a process, which Ctrl-C ends: the global mapper has no way to be cancelled."""
+    set_up = partial(set_up_pycolmap, pycolmap.logging.minloglevel == int(pycolmap.logging.INFO))
+    try:
+        with worker_processes(1, set_up) as pool:
+            count = pool.submit(write_models, database, folder, folder, list(names), known, mapper).result()
+    except BrokenProcessPool as error:
+        raise RunError(
+            f"the process that estimates the poses of {len(names)} photographs was killed, which happens when memory "
+            "runs out: expected memory for all of their matches; give fewer --features, and continue with the same "
+            "command"
+        ) from error
+    progress(len(names), len(names))
+    return [read_model(folder / str(number)) for number in range(count)]
+
+
+def write_models(
+    database: Path,
+    work: Path,
+    folder: Path,
+    names: Collection[str],
+    known: bool,
+    mapper: Mapper,
+    threads: int | None = None,
+) -> int:
+    """Write the models of `find_models` to folders 0, 1, ... of a folder; returns their number.
+
+    Args:
+        work: where pycolmap may write.
+    """
+    models = find_models(database, work, names, lambda done, whole: None, known, mapper, threads)
+    for number, model in enumerate(models):
+        write_model(model, folder / str(number))
+    return len(models)
 
 
 def interruptible(job: Callable[[pycolmap.CancellationToken], Result]) -> Result:

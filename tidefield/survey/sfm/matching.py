@@ -71,7 +71,7 @@ def _match_in_processes(
                 return pool.submit(_match, part, batch, device, threads)
 
             for batch, part in in_order(submit, batches, 2 * workers):
-                _copy_matches(part, batch, db)
+                _copy_geometries(part, batch, db)
                 part.unlink()
                 yield len(batch)
     except BrokenProcessPool as error:
@@ -109,9 +109,11 @@ def _match(part: Path, pairs: Sequence[Pair], device: pycolmap.Device, threads: 
     return part
 
 
-def _copy_matches(part: Path, pairs: Sequence[Pair], db: pycolmap.Database) -> None:
-    """Write what was found of pairs to the common database, all or nothing; also that there was nothing."""
+def _copy_geometries(part: Path, pairs: Sequence[Pair], db: pycolmap.Database) -> None:
+    """Write what was verified of pairs to the common database, all or nothing; also that there was nothing.
+
+    Matches that were not verified stay behind: mapping does not read them.
+    """
     with pycolmap.Database.open(part) as own, pycolmap.DatabaseTransaction(db):
         for pair in pairs:
-            db.write_matches(*pair, own.read_matches(*pair))
             db.write_two_view_geometry(*pair, own.read_two_view_geometry(*pair))

@@ -6,7 +6,9 @@ features (preemptive matching: Wu, Towards Linear-Time Incremental Structure fro
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
+from heapq import heappush, heappushpop
 from itertools import combinations
 
 import numpy as np
@@ -15,14 +17,14 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from tidefield.data.sift import MAX_ANGLE_RAD, MAX_RATIO
 from tidefield.survey.io.positions import positions_m
+from tidefield.survey.quality.assessment import capture_order
 from tidefield.survey.survey import Photograph, Progress
 
 Pair = tuple[int, int]
 """Indices of two photographs, the smaller first."""
 
-MAX_RATIO, MAX_ANGLE_RAD = 0.8, 0.7
-"""Limits on the angle between matching descriptors, relative to the second nearest and absolute: COLMAP's values."""
 NEIGHBOURS = 24
 """Nearest photographs with which each is paired, where positions exist."""
 MAX_RELATIVE_DISTANCE = 4.0
@@ -60,15 +62,17 @@ def candidate_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
                 pairs.add(_pair(located[i], located[nearest[i, j]]))
     else:
         located = []
-    for k in set(range(count)) - set(located):
-        pairs |= {_pair(k, other) for other in range(count) if other != k}
-    order = sorted(range(count), key=lambda k: (photographs[k].time_s, photographs[k].name))
+    order = capture_order(photographs)
     for offset in range(1, SEQUENTIAL + 1):
         for a, b in zip(order, order[offset:], strict=False):
             # "not >", because a time may be unknown (NaN).
             if not photographs[b].time_s - photographs[a].time_s > MAX_PAUSE_S:
                 pairs.add(_pair(a, b))
-    return sorted(pairs)
+    everyone = list(range(count))
+    without = set(everyone) - set(located)
+    # There may be millions of these, for which a set would take twice the memory.
+    others = [_pair(k, other) for k in without for other in everyone if other > k or other not in without]
+    return sorted([*others, *(pair for pair in pairs if without.isdisjoint(pair))])
 
 
 def _pair(i: int, j: int) -> Pair:
@@ -105,22 +109,23 @@ def select_pairs(candidates: Sequence[Pair], previews: Float[Tensor, "V K D"], p
     Args:
         previews: from `preview_descriptors`.
     """
-    partners: dict[int, list[int]] = {}
+    partners: defaultdict[int, list[int]] = defaultdict(list)
     for i, j in candidates:
-        partners.setdefault(i, []).append(j)
-    matches: dict[Pair, int] = {}
+        partners[i].append(j)
+    # Of each photograph, the best so far, the worst of them first, as (matches, -i, -j): candidates may be millions.
+    best: defaultdict[int, list[tuple[int, int, int]]] = defaultdict(list)
     for done, (i, others) in enumerate(sorted(partners.items()), start=1):
         for start in range(0, len(others), AT_ONCE):
             part = others[start : start + AT_ONCE]
             counts = (match_descriptors(previews[i].expand(len(part), -1, -1), previews[part]) >= 0).sum(-1)
-            matches |= {(i, j): int(n) for j, n in zip(part, counts, strict=True)}
+            for j, matches in zip(part, counts.tolist(), strict=True):
+                for k in (i, j):
+                    keep = heappush if len(best[k]) < MAX_PAIRS else heappushpop
+                    keep(best[k], (matches, -i, -j))
         progress(done, len(partners))
-    ranked: dict[int, list[Pair]] = {}
-    for pair in sorted(matches, key=lambda p: (-matches[p], p)):
-        for k in pair:
-            ranked.setdefault(k, []).append(pair)
     selected: set[Pair] = set()
-    for pairs in ranked.values():
-        selected |= set(pairs[:MIN_PAIRS])
-        selected |= {pair for pair in pairs[:MAX_PAIRS] if matches[pair] >= MIN_PREVIEW_MATCHES}
+    for heap in best.values():
+        for rank, (matches, i, j) in enumerate(sorted(heap, reverse=True)):
+            if rank < MIN_PAIRS or matches >= MIN_PREVIEW_MATCHES:
+                selected.add((-i, -j))
     return sorted(selected)
