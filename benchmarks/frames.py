@@ -55,7 +55,7 @@ def frames(
     preset: Literal["swift", "paper"] = "swift",
     weights: Path | None = None,
     width: int = 800,
-    height: int = 600,
+    height: int | None = None,
     device: str = "cpu",
     run: HiddenRunner = run_measured,
 ) -> dict[str, Any]:
@@ -66,12 +66,15 @@ def frames(
         runs: Store the figures in this folder's frames.json.
         preset: Which network.
         weights: Its weights, of `tidefield pretrain`; those that came with Tidefield if not given.
-        width, height: Of the views, in pixels.
+        width: Of the views, in pixels.
+        height: Of the views; in proportion to the width, as photographs are, if not given.
         device: auto, cpu, cuda, cuda:N or mps.
         run: Runs a command.
     """
     loaded, file, where = load_scene(scene), given_or_shipped(weights, preset), choose_device(device)
-    name = loaded.names[(loaded.test or loaded.train)[0]]
+    index = (loaded.test or loaded.train)[0]
+    name, own = loaded.names[index], loaded.cameras[index]
+    height = height or round(width * own.height / own.width)
     first = _first(scene, name, preset, file, str(where), (width, height), runs, run)
     named = "" if weights is None else " --weights WEIGHTS"
 

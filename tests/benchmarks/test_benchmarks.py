@@ -176,7 +176,10 @@ def test_frames_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
         assert not Path(environment["XDG_CACHE_HOME"]).exists(), "nothing is decoded before"
         return Usage(12.5, 1)
 
-    record = frames.frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", 32, 24, "cpu", run)
+    record = frames.frames(scene, tmp_path, "swift", tmp_path / "w.safetensors", 32, None, "cpu", run)
+    camera = load_scene(scene).cameras[0]
+    assert record["size_px"] == [32, round(32 * camera.height / camera.width)]
+    assert asked[asked.index("--height") + 1] == str(record["size_px"][1])
     assert record == json.loads((tmp_path / "frames.json").read_text())
     assert "--zero-shot" in asked
     assert record["first"]["seconds"] == 12.5
