@@ -42,7 +42,7 @@ COMMANDS = {
     "map_control": "Heights of a map's surface at ground control that is left out in turn (minutes).",
     "map_views": "A photograph of a built-in flat that took no part in its map, against the orthophoto warped into it "
     "(minutes).",
-    "map_surveys": "Maps of real surveys and the time they take, beside what users of ODM published (minutes each).",
+    "map_surveys": "Maps of real surveys and the time they take, next to what users of ODM published (minutes each).",
     "map_memory": "Peak memory of a map of a square kilometre, simulated by repeating a scene (an hour, 20 GB of "
     "disk).",
     "cluster": "A map on a cluster of this machine: speed of one and two workers, and what killed workers cost (an "

@@ -54,8 +54,8 @@ def scales(
         width: That scenes are opened at; a run has its own.
         device: auto, cpu, cuda, cuda:N or mps.
         out: The Markdown file to write; replaced if it is there.
-        pictures: Folder for a detail of each source's first held-out photograph at the largest width, beside renderings
-            by points and by cones; the page shows those that lie beside it.
+        pictures: Folder for a detail of each source's first held-out photograph at the largest width, next to
+            renderings by points and by cones; the page shows those that lie next to it.
         run: Runs a command.
 
     Raises:

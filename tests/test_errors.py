@@ -7,5 +7,5 @@ from tidefield.errors import RunError, need
 
 def test_a_library_that_is_missing_is_named_with_its_extra():
     assert need("json.decoder", "view").__name__ == "json.decoder"
-    with pytest.raises(RunError, match=r"^nothing cannot be imported .*pip install 'tidefield\[view\]'`$"):
+    with pytest.raises(RunError, match=r"^this needs nothing, which cannot be imported .*pip install 'tidefield\[view\]'`$"):
         need("nothing.at_all", "view")

@@ -40,8 +40,8 @@ def need(module: str, extra: str = "maps") -> ModuleType:
         return import_module(module)
     except ImportError as error:
         raise RunError(
-            f"{module.partition('.')[0]} cannot be imported ({error}): expected the extra `{extra}`; install it with "
-            f"`pip install 'tidefield[{extra}]'`"
+            f"this needs {module.partition('.')[0]}, which cannot be imported ({error}): expected the extra `{extra}`; "
+            f"install it with `pip install 'tidefield[{extra}]'`"
         ) from error
 
 

@@ -479,7 +479,7 @@ def test_a_pretraining_is_not_continued_with_another_scene_of_the_same_name(
     go_on(own, steps=2)
     assert json.loads(file.read_text())["real"] == started["real"]
     go_on(other, own, steps=1, resume=False, out="both")
-    with pytest.raises(RunError, match="was started with real"):  # scenes are drawn by their place
+    with pytest.raises(RunError, match="was started with --real in the order"):  # by which they are drawn
         go_on(own, other, steps=2, out="both")
 
 

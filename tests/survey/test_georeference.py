@@ -243,7 +243,7 @@ def test_missing_heights_are_relative_altitudes_or_level_flight():
     heights = np.array([centre[2] for centre in camera_centres(model).values()])
     assert abs(heights.mean() - found.frame.height_m * -1) < 5
     assert np.isnan(found.gps.error_m[:, 2]).all(), "heights that were not given have no errors"
-    assert found.gps_used.known.all()
+    assert found.gps_used.known_in_plan.all()
     assert found.gps_used.horizontal_rms_m < 2.0
     above = tuple(
         replace(p, relative_altitude_m=float(flight.centres_world[i, 2])) for i, p in enumerate(without.photographs)

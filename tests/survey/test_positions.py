@@ -483,7 +483,11 @@ def test_the_folder_in_a_path_of_another_machine_distinguishes_names():
         names.find("/elsewhere/DJI_0001.JPG")
     later = PhotographNames(["100MEDIA/DJI_0001.JPG", "100MEDIA/DJI_0002.JPG"])
     assert later.find("101MEDIA/DJI_0001.JPG") is None, "cameras number photographs anew in each folder"
-    assert later.find("DJI_0001.JPG") == "100MEDIA/DJI_0001.JPG"
+    for path in ("DJI_0001.JPG", "D:\\x\\100MEDIA\\DJI_0001.DNG", "/flight/DJI_0001.JPG"):
+        assert later.find(path) == "100MEDIA/DJI_0001.JPG"
+    inner = PhotographNames(["DCIM/100MEDIA/DJI_0001.JPG"])
+    assert inner.find("100MEDIA/DJI_0001.JPG") == "DCIM/100MEDIA/DJI_0001.JPG"
+    assert inner.find("DCIM/101MEDIA/DJI_0001.JPG") is None
 
 
 def test_letters_of_the_hemispheres_beside_unsigned_degrees_are_signs(tmp_path):

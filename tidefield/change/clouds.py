@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,9 +29,6 @@ from tidefield.geometry.geodesy import (
     vertical_datum_of,
 )
 from tidefield.maps.classes import NOISE, WATER
-
-if TYPE_CHECKING:
-    pass
 
 _MOST_POINTS = 200_000_000
 _POINTS_PER_CELL = 10.0

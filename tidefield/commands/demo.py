@@ -18,7 +18,7 @@ from tidefield.commands.render import Render, render
 from tidefield.commands.train import Train, train
 from tidefield.config import Budget
 from tidefield.errors import RunError, list_names
-from tidefield.files import completed_file, completed_folder, only_writer, read_json, write_json
+from tidefield.files import completed_file, only_writer, read_json, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,7 +63,7 @@ def demo(options: Demo, console: Console) -> None:
 
 
 def _demo(options: Demo, console: Console) -> None:
-    from tidefield.synthetic import make_survey, write_survey
+    from tidefield.compare.run import make_flat
     from tidefield.train.checkpoint import CHECKPOINT_FILE
 
     out, device = options.out, options.device
@@ -75,8 +75,8 @@ def _demo(options: Demo, console: Console) -> None:
         made.delete()
     if not scene.exists():
         console.print("Making a survey of a tidal flat ...")
-        with made.making(), completed_folder(scene) as partial:
-            write_survey(make_survey("river_mouths", seed=7, views=40, width=SURVEY_WIDTH), partial)
+        with made.making():
+            make_flat(scene, "river_mouths", seed=7, views=40, width=SURVEY_WIDTH)
     if not first.exists():
         console.print("A first view, with trained weights that have never seen this place:")
         view = Render(scene, first, camera=PHOTOGRAPH, zero=ZeroShot(True), width=TRAINING_WIDTH, device=device)

@@ -62,7 +62,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
     occupied = folder.exists() and (not folder.is_dir() or not is_empty(folder))
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
     if options.resume:
-        _require_same(folder, _record(options))
+        _require_same(folder, _record(options), _places(options))
         if options.budget == Budget():
             budget = _budget_of(folder) or budget
     if occupied and not options.resume:
@@ -95,7 +95,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
         for scene in options.real:  # a name that is mistyped leaves the folder as it is
             read_posed(scene, allow_missing=False)
         if not options.resume:
-            write_json(folder / PRETRAINING_FILE, {**_record(options), "budget": asdict(budget)})
+            write_json(folder / PRETRAINING_FILE, _whole_record(options, budget))
     validation = across.Validation(across.validation_scenes(folder, options.real, console), folder)
     with Stream(folder / "scenes", options.real, across.process_seed(seed), config) as stream:
         shown = next(iter(validation.scenes.values()))
@@ -104,7 +104,7 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
             trainer.resume(folder)
             validation.resume(trainer.progress.step)
             if trainer.is_main_process:  # an older one may lack it
-                write_json(folder / PRETRAINING_FILE, {**_record(options), "budget": asdict(budget)})
+                write_json(folder / PRETRAINING_FILE, _whole_record(options, budget))
             if budget.share(trainer.progress.step, trainer.progress.seconds) >= 1:
                 console.print(USED_BEFORE, highlight=False)
         stopped = train(trainer, folder, budget, console, validation)
@@ -120,15 +120,26 @@ def _pretrain(options: Pretrain, budget: Budget, seed: int, device: torch.device
             "validation": validation.points,
         }
         write_weights(folder / WEIGHTS_FILE, trainer.network, trainer.config, description)
-    report_end(trainer.progress, stopped, folder, console)
+    report_end(trainer.progress, stopped, folder, console, budget)
 
 
 def _record(options: Pretrain) -> dict[str, Any]:
     """What must not change while a training is continued: its weights tell what they learned from."""
+    real = sorted(_places(options))
+    return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
+
+
+def _whole_record(options: Pretrain, budget: Budget) -> dict[str, Any]:
+    places = _places(options)
+    order = {"order": places} if places != sorted(places) else {}
+    return {**_record(options), **order, "budget": asdict(budget)}
+
+
+def _places(options: Pretrain) -> list[str]:
+    """The real scenes in their order, by which they are drawn."""
     from tidefield.addresses import address_of
 
-    real = [address_of(scene) or str(scene.resolve()) for scene in options.real]  # scenes are drawn by their place
-    return {"preset": options.preset, "variant": options.variant, "seed": options.seed, "real": real}
+    return [address_of(scene) or str(scene.resolve()) for scene in options.real]
 
 
 def _budget_of(folder: Path) -> Budget | None:
@@ -140,7 +151,7 @@ def _budget_of(folder: Path) -> Budget | None:
     return from_json(Budget, stated, f"{folder / PRETRAINING_FILE}: budget").checked()
 
 
-def _require_same(folder: Path, record: dict[str, Any]) -> None:
+def _require_same(folder: Path, record: dict[str, Any], order: list[str]) -> None:
     """Raises: RunError when the folder holds no training across scenes, or one with other options."""
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
@@ -157,6 +168,8 @@ def _require_same(folder: Path, record: dict[str, Any]) -> None:
     if found.get("real") == names:  # all that older ones have
         record = {**record, "real": names}
     wrong = [f"{name} {found.get(name)}, not {value}" for name, value in record.items() if found.get(name) != value]
+    if not wrong and found["real"] != names and found.get("order", found["real"]) != order:
+        wrong = [f"--real in the order {found.get('order', found['real'])}"]
     if wrong:
         raise RunError(
             f"{folder} was started with {'; '.join(wrong)}: expected the same options to continue it; repeat them"

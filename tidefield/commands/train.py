@@ -186,7 +186,7 @@ def _train(options: Train, console: Console, again: str) -> None:
             if used >= 1:
                 console.print(USED_BEFORE, highlight=False)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
-    report_end(progress, stopped, folder, console, again)
+    report_end(progress, stopped, folder, console, budget, again)
 
 
 def _both(first: Callback | None, second: Callback) -> Callback:
@@ -202,12 +202,19 @@ def _both(first: Callback | None, second: Callback) -> Callback:
 
 
 def report_end(
-    progress: TrainingProgress, stopped: int | None, folder: Path, console: Console, again: str = AGAIN
+    progress: TrainingProgress,
+    stopped: int | None,
+    folder: Path,
+    console: Console,
+    budget: Budget,
+    again: str = AGAIN,
 ) -> None:
-    """Print what was done; a training that a signal stopped ends its command as the signal does."""
+    """Print what was done; a training that a signal stopped ends its command as the signal does, and `again` says what
+    continues it, if some of the budget is left."""
     console.print(f"{progress.step} steps in {progress.seconds / 60:.1f} minutes, kept in {folder}", highlight=False)
     if stopped is not None:
-        console.print(f"interrupted; {again} continues")
+        left = budget.share(progress.step, progress.seconds) < 1
+        console.print(f"interrupted; {again} continues" if left else "interrupted")
         raise Ended(stopped)
 
 

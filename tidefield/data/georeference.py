@@ -37,6 +37,11 @@ class Residuals:
 
     @property
     def known(self) -> Bool[np.ndarray, " N"]:
+        """Whether all of an error's components are finite."""
+        return np.asarray(np.isfinite(self.error_m).all(axis=1))
+
+    @property
+    def known_in_plan(self) -> Bool[np.ndarray, " N"]:
         """Whether an error's horizontal components are finite; positions without heights have no vertical one."""
         return np.asarray(np.isfinite(self.error_m[:, :2]).all(axis=1))
 

@@ -45,7 +45,7 @@ class ExposureCorrection:
         gain: brightness of each photograph relative to the common exposure, in the three channels; ones if `helps` is
             false.
         falloff: k1, k2, k3 of f(r) of each photograph's lens; zeros if `sees_falloff` is false, or if the lens took few
-            photographs.
+            photographs and another enough.
         before, gains_alone, after: disagreement of the photographs about points that took no part in the estimate:
             uncorrected, after division by gains, and after division by gains and falloff. A standard deviation of log
             colours: 0.05 is 5% of a pixel's value. NaN without such points.
@@ -139,6 +139,7 @@ def _fitted(seen: Seen, power: Float64[np.ndarray, "O 3"] | None, lens: Int64[np
     """
     lenses, own = int(lens.max()) + 1, lens[seen.photograph]
     few = np.bincount(lens[np.unique(seen.photograph)], minlength=lenses) < IMAGES_OF_A_LENS
+    few &= not few.all()  # a small survey's own lens is judged by what it explains
     own[few[own]] = -1
     terms = None
     if power is not None:

@@ -107,8 +107,10 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     if np.isfinite(degrees).any():
         longitude, latitude = np.nanmedian(degrees, axis=0).tolist()
         refuse_elsewhere(control, longitude, latitude, radius_m(degrees, (longitude, latitude)))
+    to_degrees = Transformer.from_crs(parse_crs(crs).to_2d(), WGS84, always_xy=True)
     for point, (x, y, _) in control.points.items():
-        if math.isinf(_distance_m(parse_crs(crs), x, y, (0.0, 0.0))):
+        place = to_degrees.transform(x, y)
+        if not np.isfinite(place).all() or abs(place[1]) > 90:
             raise SurveyError(
                 f"{first_lines[point][0]} puts the point {point} at ({x:.10g}, {y:.10g}), which is nowhere in "
                 f"{parse_crs(crs).name}: expected coordinates of this system, easting or longitude first; correct them"

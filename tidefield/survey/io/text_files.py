@@ -16,6 +16,7 @@ from tidefield.geometry.geodesy import has_unstated_unit, parse_crs
 _MAX_MEGABYTES = 50
 _MAX_WORDS = 64
 """Of a photograph's name: each further word is one more name to look up, so that long lines would take hours."""
+_CAMERA_FOLDER = re.compile(r"\d{3}\w+")
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
 _UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
 _CODE = re.compile(r"\+|\w+[:[]")
@@ -26,7 +27,7 @@ class PhotographNames:
     """Index of the photographs of a survey by full or shortened name.
 
     A name may be the path in the survey's folder or the file name alone, with or without suffix, in any case. One in
-    another folder is another photograph: cameras number them anew in each.
+    another of a camera's folders (100MEDIA, 101MEDIA) is another photograph: numbers start again in each.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -57,13 +58,10 @@ class PhotographNames:
             raise SurveyError(
                 f"{text} names {len(names)} photographs ({list_names(names)}): expected one; write its folder, too"
             )
-        if not names or (len(path.parts) > 1 and "/" in names[0] and not self._is_in(names[0], places)):
+        if not names:
             return None
-        return names[0]
-
-    def _is_in(self, name: str, places: Sequence[tuple[str, str]]) -> bool:
-        """Whether a photograph is at one of some places."""
-        return any(name in self._names.get(place, ()) for place in places)
+        folders = {path.parent.name, PurePosixPath(normalise_name(names[0])).parent.name}
+        return None if len(folders) > 1 and all(map(_CAMERA_FOLDER.fullmatch, folders)) else names[0]
 
     def split(self, line: str) -> tuple[str | None, list[str]]:
         """Split a line that begins with a photograph's name, which may have spaces, into the name and further cells."""

@@ -163,7 +163,7 @@ def draw_histogram(
 def draw_residuals(comparison: Comparison) -> Markup | None:
     """Draw residuals in plan, and their heights in a strip next to it, which is empty where positions had none; None if
     no residuals are known."""
-    finite = comparison.residuals.known
+    finite = comparison.residuals.known_in_plan
     if not (finite & comparison.used).any():
         return None
     error_m, used = comparison.residuals.error_m[finite], comparison.used[finite]
