@@ -7,5 +7,6 @@ from tidefield.errors import RunError, need
 
 def test_a_library_that_is_missing_is_named_with_its_extra():
     assert need("json.decoder", "view").__name__ == "json.decoder"
-    with pytest.raises(RunError, match=r"^this needs nothing, which cannot be imported .*pip install 'tidefield\[view\]'`$"):
+    expected = r"^this needs nothing, which cannot be imported .*pip install 'tidefield\[view\]'`$"
+    with pytest.raises(RunError, match=expected):
         need("nothing.at_all", "view")
