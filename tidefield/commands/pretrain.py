@@ -62,7 +62,7 @@ def pretrain(options: Pretrain, console: Console) -> None:
     occupied = folder.exists() and (not folder.is_dir() or not is_empty(folder))
     device = across.join(choose_device(options.device))  # all processes have looked before one of them writes
     if options.resume:
-        _require_same(folder, _record(options), _places(options))
+        _require_same(folder, options)
         if options.budget == Budget():
             budget = _budget_of(folder) or budget
     if occupied and not options.resume:
@@ -151,7 +151,7 @@ def _budget_of(folder: Path) -> Budget | None:
     return from_json(Budget, stated, f"{folder / PRETRAINING_FILE}: budget").checked()
 
 
-def _require_same(folder: Path, record: dict[str, Any], order: list[str]) -> None:
+def _require_same(folder: Path, options: Pretrain) -> None:
     """Raises: RunError when the folder holds no training across scenes, or one with other options."""
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
@@ -164,7 +164,8 @@ def _require_same(folder: Path, record: dict[str, Any], order: list[str]) -> Non
             f"{folder} holds no training of `tidefield pretrain` (no {PRETRAINING_FILE}): expected one to continue; "
             "name it, or leave --resume out"
         )
-    names = sorted(Path(scene).name for scene in record["real"])
+    record, order = _record(options), _places(options)
+    names = sorted(Path(scene).name for scene in order)
     if found.get("real") == names:  # all that older ones have
         record = {**record, "real": names}
     wrong = [f"{name} {found.get(name)}, not {value}" for name, value in record.items() if found.get(name) != value]

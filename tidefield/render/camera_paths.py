@@ -118,7 +118,7 @@ class Layout:
 
 
 def require_path(path: str, frames: int) -> None:
-    """Raise a TidefieldError where `make_trajectory` would, as far as can be told without a scene."""
+    """Raise a TidefieldError where `make_trajectory` would, as far as names and files show it without a scene."""
     if frames < 1:
         raise TidefieldError(f"a video of {frames} frames was asked for: expected at least one; choose more --frames")
     if Path(path).suffix.lower() == ".json":

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 from pyproj import CRS, Geod, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info
@@ -55,7 +56,8 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     crs, lines = read_list(path)
     if not lines:
         raise SurveyError(f"{path} has no ground control points: {_EXPECTED_LINE} after its first line; add them")
-    across = _SAME_POINT_M / (metres_per_degree(0.0)[1] if parse_crs(crs).is_geographic else 1.0)
+    system = parse_crs(crs)
+    across = _SAME_POINT_M / (metres_per_degree(0.0)[1] if system.is_geographic else 1.0)
     by_name = {photograph.name: photograph for photograph in photographs}
     names = PhotographNames(by_name)
     first_lines: dict[str, tuple[str, tuple[float, ...]]] = {}
@@ -107,15 +109,16 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     if np.isfinite(degrees).any():
         longitude, latitude = np.nanmedian(degrees, axis=0).tolist()
         refuse_elsewhere(control, longitude, latitude, radius_m(degrees, (longitude, latitude)))
-    to_degrees = Transformer.from_crs(parse_crs(crs).to_2d(), WGS84, always_xy=True)
-    for point, (x, y, _) in control.points.items():
-        place = to_degrees.transform(x, y)
-        if not np.isfinite(place).all() or abs(place[1]) > 90:
-            raise SurveyError(
-                f"{first_lines[point][0]} puts the point {point} at ({x:.10g}, {y:.10g}), which is nowhere in "
-                f"{parse_crs(crs).name}: expected coordinates of this system, easting or longitude first; correct them"
-            )
-    remarks = unit_remarks(path, parse_crs(crs))
+    xyz = np.array(list(control.points.values()), dtype=np.float64).reshape(-1, 3)
+    nowhere = np.isinf(_degrees(system, xyz[:, 0], xyz[:, 1])).any(axis=1)
+    if nowhere.any():
+        point = list(control.points)[int(nowhere.argmax())]
+        x, y, _ = control.points[point]
+        raise SurveyError(
+            f"{first_lines[point][0]} puts the point {point} at ({x:.10g}, {y:.10g}), which is nowhere in "
+            f"{system.name}: expected coordinates of this system, easting or longitude first; correct them"
+        )
+    remarks = unit_remarks(path, system)
     if missing:
         remarks.append(
             f"{path.name} marks points in photographs that do not exist (left out): {list_names(list(missing))}."
@@ -229,10 +232,17 @@ def _fitting(crs: str, x: float, y: float, site: tuple[float, float]) -> list[st
 
 def _distance_m(crs: CRS, x: float, y: float, site: tuple[float, float]) -> float:
     """Metres on the ellipsoid; infinite where the coordinates are outside of the system's domain."""
+    longitude, latitude = _degrees(crs, np.array([x]), np.array([y]))[0].tolist()
+    if math.isinf(longitude):
+        return math.inf
+    return abs(Geod(ellps="WGS84").inv(*site, longitude, latitude)[2])
+
+
+def _degrees(crs: CRS, x: Float64[np.ndarray, " N"], y: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
+    """Longitudes and latitudes (WGS 84); infinite outside of the system's domain."""
     try:
-        there = Transformer.from_crs(crs.to_2d(), WGS84, always_xy=True).transform(x, y, errcheck=True)
+        there = np.stack(Transformer.from_crs(crs.to_2d(), WGS84, always_xy=True).transform(x, y), axis=1)
     except (ProjError, CRSError):
-        return float("inf")
-    if not np.isfinite(there).all() or abs(there[1]) > 90:
-        return float("inf")
-    return abs(Geod(ellps="WGS84").inv(*site, *there)[2])
+        return np.full((len(x), 2), math.inf)
+    there[~(np.isfinite(there).all(axis=1) & (np.abs(there[:, 1]) <= 90))] = math.inf
+    return there

@@ -17,6 +17,7 @@ _MAX_MEGABYTES = 50
 _MAX_WORDS = 64
 """Of a photograph's name: each further word is one more name to look up, so that long lines would take hours."""
 _CAMERA_FOLDER = re.compile(r"\d{3}\w+")
+"""As cameras name the folders of a card (DCF)."""
 _SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,3}")
 _UTM = re.compile(r"WGS\s*-?\s*84[\s/,]+UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", re.IGNORECASE)
 _CODE = re.compile(r"\+|\w+[:[]")
