@@ -92,6 +92,13 @@ def test_accurate_points_have_more_weight():
     assert off[1] < 0.05 < off[0]
 
 
+def test_a_start_of_a_scale_near_zero_is_refined_to_the_truth():
+    points = cameras()
+    start = Similarity(42e-9, TRUTH.rotation, TRUTH(points.mean(0)[None])[0] - 42e-9 * TRUTH.rotation @ points.mean(0))
+    found = refine_similarity(start, points, TRUTH(points), np.ones((20, 3)))
+    assert_same(found.similarity, TRUTH, points, 1e-6)
+
+
 def test_the_estimated_tilt_error_is_the_observed_one():
     points, tilts = cameras(30, across=0.15), []
     for seed in range(200):

@@ -267,6 +267,18 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
         assert db.num_matches() == 0, "mapping reads no others"
 
 
+def test_what_is_not_matched_any_more_is_deleted(tmp_path: Path):
+    path = tmp_path / "database.db"
+    first, second, third, _ = write_database(path)
+    for pairs in ([(first, second), (second, third)], [(third, first), (second, first)]):
+        assert match(path, pairs, pycolmap.Device.cpu, lambda done, whole: None)[0] == 2
+    with pycolmap.Database.open(path) as db:
+        number = {image.name: image.image_id for image in db.read_all_images()}
+        assert db.exists_two_view_geometry(number[first], number[second])
+        assert db.exists_two_view_geometry(number[first], number[third])
+        assert not db.exists_two_view_geometry(number[second], number[third])
+
+
 def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     names = write_database(tmp_path / "one.db")
     shutil.copy(tmp_path / "one.db", tmp_path / "many.db")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
+from unittest.mock import Mock
 
 import ground_flight
 import numpy as np
@@ -28,6 +29,7 @@ from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, _fingerprint, _is_rounded, _require_control, prepare
 from tidefield.survey.quality.assessment import without
 from tidefield.survey.report import collect_findings, write_report
+from tidefield.survey.sfm import features, matching
 from tidefield.survey.sfm.blocks import cut
 from tidefield.survey.sfm.features import FeatureOptions
 from tidefield.survey.stages import Stages
@@ -244,9 +246,24 @@ def test_the_split_of_an_earlier_run_is_not_read_while_photographs_are_written_a
 
 
 @pytest.mark.thorough
-def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    import tidefield.survey.sfm.features as features
+def test_other_positions_keep_features_and_matches(
+    made: tuple[Path, Prepared], flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scene = shutil.copytree(made[0], tmp_path / "scene")
+    corrected = ground_flight.FRAME.to_geographic(flight.position_world + np.array([0.4, -0.3, 1.0]))
+    rows = [f"{name},{x!r},{y!r},{z}\n" for name, (x, y, z) in zip(flight.names, corrected.tolist(), strict=True)]
+    table = tmp_path / "ppk.csv"
+    table.write_text("image_name,lon,lat,gps_height\n" + "".join(rows))
+    for module, name in ((features, "_write_features"), (matching, "_match")):
+        monkeypatch.setattr(module, name, Mock(side_effect=AssertionError("done again")))
+    moved = read_survey(flight.folder, gps=table)
+    again = prepare(moved, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True))
+    assert again.models == made[1].models
+    assert position_error_m(scene, flight).mean(0) == pytest.approx([0.4, -0.3, 1.0], abs=0.05)
 
+
+@pytest.mark.thorough
+def test_an_interrupted_stage_continues(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     original, written = features._write_features, []
 
     def interrupt_at_the_seventh(db, photograph, *rest):

@@ -112,6 +112,36 @@ def test_stages_after_one_that_was_interrupted_are_repeated_and_not_continued(pi
     assert pipeline.run() == []
 
 
+def test_a_stage_with_the_same_inputs_continues_unless_it_is_repeated_on_request(tmp_path: Path):
+    def run(source: int, inputs: int, redo: str | None = None) -> list[bool]:
+        stages = Stages(tmp_path, source, redo)
+        facts = [stages.run("features", 0, [], lambda resume: {"resumed": resume}, inputs=inputs)]
+        facts.append(stages.run("matches", 0, [], lambda resume: {"resumed": resume}, inputs=inputs))
+        facts.append(stages.run("poses", 0, [], lambda resume: {"resumed": resume}))
+        return [fact["resumed"] for fact in facts]
+
+    assert run(0, inputs=1) == [False, False, False]
+    assert run(7, inputs=1) == [True, True, False]
+    assert run(7, inputs=1, redo="matches") == [True, False, False]
+    assert run(7, inputs=1, redo="features") == [False, False, False]
+    assert run(8, inputs=2) == [False, False, False]
+
+
+def test_a_stage_does_not_continue_from_what_is_damaged(tmp_path: Path):
+    def damaged(_: Facts) -> Facts:
+        raise ValueError("no database")
+
+    def again(resume: bool) -> Facts:
+        resumed.append(resume)
+        return {}
+
+    resumed: list[bool] = []
+    Stages(tmp_path, 0).run("features", 0, [], lambda _: {}, inputs=1)
+    with pytest.raises(ValueError, match="no database"):
+        Stages(tmp_path, 0).run("features", 0, [], again, damaged, inputs=1)
+    assert resumed == [False]
+
+
 def test_a_damaged_record_is_an_error(tmp_path: Path):
     for text in ("{", "[]", "[" * 100_000):
         (tmp_path / "stages.json").write_text(text)

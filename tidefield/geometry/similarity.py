@@ -133,6 +133,8 @@ def refine_similarity(
         # Collinear points leave one rotation free: damp it, by a term that is negligible next to all others.
         normal += 1e-12 * np.diag(normal).max() * np.diag([1.0, 1, 1, 1, 0, 0, 0])
         step = -np.linalg.solve(normal, gradient)
+        # Where points contradict each other the start has a scale near 0, from which whole steps overflow.
+        step[:4] /= max(1.0, np.abs(step[:4]).max())
         scale, middle = scale * float(np.exp(step[0])), middle + step[4:]
         rotation = Rotation.from_rotvec(step[1:4]).as_matrix() @ rotation
         if np.abs(step[:4]).max() < 1e-11:

@@ -160,7 +160,8 @@ def prepare(
         masks, kind = _masks_fingerprint(good), [lens] if lens != "pinhole" else []
         scales = ["a scale of each side"] if _is_rounded(good, features.side_px) else []
         options = [names, asdict(features), *masks, *kind, *scales]
-        stages.run("features", options, [database], extract_features, refuse_damaged)
+        pixels = [_pixels_fingerprint(good), *options]  # other positions choose other pairs of the same features
+        stages.run("features", options, [database], extract_features, refuse_damaged, inputs=pixels)
         pairs = stages.run(
             "pairs",
             {},
@@ -178,7 +179,7 @@ def prepare(
                 agree, inliers = match(database, pairs, device, bar)
             return {"agree": agree, "inliers": inliers}
 
-        stages.run("matches", {}, [database], match_pairs)
+        stages.run("matches", {}, [database], match_pairs, inputs=pixels)
 
         def read_poses(facts: Facts) -> tuple[list[list[str]], LensChoice]:
             models = [[str(name) for name in model] for model in facts["models"]]
@@ -435,6 +436,11 @@ def _fingerprint(survey: Survey) -> list:
         angles = [repr(photograph.gimbal_deg)] if photograph.gimbal_is_given else []
         fingerprint.append([photograph.name, state.st_size, state.st_mtime_ns, position, lens, *angles])
     return fingerprint
+
+
+def _pixels_fingerprint(survey: Survey) -> list:
+    """Identify what features and matches are made of: files and lenses, without positions and angles."""
+    return [entry[:3] + entry[4:5] for entry in _fingerprint(survey)]
 
 
 def _have_masks(photographs: Sequence[Photograph]) -> bool:

@@ -67,7 +67,7 @@ class Stages:
         if all(record["done"] for record in self._records.values()):
             for record in self._records.values():
                 record.pop("redone", None)
-        self._key, self._redo, self._is_redoing = _digest(source), redo, False
+        self._key, self._redo, self._is_redoing, self._is_forced = _digest(source), redo, False, False
         self.seconds: dict[str, float] = {}
 
     def run(
@@ -77,15 +77,20 @@ class Stages:
         outputs: Sequence[Path],
         job: Callable[[bool], Facts],
         read: Callable[[Facts], Result] = lambda facts: facts,
+        *,
+        inputs: object = None,
     ) -> Result:
         """Run a stage unless it is complete, and then all that follow, too.
 
         Args:
             options: everything its result depends on, besides the previous stages (any JSON).
             outputs: all files that it writes; they must exist for the stage to count as complete.
-            job: runs the stage; called with whether an interrupted attempt with the same key can be continued.
+            job: runs the stage; called with whether it can continue from what an earlier run left: one with the same
+                key that was interrupted, or any with the same inputs.
             read: converts the job's result, and checks the files; the stage is repeated if those of an earlier run are
                 damaged.
+            inputs: what each part of the result depends on, where that is less than the key (any JSON): a repeated
+                stage continues from an earlier run's parts unless the repetition was requested or they are damaged.
 
         Returns:
             The result, of this run or of an earlier one.
@@ -93,8 +98,11 @@ class Stages:
         self._key = _digest([self._key, name, options])
         record = self._records.get(name, {})
         # A repetition that was interrupted goes on.
-        self._is_redoing = self._is_redoing or (name == self._redo and not record.get("redone"))
+        self._is_forced = self._is_forced or (name == self._redo and not record.get("redone"))
+        self._is_redoing = self._is_redoing or self._is_forced
         is_same = record.get("key") == self._key and not self._is_redoing
+        of = None if inputs is None else _digest(inputs)
+        continues = is_same or (of is not None and record.get("inputs") == of and not self._is_forced)
         with writing_to(self._scene):
             is_complete = is_same and record["done"] and all(path.exists() for path in outputs)
         if is_complete:
@@ -102,7 +110,7 @@ class Stages:
                 result = read(record["facts"])
             except _DAMAGE as error:
                 log.warning(f"{self._folder}: what the stage {name} wrote is damaged ({error}): it is done again")
-                is_same = False
+                is_same = continues = False
             else:
                 self.seconds[name] = record["seconds"]
                 log.info(f"{name}: complete already")
@@ -112,6 +120,8 @@ class Stages:
         stale = set(record.get("files", ())) - set(files)
         earlier = record["seconds"] if is_same else 0.0
         record = {"key": self._key, "done": False, "seconds": earlier, "files": [*files, *sorted(stale)]}
+        if of is not None:
+            record["inputs"] = of
         if name == self._redo:
             record["redone"] = True
         self._records[name] = record
@@ -125,7 +135,7 @@ class Stages:
             with writing_to(self._scene):
                 for file in stale:
                     self._remove(file)
-                facts = job(is_same)
+                facts = job(continues)
             record |= {"done": True, "facts": facts, "files": files}
             log.info(f"{name}: done in {time.monotonic() - start:.1f} s")
         finally:

@@ -27,7 +27,7 @@ BATCH = 256
 def match(
     database: Path, pairs: Sequence[tuple[str, str]], device: pycolmap.Device, progress: Progress
 ) -> tuple[int, int]:
-    """Match and verify pairs of photographs by name; pairs that the database contains already are kept.
+    """Match and verify pairs of photographs by name; what the database contains of them is kept, other pairs are not.
 
     Returns:
         The number of pairs with a verified two-view geometry, and the total number of their inlier matches.
@@ -42,6 +42,7 @@ def match(
         with pycolmap.Database.open(database) as db:
             ids = {image.name: image.image_id for image in db.read_all_images()}
             numbers = [(ids[encode_name(first)], ids[encode_name(second)]) for first, second in pairs]
+            _delete_others(db, numbers)
             todo = [pair for pair in numbers if not db.exists_two_view_geometry(*pair)]
             done = len(pairs) - len(todo)
             for count in _match_in_processes(db, todo, folder, device):
@@ -51,6 +52,17 @@ def match(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return sum(n > 0 for n in inliers), sum(inliers)
+
+
+def _delete_others(db: pycolmap.Database, pairs: Sequence[Pair]) -> None:
+    """Delete what a database contains of other pairs than these."""
+    wanted = {frozenset(pair) for pair in pairs}
+    with pycolmap.DatabaseTransaction(db):
+        for pair_id in {*db.read_num_matches()[0], *db.read_two_view_geometry_num_inliers()[0]}:
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            if frozenset(pair) not in wanted:
+                db.delete_matches(*pair)
+                db.delete_two_view_geometry(*pair)
 
 
 def _match_in_processes(
