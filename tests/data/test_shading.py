@@ -85,6 +85,17 @@ def test_the_light_is_found_and_foretold_for_held_out_photographs(caplog: pytest
     assert "applied" in caplog.text
 
 
+def test_lenses_that_were_calibrated_for_each_photograph_are_one():
+    value, cameras, points = observed(planted())
+    seen = seen_in(TRAIN, value, points)
+    one, each = (
+        estimate_shading(seen, cameras, points, lenses, TRAIN) for lenses in (LENSES, [f"{i}" for i in range(COUNT)])
+    )
+    assert one is not None
+    assert each is not None
+    assert torch.equal(one, each)
+
+
 def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings(caplog: pytest.LogCaptureFixture):
     caplog.set_level(logging.DEBUG, "tidefield")
     value, cameras, points = observed(None, turned=(1,))

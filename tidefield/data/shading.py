@@ -20,6 +20,7 @@ direction, T unknowns that one observation depends on, of N unknowns, F folds.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,6 +53,8 @@ SHARED_RIDGE = 0.003
 """Cost of the shared polynomials, relative to that of the errors."""
 FEWEST_PHOTOGRAPHS = 12
 """Training photographs with observations for shading to be estimated."""
+FEWEST_OF_A_LENS = 8
+"""Of them, for a lens to have a polynomial of its own."""
 FOLDS = 4
 LEAST_GAIN = 0.01
 """By which the cost of left-out photographs has to fall in every fold."""
@@ -83,7 +86,8 @@ def estimate_shading(
         seen: observations of the points in the training photographs (`exposure.observe`).
         cameras: with the photographs' gains, and the shading that is known already, to which this comes.
         points: that are observed.
-        lenses: of each photograph; equal ones are one physical camera.
+        lenses: of each photograph; equal ones are one physical camera. Those of few photographs are taken for one
+            that was calibrated for each photograph.
         train: the training photographs.
         metadata: for the order in which the photographs were taken.
     """
@@ -206,8 +210,7 @@ class _Model:
         frame = monomials(xy.double(), SHADING_DEGREE).numpy()
         to_monomials = np.linalg.inv(np.linalg.qr(frame, mode="r")) * np.sqrt(len(frame))
         frame = frame @ to_monomials
-        names = {lens: k for k, lens in enumerate(dict.fromkeys(lenses))}
-        lens = np.array([names[own] for own in lenses])
+        lens = _numbers(lenses, cameras, np.unique(photograph))
         squares = _squares(seen.direction)
         deviation = np.maximum(squares.std(0), 1e-9)
         own, shared, of_direction = frame[:, :OWN_TERMS], frame[:, 1:], (squares - squares.mean(0)) / deviation
@@ -352,6 +355,22 @@ class _Equations:
             right=self.right[rest],
             eliminated=None if self.eliminated is None else self.eliminated[rest, rest],
         )
+
+
+def _numbers(
+    lenses: Sequence[Hashable], cameras: Cameras, supported: Int64[np.ndarray, " S"]
+) -> Int64[np.ndarray, " V"]:
+    """Number the lenses of all photographs; those of few photographs with observations are one for each frame size.
+
+    COLMAP gives each photograph a lens of its own unless it is asked for one; nothing would be known of a held-out
+    photograph's.
+    """
+    shared, sizes = Counter(lenses[i] for i in supported), cameras.size_px.tolist()
+    names = [
+        lens if shared[lens] >= FEWEST_OF_A_LENS else tuple(size) for lens, size in zip(lenses, sizes, strict=True)
+    ]
+    numbers = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    return np.array([numbers[name] for name in names])
 
 
 def _chain(cameras: Cameras, sequence: Pairs) -> sparse.sparray:
