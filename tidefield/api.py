@@ -15,7 +15,7 @@ from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.checkpoint import given_or_shipped, read_run
+from tidefield.train.checkpoint import given_or_shipped, read_run, require_scene
 
 
 def zero_shot(scene: Scene, preset: str = "swift", weights: str | Path | None = None, device: str = "auto") -> Render:
@@ -54,6 +54,7 @@ class OpenRun:
         run = read_run(folder)
         self.folder, self.config = folder, run.config
         pull(run.scene)
+        require_scene(folder, run)
         self.scene: Scene = load_scene(run.scene, width=run.width)
         self._stack = ExitStack()
         trained = methods.trained(folder, run, self.scene, choose_device(device))

@@ -188,8 +188,10 @@ def only_writer(folder: Path, wait_seconds: float = 0.0) -> Iterator[None]:
         wait_seconds: for another process to end.
 
     Raises:
-        RunError: another process has the lock, or the folder cannot be written to.
+        RunError: it is a file, another process has the lock, or the folder cannot be written to.
     """
+    if os.path.isfile(folder):
+        raise RunError(f"{folder} is a file: expected a folder or a new name; choose another")
     made = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
     path, end = folder / LOCK_FILE, time.monotonic() + wait_seconds
     try:

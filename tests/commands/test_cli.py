@@ -181,6 +181,7 @@ def test_users_mistakes_are_one_clear_message(
     assert "cuda:7" in fails(capsys, "train", scene, tmp_path / "new", "--device", "cuda:7")
     assert "both" in fails(capsys, "train", scene, tmp_path / "new", "--steps", 1, "--minutes", 1)
     assert "holds no run" in fails(capsys, "evaluate", tmp_path)
+    assert "nowhere is missing" in fails(capsys, "evaluate", tmp_path / "nowhere")
     assert "nowhere to write" in fails(capsys, "evaluate", scene, "--method", "sparse-depth")
     assert "--opened-width belongs to --zero-shot" in fails(capsys, "evaluate", run, "--opened-width", 400)
     weights = "--weights", tmp_path / "w.safetensors"
@@ -304,6 +305,25 @@ def test_mistakes_are_refused_before_anything_is_made_or_read(
     assert "path.json" in fails(capsys, *video, "--path", tmp_path / "path.json")
     assert "0 frames" in fails(capsys, *video, "--frames", 0)
     assert "--width 8" in fails(capsys, *video, "--width", 8)
+    (tmp_path / "notes.txt").write_text("no weights")
+    weights = "--weights", tmp_path / "notes.txt"
+    assert "notes.txt is damaged" in fails(capsys, *video, *weights)
+    assert "notes.txt is damaged" in fails(capsys, "evaluate", scene, tmp_path / "out", "--zero-shot", *weights)
+    monkeypatch.setattr("tidefield.commands.train.load", lambda *_: pytest.fail("photographs were read"))
+    assert "notes.txt is damaged" in fails(capsys, "train", scene, tmp_path / "run", *weights)
+    assert "notes.txt is a file" in fails(capsys, "train", scene, tmp_path / "notes.txt")
+
+
+def test_an_evaluation_that_would_be_replaced_is_refused_before_its_run_is_opened(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tidefield.commands.evaluate.open_trained", lambda *_: pytest.fail("a run was opened"))
+    (tmp_path / "evaluation.json").write_text("{}")
+    assert "evaluation.json is there already" in fails(capsys, "evaluate", run, tmp_path)
+
+
+def test_a_run_is_no_scene(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "is a run, not a scene" in fails(capsys, "train", run, tmp_path / "new")
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

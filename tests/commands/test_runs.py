@@ -368,6 +368,25 @@ def test_a_run_whose_scene_was_made_anew_does_not_go_on(
     assert [text for text in caplog.messages if "other photographs or poses than when" in text]
 
 
+def test_a_run_whose_scene_was_moved_goes_on_there(scene: Path, tmp_path: Path) -> None:
+    old, new, run = tmp_path / "scene", tmp_path / "moved", tmp_path / "run"
+    shutil.copytree(scene, old)
+    train(Train(old, run, budget=Budget(steps=1), device="cpu"), QUIET)
+    old.rename(new)
+    with pytest.raises(RunError, match=r"which is missing: .*`tidefield train SCENE"):
+        evaluate(Evaluate(run, device="cpu"), QUIET)
+    with pytest.raises(SceneError, match="is missing"):
+        train(Train(tmp_path / "nothing", run, resume=True, device="cpu"), QUIET)
+    train(Train(new, run, budget=Budget(steps=2), resume=True, device="cpu"), QUIET)
+    assert read_run(run).scene == Path(os.path.realpath(new))
+    assert evaluate(Evaluate(run, device="cpu"), QUIET).path.exists()
+
+
+def test_few_steps_in_minutes_are_remarked(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    train(Train(scene, tmp_path / "run", budget=Budget(minutes=0.001), device="cpu"), QUIET)
+    assert "steps change little" in caplog.text
+
+
 def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
     tmp_path: Path, scene: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

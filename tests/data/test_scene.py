@@ -40,6 +40,17 @@ def test_an_unknown_name_is_an_error_with_some_names():
         wall.cameras(4)["a.jpg"]
 
 
+def test_a_name_in_another_case_is_found_and_one_that_is_misspelt_is_answered_by_the_nearest():
+    names = ("DJI_0001.jpg", "dji_0001.JPG", "DJI_0017.jpg", "DJI_0025.jpg")
+    scene = replace(named(), names=names)
+    assert scene.index("DJI_0025.JPG") == 3
+    assert scene.index("DJI_0001.jpg") == 0
+    with pytest.raises(SceneError, match="names 2 photographs"):
+        scene.index("Dji_0001")
+    with pytest.raises(SceneError, match=r"names look like DJI_0025\.jpg"):
+        scene.index("DJI_025.jpg")
+
+
 def test_a_name_of_several_photographs_is_an_error_unless_it_is_the_whole_name_of_one():
     names = ("100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0002.JPG", "DJI_0002.JPG")
     scene = replace(named(), names=names)

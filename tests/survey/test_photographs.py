@@ -128,7 +128,7 @@ def test_files_that_cannot_be_read_are_left_out_and_named(tmp_path):
 
 def test_too_few_files_that_can_be_read_is_an_error_that_names_the_others(tmp_path):
     spoil(survey_folder(tmp_path, count=1))
-    with pytest.raises(SurveyError, match=r"has 1 photographs that can be read(.|\n)*empty.jpg"):
+    with pytest.raises(SurveyError, match=r"has 1 photograph that can be read(.|\n)*empty.jpg"):
         read_survey(tmp_path)
 
 

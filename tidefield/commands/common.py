@@ -102,6 +102,12 @@ class ZeroShot:
             )
         return self
 
+    def require_weights(self) -> None:
+        """Raises: RunError, before photographs are read, which may take minutes, when there are no such weights."""
+        from tidefield.train.checkpoint import given_or_shipped, read_weights_file
+
+        read_weights_file(given_or_shipped(self.weights, self.network))
+
 
 @dataclass(frozen=True)
 class Footprint:
@@ -159,6 +165,7 @@ def open_source(
         RunError: a network or weights are given, but not for a scene without training.
     """
     if zero.checked().zero_shot:
+        zero.require_weights()
         scene = load(source, None, allow_missing, console, hold_out)
         yield scene, *open_zero_shot(zero, scene, device, sampling)
     else:
@@ -182,7 +189,7 @@ def open_trained(
     from tidefield.addresses import pull
     from tidefield.data.load import is_scene
     from tidefield.methods import trained
-    from tidefield.train.checkpoint import RUN_FILE, read_run
+    from tidefield.train.checkpoint import RUN_FILE, read_run, require_scene
 
     if not (folder / RUN_FILE).exists() and is_scene(folder):
         raise RunError(
@@ -191,6 +198,7 @@ def open_trained(
         )
     run = read_run(folder)
     pull(run.scene)
+    require_scene(folder, run)
     scene = load(run.scene, run.width, allow_missing, console, hold_out)
     with trained(folder, run, scene, device, sampling) as (render, progress):
         record = {"seed": run.seed, "weights": run.weights, "run": run.id, "trained_width": scene.cameras.width}

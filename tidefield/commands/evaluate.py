@@ -21,6 +21,8 @@ from tidefield.commands.common import (
     open_zero_shot,
 )
 from tidefield.errors import RunError, list_names
+from tidefield.evaluation import EVALUATION_FILE
+from tidefield.files import require_writable
 from tidefield.methods import UNTRAINED_DEVICE, untrained
 
 if TYPE_CHECKING:
@@ -78,6 +80,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
                 f"--width is given without OUT: expected `tidefield evaluate {source} OUT --width {options.width}`, "
                 "as the run itself keeps the evaluation at its own width; name a folder"
             )
+        require_writable((out or source) / EVALUATION_FILE, overwrite=options.overwrite)
         opened = open_trained(source, choose_device(options.device), options.allow_missing, console, sampling)
         with opened as (scene, render, record):
             _refuse_learned(source, scene.held_out)
@@ -90,6 +93,9 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
         )
     if out is None:
         raise RunError(f"nowhere to write: expected `tidefield evaluate {source} OUT ...`; name a folder")
+    require_writable(out / EVALUATION_FILE, overwrite=options.overwrite)
+    if zero_shot:
+        options.zero.require_weights()
     scene = load(source, options.opened_width or options.width, options.allow_missing, console)
     if method is not None:
         side = sampling.rays_per_side or 1

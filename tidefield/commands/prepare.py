@@ -107,7 +107,11 @@ def prepare(options: Prepare, console: Console) -> None:
         found = [f"{n} {what}{'s'[: n > 1]}" for n, what in ((points, "point"), (marks, "single mark")) if n]
         log.warning(f"ground control: {' and '.join(found)} left out; why, is in {page}")
     missing = len(survey.photographs) - len(prepared.models[0])
-    reasons = f"; why {missing} are missing, and more, is in {page}" if missing else f"; see {page}"
+    reasons = (
+        f"; why {missing} {'is' if missing == 1 else 'are'} missing, and more, is in {page}"
+        if missing
+        else f"; see {page}"
+    )
     console.print(
         f"{options.scene}: {len(prepared.models[0])} of {len(survey.photographs)} photographs{reasons}",
         highlight=False,

@@ -96,8 +96,6 @@ def train(options: Train, console: Console, again: str | None = None) -> None:
     folder = options.run
     if options.resume and options.overwrite:
         raise RunError("--resume continues the run that --overwrite replaces: expected one of them; leave one out")
-    if os.path.isfile(folder):
-        raise RunError(f"{folder} is a file: expected a new folder for the run; choose another name")
     with only_writer(folder):
         delete_partials(*(folder / name for name in (RUN_FILE, CHECKPOINT_FILE, CURVE_FILE)))
         _train(options, console, again or os.environ.get(AGAIN_VARIABLE, AGAIN))
@@ -119,10 +117,13 @@ def _train(options: Train, console: Console, again: str) -> None:
     device = choose_device(options.device)
     if options.resume:
         run = read_run(folder)  # its other options were settled when it was started
-        if run.scene != Path(os.path.realpath(options.scene)):
-            raise RunError(
-                f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
-            )
+        scene_folder = Path(os.path.realpath(options.scene))
+        if run.scene != scene_folder:
+            if run.poses is None or run.scene.exists():
+                raise RunError(
+                    f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
+                )
+            run = replace(run, scene=scene_folder)  # it was moved, if its poses are the same
         if isinstance(run.config, ExternalConfig):
             raise RunError(f"{run.config.method} cannot continue where it stopped: train it again, with --overwrite")
         _require_its_options(options, run)
@@ -186,6 +187,10 @@ def _train(options: Train, console: Console, again: str) -> None:
             if used >= 1:
                 console.print(USED_BEFORE, highlight=False)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
+        if budget.minutes is not None and stopped is None and progress.step < run.config.train.warm_up:
+            log.warning(
+                f"{progress.step} steps change little: expected hundreds; give more --minutes, or a smaller --width"
+            )
     report_end(progress, stopped, folder, console, budget, again)
 
 
@@ -294,7 +299,7 @@ def _resumed_weights(options: Train, run: Run) -> Path | None:
 
 def _new_run(options: Train) -> tuple[Run, Path | None]:
     """A new run, and the weights it starts from: the named ones, else the installed ones of its network."""
-    from tidefield.train.checkpoint import Run, shipped_weights, weights_sha256
+    from tidefield.train.checkpoint import Run, read_weights_file, shipped_weights, weights_sha256
 
     _require_free(options.run, options.overwrite)
     weights, config = options.weights, _configuration(options)
@@ -306,6 +311,8 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
         )
     if weights is None and not options.from_scratch and isinstance(config, Config):
         weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
+    if weights is not None:
+        read_weights_file(weights)  # before photographs are read, which may take minutes
     digest = None if weights is None else weights_sha256(weights)
     root = Path(os.path.realpath(options.scene))
     if isinstance(config, Config) and config.train.crop_px is None:

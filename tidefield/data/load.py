@@ -408,6 +408,8 @@ def _read(root: Path, allow_missing: bool) -> PosedPhotographs:
         if (found := layout.find(root)) is not None:
             return layout.read(root, found, allow_missing)
     paths = sorted(root.iterdir())
+    if (root / "run.json").is_file():
+        raise SceneError(f"{root} is a run, not a scene: expected the scene that it was trained on; name that")
     if any(path.suffix.lower() in SUFFIXES for path in paths):
         raise SceneError(
             f"{root} has photographs without poses: expected a scene; make one with `tidefield prepare {root} SCENE`, "

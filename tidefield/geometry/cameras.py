@@ -10,6 +10,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from pathlib import PurePath
 from typing import SupportsIndex
 
@@ -275,13 +276,20 @@ _TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", *_OF
 def find_name(name: str, names: Sequence[str], where: str) -> int:
     """Find a photograph by its path in the scene, its file name, or either without the suffix.
 
+    If none fits, upper and lower case count as the same.
+
     Raises:
         SceneError: none of the names matches, or several match in part and none as a whole.
     """
     if name in names:
         return names.index(name)
-    paths = map(PurePath, names)
-    found = [i for i, p in enumerate(paths) if name in (p.name, p.stem, p.with_suffix("").as_posix())]
+    paths = [
+        (whole, p.name, p.stem, p.with_suffix("").as_posix())
+        for whole, p in zip(names, map(PurePath, names), strict=True)
+    ]
+    found = [i for i, forms in enumerate(paths) if name in forms]
+    if not found:
+        found = [i for i, forms in enumerate(paths) if name.casefold() in map(str.casefold, forms)]
     if len(found) > 1:
         matching = list_names([names[i] for i in found])
         raise SceneError(
@@ -289,8 +297,9 @@ def find_name(name: str, names: Sequence[str], where: str) -> int:
         )
     if found:
         return found[0]
+    near = get_close_matches(name, names, n=3) or names[:3]
     looks = (
-        f"names look like {', '.join(names[:3])}; choose one of these" if names else "they have no names; use indices"
+        f"names look like {', '.join(near)}; choose one that is there" if names else "they have no names; use indices"
     )
     raise SceneError(f"no photograph named {name!r} in {where}: {looks}")
 

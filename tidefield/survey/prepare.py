@@ -417,8 +417,6 @@ def _refuse_foreign(scene: Path, survey: Survey) -> None:
     photographs = survey.folder.resolve()
     if scene.resolve() == photographs or scene.resolve() in photographs.parents:
         raise RunError(f"{scene} holds the photographs: expected another folder for the scene; name a new one")
-    if scene.exists() and not scene.is_dir():
-        raise RunError(f"{scene} is a file: expected a folder or a new name; choose another")
     if scene.is_dir() and not (scene / "prepare" / "stages.json").exists() and not is_empty(scene):
         raise RunError(
             f"{scene} holds something else: expected a new name, or a scene that `tidefield prepare` started; choose "

@@ -114,15 +114,23 @@ def read_run(folder: Path) -> Run:
     path = folder / RUN_FILE
     data = read_json(path)
     if data is None:
-        raise RunError(
-            f"{folder} holds no run (no {RUN_FILE}): expected a folder that `tidefield train` wrote; train one"
-        )
+        what = "is missing" if not folder.exists() else f"holds no run (no {RUN_FILE})"
+        raise RunError(f"{folder} {what}: expected a folder that `tidefield train` wrote; train one")
     keys = {*_RUN, "config"}
     if not isinstance(data, dict) or not keys - {"variant", "id", "budget", "poses", "held_out"} <= set(data) <= keys:
         raise RunError(f"{path} is damaged: expected the keys {sorted(keys)}, as `tidefield train` wrote; restore it")
     values = {name: from_json(kind, data.get(name), f"{path}: {name}") for name, kind in _RUN.items()}
     config = config_from_json(data["config"], f"{path}: config")
     return Run(**{**values, "scene": path_of(values["scene"])}, config=config)
+
+
+def require_scene(folder: Path, run: Run) -> None:
+    """Raises: RunError when the scene of the run in a folder is not where it was."""
+    if not run.scene.exists():
+        raise RunError(
+            f"{folder} was trained on {run.scene}, which is missing: expected its scene, from whose photographs it "
+            f"renders; put it back, or name its new place with `tidefield train SCENE {folder} --resume`"
+        )
 
 
 def is_of(run: Run, scene: Scene) -> bool:

@@ -105,8 +105,8 @@ def read_survey(
     unread = [f"Left out: {problem}" for problem in read if isinstance(problem, str)]
     if len(known) < FEWEST:
         raise SurveyError(
-            f"{folder} has {len(known)} photographs that can be read: expected at least {FEWEST} that overlap by "
-            "more than half; add more" + "".join(f"\n{problem}" for problem in unread)
+            f"{folder} has {len(known)} photograph{'s'[: len(known) != 1]} that can be read: expected at least "
+            f"{FEWEST} that overlap by more than half; add more" + "".join(f"\n{problem}" for problem in unread)
         )
     remarks += unread
     for block in ("EXIF", "XMP"):
