@@ -234,8 +234,9 @@ def test_a_damaged_database_makes_the_same_scene_again(made: tuple[Path, Prepare
 
 
 def test_the_split_of_an_earlier_run_is_not_read_while_photographs_are_written_again(
-    made: tuple[Path, Prepared], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    made: tuple[Path, Prepared], tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     scene, survey = shutil.copytree(made[0], tmp_path / "scene"), made[1].survey
     written = (scene / "transforms.json").read_text(encoding="utf-8")
     earlier = json.loads(written) | {"train_filenames": ["images/gone.jpg"]}
@@ -243,6 +244,7 @@ def test_the_split_of_an_earlier_run_is_not_read_while_photographs_are_written_a
     prepare(survey, scene, OPTIONS, pycolmap.Device.cpu, Console(quiet=True), redo="images")
     assert "split" not in caplog.text
     assert (scene / "transforms.json").read_text(encoding="utf-8") == written
+    assert not (tmp_path / "cache").exists(), "what is not corrected yet is of no use to the user"
 
 
 @pytest.mark.thorough

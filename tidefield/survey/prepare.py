@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -397,9 +398,20 @@ def write_scene(
         write_masks(photographs, scene / "masks")
     correction = None
     if colour != "off":
-        with ProgressBar(console, "Measuring exposures") as bar:
-            loaded = load_scene(scene, width=COLOUR_WIDTH, hold_out=bool(held_out), progress=bar, unfinished=True)
-        correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
+        # A cache of its own: photographs that are to be corrected would only fill the user's.
+        with TemporaryDirectory(dir=scene / "prepare", ignore_cleanup_errors=True) as cache:
+            with ProgressBar(console, "Measuring exposures") as bar:
+                loaded = load_scene(
+                    scene,
+                    width=COLOUR_WIDTH,
+                    hold_out=bool(held_out),
+                    calibrate=False,
+                    progress=bar,
+                    cache=Path(cache),
+                    unfinished=True,
+                )
+            correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
+            del loaded
         if correction.helps:
             with ProgressBar(console, "Correcting exposures") as bar:
                 write_images(photographs, images, correction, cameras, bar)
