@@ -1,5 +1,6 @@
 """Gaussians of a wall: where they are, how they look to another program's reader, and what is refused."""
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from tidefield.commands.export import Export, export
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Rendering
-from tidefield.render.gaussians import FLATNESS, OPACITY, make_gaussians, write_gaussians
+from tidefield.render.gaussians import FLATNESS, OPACITY, PIXEL_BYTES, make_gaussians, write_gaussians
 
 TILT = (0.2, -0.1)
 
@@ -81,7 +82,43 @@ def test_views_of_nothing_and_other_names_are_one_clear_error(tmp_path: Path):
 
 
 def test_views_that_do_not_fit_into_memory_are_refused_before_any_is_rendered(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("tidefield.render.gaussians.memory_bytes", lambda: 2_000_000)
+    monkeypatch.setattr("tidefield.render.gaussians.memory_bytes", lambda: 2_500_000)
     with pytest.raises(RunError, match="choose a smaller --width"):
         make_gaussians(lambda camera: pytest.fail("a view was rendered"), textured_wall.cameras(4, 96, 72), 96)
     assert len(make_gaussians(render_wall, textured_wall.cameras(4, 96, 72), 48).mean_world)
+
+
+def test_no_more_memory_is_used_than_was_checked_for(tmp_path: Path):
+    cameras = textured_wall.cameras(8, 160, 120, step=3.0)  # far apart, so that few points share cells
+    tracemalloc.start()
+    found = make_gaussians(render_wall, cameras, 160)
+    peaks = [tracemalloc.get_traced_memory()[1]]
+    tracemalloc.reset_peak()
+    write_gaussians(found, tmp_path / "wall.ply", (0.0, 0.0, 0.0))
+    peaks.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+    assert max(peaks) < PIXEL_BYTES * 8 * 160 * 120
+
+
+def test_where_there_would_be_too_many_gaussians_cells_are_larger(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    cameras = textured_wall.cameras(2, 48, 36)
+    fine = make_gaussians(render_wall, cameras, 48)
+    assert caplog.messages == []
+    monkeypatch.setattr("tidefield.render.gaussians.MOST", len(fine.mean_world) // 2)
+    coarse = make_gaussians(render_wall, cameras, 48)
+    assert len(fine.mean_world) / 4 < len(coarse.mean_world) <= len(fine.mean_world) / 2
+    assert coarse.sigma / fine.sigma == pytest.approx(1.25**2, rel=0.3)
+    assert f"more than {len(fine.mean_world) // 2:,} Gaussians: cells are" in caplog.text
+
+
+def test_a_point_far_away_does_not_join_cells():
+    def with_outliers(camera: Cameras) -> Rendering:
+        whole = render_wall(camera)
+        whole.depth[0, :2] = torch.tensor([1e14, 3e14])
+        return whole
+
+    camera = textured_wall.cameras(1, 48, 36)
+    plain, far = (make_gaussians(method, camera, 48) for method in (render_wall, with_outliers))
+    assert len(far.mean_world) > 0.9 * len(plain.mean_world)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from captures import SCENES, TILT, survey
+from captures import SCENES, TILT, UP, survey
 from rich.console import Console
 
 from tidefield.commands.render import Render, render
@@ -23,6 +23,7 @@ from tidefield.render.camera_paths import (
     make_trajectory,
     orbit,
     path_cameras,
+    require_path,
     strip,
 )
 
@@ -97,6 +98,25 @@ def test_the_far_of_oblique_frames_includes_what_they_see():
     aside, down = path_of("orbit", scene, 24), path_of("strip", scene, 24)
     assert aside.near_far[:, 1].mean() > 1.1 * down.near_far[:, 1].mean()
     assert down.near_far[:, 0].max() < 40 < down.near_far[:, 1].min()
+
+
+@pytest.mark.parametrize("heights", [np.tile([8.0, 40.0], 5), 4 + 36 * np.abs(np.linspace(-1, 1, 48))])
+def test_the_range_of_each_frame_contains_its_own(heights: np.ndarray):
+    scene = survey()
+    layout = layout_of(scene)
+    assert scene.points is not None
+    ground = scene.points.xyz_world.repeat(400, 1)
+    ground = ground + 4 * torch.randn(ground.shape, generator=torch.Generator().manual_seed(0))
+    ground = ground - (ground @ UP)[:, None] * UP
+    scene = replace(scene, points=replace(scene.points, xyz_world=ground, error_px=torch.ones(len(ground))))
+    position, rotation = strip(layout, len(heights), 0.3)
+    position = position - ((position @ layout.up)[:, None] - heights[:, None]) * layout.up
+    together = path_cameras(scene, position, rotation, 64, 48).near_far
+    alone = [path_cameras(scene, p[None], r[None], 64, 48).near_far for p, r in zip(position, rotation, strict=True)]
+    seen = torch.cat(alone)
+    assert (together[:, 0] <= seen[:, 0]).all()
+    assert (together[:, 1] >= seen[:, 1]).all()
+    assert (together[:, 0] < torch.as_tensor(heights)).all(), "the ground is before near"
 
 
 def test_an_unknown_path_is_one_clear_error():
@@ -265,6 +285,17 @@ def test_a_malformed_path_is_one_clear_error(tmp_path: Path, poses: np.ndarray, 
     spoil(content)
     with pytest.raises(TidefieldError, match=message):
         load(tmp_path, content)
+
+
+def test_a_path_of_another_camera_is_refused_before_a_scene_is_read(tmp_path: Path, poses: np.ndarray):
+    file = tmp_path / "path.json"
+    for changes, message in (
+        ({"camera_type": "equirectangular"}, "expected perspective"),
+        ({"camera_path": []}, "list"),
+    ):
+        file.write_text(json.dumps(exported(poses, **changes)))
+        with pytest.raises(TidefieldError, match=message):
+            require_path(str(file), 1)
 
 
 def test_invalid_json_and_missing_files_are_one_clear_error(tmp_path: Path):

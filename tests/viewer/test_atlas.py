@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,13 +14,14 @@ from PIL import Image
 pytest.importorskip("rasterio", reason="needs rasterio, which is not installed")
 
 from map_folders import CELL, SHAPE, corner, write_change, write_map
-from surveys_of_two_dates import noise, write_surface
+from surveys_of_two_dates import NORTH, WEST, noise, write_surface
 
 from tidefield.change.measure import measure
 from tidefield.change.surfaces import open_surface
 from tidefield.change.write import write_all
 from tidefield.errors import RunError, TidefieldError
 from tidefield.maps.grid import LOCAL_WKT
+from tidefield.viewer import atlas as atlas_module
 from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
 
 
@@ -178,6 +180,38 @@ def test_heights_of_any_unit_are_shown_in_metres_and_what_is_no_height_not_at_al
     assert volumes["above"]["value_m3"] < 1e-2 * volumes["cells_m2"]
 
 
+def test_two_dates_have_one_scale_of_colours(tmp_path: Path):
+    rows, columns = np.indices(SHAPE)
+    heights = 5 + 0.01 * columns + 0.02 * rows
+    maps = [write_map(tmp_path / f"map 202{k}-01-01", (1, 2, 3), heights - k) for k in range(2)]
+    write_surface(maps[1] / "odm_dem" / "dsm_sigma.tif", np.full(SHAPE, 0.05, np.float32), CELL, nodata=-9999.0)
+    sheets = Atlas([*maps, write_change(tmp_path / "change", np.full(SHAPE, -1, np.float32))]).describe()["sheets"]
+    for kind, low, high in (("height", 4.3, 7.3), ("error", 0.02, 0.051)):
+        layers = [layer for sheet in sheets for layer in sheet["layers"] if layer["kind"] == kind]
+        assert len(layers) >= 2
+        assert len({(layer["low"], layer["high"]) for layer in layers}) == 1
+        assert (layers[0]["low"], layers[0]["high"]) == pytest.approx((low, high), abs=0.1)
+
+
+@pytest.mark.parametrize("sentinel", [False, True])
+@pytest.mark.parametrize("nodata", [None, math.nan])
+def test_cells_that_are_nan_do_not_hide_their_neighbours_when_zoomed_out(
+    tmp_path: Path, nodata: float | None, sentinel: bool
+):
+    heights = np.random.default_rng(0).normal(5, 0.1, (1024, 1024)).astype(np.float32)
+    heights[::4, ::4] = np.nan  # some in all that a pixel of level 0 shows
+    if sentinel:
+        heights[:, :64] = -9999
+    write_surface(tmp_path / "dsm.tif", heights, CELL, nodata=nodata)
+    write_surface(tmp_path / "dsm_sigma.tif", heights / 100, CELL, nodata=nodata)
+    for layer, low, high in (("height", 4, 6), ("error", 0.04, 0.06)):
+        content = Atlas([tmp_path]).tile(0, layer, 0, 0, 0)
+        assert content is not None
+        shown = decoded(content)[:, 20:]
+        assert (low < shown).all()
+        assert (shown < high).all()
+
+
 def test_a_tile_of_nothing_and_one_that_is_not_there_are_none(tmp_path: Path):
     heights = np.ones(SHAPE, np.float32)
     heights[40:, 40:] = -9999
@@ -196,6 +230,53 @@ def test_values_at_a_place_are_those_of_the_cell_it_lies_in(tmp_path: Path):
         assert found["height"] == pytest.approx(5 + 0.01 * int(column) + 0.02 * int(row), abs=1e-5)
         assert found["sigma"] == pytest.approx(0.02)
     assert atlas.at(*corner(-0.5, 3)) == [{"height": None, "sigma": None}]
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_errors_on_another_grid_than_the_heights_are_those_of_the_place(tmp_path: Path, scale: float):
+    heights = np.full(SHAPE, 5, np.float32)
+    heights[24:36, 24:36] = 6
+    write_surface(tmp_path / "dsm.tif", heights, CELL)
+    rows, columns = (round(2 * side / scale) for side in SHAPE)
+    sigma = np.full((rows, columns), 0.02, np.float32)
+    sigma[: rows // 2, : columns // 2] = 5  # the quarter in the north-west, where the map is not
+    west, north = corner(-SHAPE[1], -SHAPE[0])
+    write_surface(tmp_path / "dsm_sigma.tif", sigma, scale * CELL, west, north)
+    atlas = Atlas([tmp_path])
+    above = atlas.area(box(20, 20, 40, 40))["sheets"][0]["above"]
+    assert atlas.at(*corner(30, 30))[0]["sigma"] == pytest.approx(0.02)
+    assert above["value_m3"] == pytest.approx(144 * CELL**2)
+    # Level ground counts, too, where rounding puts it above the plane.
+    assert 0.999 * 1.96 * 0.02 * 144 < (above["high_m3"] - above["value_m3"]) / CELL**2 < 1.001 * 1.96 * 0.02 * 400
+
+
+def test_errors_that_are_nowhere_in_a_polygon_make_no_interval(tmp_path: Path):
+    write_surface(tmp_path / "dsm.tif", 5 + np.eye(*SHAPE, dtype=np.float32), CELL)
+    write_surface(tmp_path / "dsm_sigma.tif", np.full((10, 10), 0.02, np.float32), CELL)
+    above = Atlas([tmp_path]).area(box(20, 20, 40, 40))["sheets"][0]["above"]
+    assert set(above) == {"value_m3"}
+
+
+@pytest.mark.parametrize("kind", ["map", "change"])
+def test_a_large_polygon_takes_little_memory(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch):
+    side = 1600
+    values = np.random.default_rng(0).normal(5, 0.1, (side, side)).astype(np.float32)
+    if kind == "map":
+        write_surface(tmp_path / "dsm.tif", values, CELL)
+        write_surface(tmp_path / "dsm_sigma.tif", values / 100, CELL)
+    else:
+        write_change(tmp_path, values, shared=np.full_like(values, 0.01))
+    atlas = Atlas([tmp_path])
+    corners = box(0, 0, side, side)
+    tracemalloc.start()
+    (found,) = atlas.area(corners)["sheets"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found["cells_m2"] == side**2 * CELL**2
+    assert peak < 30 * side**2
+    monkeypatch.setattr(atlas_module, "MOST_CELLS", side**2 - 1)
+    with pytest.raises(RunError, match=r"covers 1600 x 1600 cells: expected 2,559,999 or fewer; draw a smaller"):
+        atlas.area(corners)
 
 
 def test_a_section_has_heights_and_distances_along_its_line(tmp_path: Path):
@@ -348,6 +429,48 @@ def test_two_local_frames_are_refused(tmp_path: Path, one: str):
         write_surface(tmp_path / name / "dsm.tif", np.ones((8, 8), np.float32), CELL, crs=crs)
     with pytest.raises(RunError, match=r"a and .*b lie in different local frames: expected maps in one"):
         Atlas([tmp_path / "a", tmp_path / "b"])
+
+
+def test_a_map_is_of_the_date_that_its_file_states_where_its_folder_states_none(tmp_path: Path):
+    import rasterio
+
+    maps = [write_map(tmp_path / name, (1, 2, 3)) for name in ("a", "b", "c 2023-03-01")]
+    for folder, date in zip(maps, ("2025:03:01", "2024:03:01", "2022:03:01"), strict=True):
+        with rasterio.open(folder / "odm_dem" / "dsm.tif", "r+") as file:
+            file.update_tags(TIFFTAG_DATETIME=f"{date} 10:00:00")
+    found = [(sheet.title, sheet.date) for sheet in Atlas(maps).sheets]
+    assert found == [("c 2023-03-01", "2023-03-01"), ("b", "2024-03-01"), ("a", "2025-03-01")]
+
+
+def test_the_system_is_that_of_the_first_layer_that_states_one(tmp_path: Path):
+    write_surface(tmp_path / "ortho.tif", np.full((3, *SHAPE), 90, np.uint8), 2.0, crs=None)
+    write_surface(tmp_path / "dsm.tif", np.ones(SHAPE, np.float32), 2.0, crs="EPSG:2263")
+    atlas = Atlas([tmp_path])
+    assert atlas.metre == pytest.approx(US_SURVEY_FOOT_M)
+    assert "New York Long Island" in atlas.name
+    assert atlas.at(WEST + 5, NORTH - 5)[0]["height"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        *(
+            {part: None}
+            for part in ("earlier", "later", "level_of_detection_m", "registration", "variogram", "volumes")
+        ),
+        {"level_of_detection_m": 3},
+        {"variogram": {"sill_shares": [0.5], "ranges_m": []}},
+        {"variogram": {"sill_shares": [0.5]}},
+        {"variogram": {"sill_shares": None, "ranges_m": None}},
+    ],
+    ids=str,
+)
+def test_a_change_whose_numbers_are_not_complete_is_refused(tmp_path: Path, damage: dict):
+    folder = write_change(tmp_path / "change", np.zeros(SHAPE, np.float32))
+    numbers = json.loads((folder / "change.json").read_text())
+    (folder / "change.json").write_text(json.dumps(numbers | damage))
+    with pytest.raises(RunError, match=r"has no change\.json of a change: expected what `tidefield change` wrote"):
+        Atlas([folder])
 
 
 def test_sheets_of_one_date_have_labels_of_their_own(tmp_path: Path):

@@ -233,6 +233,7 @@ def test_pictures_are_made_without_what_cannot_be_prepared(caplog: pytest.LogCap
 
     shown = Shown()
     with serving(grey, prepare=prepare) as server:
+        server.ask("before", camera(), Shown())
         eventually(lambda: "could not be prepared" in caplog.text)
         server.ask("a", camera(), shown)
         shown.wait_for(2)
@@ -247,7 +248,10 @@ def test_what_makes_coarse_pictures_faster_is_prepared_while_nothing_moves():
         left[0] -= 1
         return left[0] > 0
 
-    with serving(grey, prepare=prepare):
+    with serving(grey, prepare=prepare) as server:
+        time.sleep(0.05)
+        assert left[0] == 3, "nobody looks"
+        server.ask("a", camera(), Shown())
         eventually(lambda: left[0] == 0)
         time.sleep(0.05)
         assert left[0] == 0

@@ -15,6 +15,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -136,6 +137,68 @@ def test_what_is_measured_on_a_map_without_a_georeference_is_in_units(tmp_path: 
     assert found["section"].startswith("Section of 7.50 units")
     assert re.search(r"^Area 28.1 square units\s", found["area"])
     assert re.search(r"[\d.]+ cubic units", found["area"])
+
+
+def test_what_is_measured_on_a_scene_a_few_units_wide_is_not_rounded_away(tmp_path: Path, browser):
+    rows, columns = np.indices(SHAPE)
+    heap = 0.02 * np.exp(-((rows - 40) ** 2 + (columns - 50) ** 2) / 50)
+    write_surface(tmp_path / "odm_dem" / "dsm.tif", (2 + heap).astype(np.float32), 0.002, 0, 0, crs=LOCAL_WKT)
+    with page_of(tmp_path) as page:
+        tab = browser.new_page(viewport=SIZE)
+        found = {}
+        for tool, points in (
+            ("ruler", "0.1,-0.08;0.103,-0.084"),
+            ("area", "0.06,-0.04;0.14,-0.04;0.14,-0.12;0.06,-0.12"),
+            ("section", "0.06,-0.08;0.14,-0.08"),
+        ):
+            tab.goto("about:blank")
+            tab.goto(f"{page.address}/#tool={tool}&points={points}&left=0.height")
+            tab.locator('#result[aria-busy="false"]').wait_for()
+            found[tool] = tab.locator("#result").inner_text()
+            colours(tab, f"small_{tool}")
+        legend = tab.locator("#legendends").inner_text()
+        tab.close()
+    assert re.search(r"^Distance 0.00500 units\s", found["ruler"])
+    assert re.search(r"^Area 0.00640 square units\s", found["area"])
+    above = float(re.search(r"above its rim\s+([\d.]+) cubic units", found["area"]).group(1))
+    assert above == pytest.approx(0.02 * 50 * np.pi * 0.002**2, rel=0.01)
+    assert found["section"].startswith("Section of 0.0800 units")
+    assert re.search(r"^2\.00000 to 2\.007\d\d units", legend)
+
+
+def test_a_section_shows_the_change_where_maps_have_no_heights(tmp_path: Path, browser):
+    write_surface(tmp_path / "ortho" / "ortho.tif", np.full((3, *SHAPE), 90, np.uint8), CELL)
+    change = write_change(tmp_path / "change", np.full(SHAPE, 0.4, np.float32))
+    points = ";".join("{:.3f},{:.3f}".format(*corner(*at)) for at in ((20, 30), (75, 45)))
+    with page_of(tmp_path / "ortho", change) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(f"{page.address}/#tool=section&points={points}")
+        tab.locator('#result[aria-busy="false"]').wait_for()
+        assert tab.locator("#result").inner_text().endswith("change; bands: 95%")
+        tab.close()
+
+
+def test_surveys_of_a_section_have_colours_of_their_own(tmp_path: Path, browser):
+    rows, columns = np.indices(SHAPE)
+    maps = [
+        write_map(tmp_path / f"map 202{k}-01-01", (90, 120, 60), 5 + 0.01 * columns + 0.5 * k + 0 * rows)
+        for k in range(7)
+    ]
+    points = ";".join("{:.3f},{:.3f}".format(*corner(*at)) for at in ((20, 30), (75, 45)))
+    with page_of(*maps) as page:
+        tab = browser.new_page(viewport=SIZE)
+        tab.goto(f"{page.address}/#tool=section&points={points}")
+        tab.locator('#result[aria-busy="false"]').wait_for()
+        inks = tab.evaluate("[...document.querySelectorAll('#result span')].map(word => getComputedStyle(word).color)")
+        colours(tab, "section")
+        tab.close()
+    assert len(inks) == 7
+    between = [np.abs(np.subtract(a, b)).sum() for a, b in combinations([_rgb(ink) for ink in inks], 2)]
+    assert min(between) > 60
+
+
+def _rgb(ink: str) -> list[int]:
+    return [int(value) for value in re.findall(r"\d+", ink)[:3]]
 
 
 def test_the_level_of_detection_hides_smaller_changes_and_the_area_has_the_volume(tmp_path: Path, browser):

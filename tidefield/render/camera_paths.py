@@ -22,14 +22,13 @@ from scipy.special import softmax
 
 from tidefield.data.hull import Hull
 from tidefield.data.near_far import ranges_of_points, with_widest
-from tidefield.data.readers.files import read_json
 from tidefield.data.readers.posed import Observations
 from tidefield.data.scene import Scene
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import TidefieldError
 from tidefield.geometry.cameras import Cameras, intersect_axes
 from tidefield.geometry.lenses import Lens
-from tidefield.render.nerfstudio_path import read_nerfstudio_path
+from tidefield.render.nerfstudio_path import read_export, read_nerfstudio_path
 
 Vector = Float64[np.ndarray, "3"]
 Positions = Float64[np.ndarray, "N 3"]
@@ -122,7 +121,7 @@ def require_path(path: str, frames: int) -> None:
     if frames < 1:
         raise TidefieldError(f"a video of {frames} frames was asked for: expected at least one; choose more --frames")
     if Path(path).suffix.lower() == ".json":
-        read_json(Path(path))
+        read_export(Path(path))
     elif path not in SHAPES:
         raise TidefieldError(f"no camera path is called {path!r}: expected {', '.join(SHAPES)} or a .json file")
 
@@ -455,7 +454,7 @@ def free_camera(scene: Scene, T_world_camera: Float64[np.ndarray, "3 4"], lens: 
 
 
 def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Lens, ...]) -> Float64[np.ndarray, "N 2"]:
-    """Return the depth ranges of the sparse points, smoothed over the frames.
+    """Return the depth ranges of the sparse points, smoothed over the frames; each contains the frame's own one.
 
     Frames that show few of them have the widest range of any frame; where all do, and the scene has a visual hull, that
     of the box around it, else that of the photographs.
@@ -474,7 +473,9 @@ def _near_far(scene: Scene, pose: Float64[np.ndarray, "N 3 4"], lenses: tuple[Le
         near, far = scene.cameras.near_far[list(scene.train)].double().cpu().numpy().T
         filled = np.tile([np.quantile(near, 0.05), np.quantile(far, 0.95)], (len(pose), 1))
     # A jump of the range would be a jump in the picture: samples lie elsewhere.
-    return np.exp(gaussian_filter1d(np.log(filled), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))
+    smooth = np.exp(gaussian_filter1d(np.log(filled), FRAMES_PER_SECOND / 4, axis=0, mode="nearest"))
+    # A fast descent, or views that are no video, must keep what they see.
+    return np.stack([np.minimum(filled, smooth)[:, 0], np.maximum(filled, smooth)[:, 1]], axis=1)
 
 
 def _ranges_of_hull(hull: Hull, pose: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 2"]:

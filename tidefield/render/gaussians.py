@@ -10,14 +10,15 @@ Alphabet: G Gaussians, P pixels of a view.
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from tidefield import SOFTWARE
@@ -29,6 +30,8 @@ from tidefield.model.rendering import Render, Rendering
 from tidefield.render.consistency import ViewPoints, choose_points
 from tidefield.render.stills import MIN_OPACITY
 
+log = logging.getLogger(__name__)
+
 SH_0 = math.sqrt(1 / (4 * math.pi))
 """The constant harmonic: colour = 0.5 + SH_0 f_dc (Kerbl et al.)."""
 WIDTH = 0.7
@@ -39,8 +42,11 @@ OPACITY = 0.95
 STEEPEST = 0.15
 """Least cosine between the surface and a ray: flatter pixels are edges between near and far."""
 MOST = 20_000_000
-PIXEL_BYTES = 120
-"""What is held of a view's pixel until all views are rendered and points are chosen."""
+"""Where there would be more, cells are larger."""
+GROWTH = 1.25
+PIXEL_BYTES = 160
+"""What is held of a view's pixel at most: while the points of all views are sorted into cells."""
+WRITTEN_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -68,13 +74,11 @@ class SurfaceView:
         points: where they are.
         normal_world: unit normals, towards the camera.
         rgb: colours at the common exposure, in [0, 1].
-        footprint: how much of the surface a pixel shows, world units.
     """
 
     points: ViewPoints
     normal_world: Float64[np.ndarray, "P 3"]
-    rgb: Float64[np.ndarray, "P 3"]
-    footprint: Float64[np.ndarray, " P"]
+    rgb: Float32[np.ndarray, "P 3"]
 
 
 def make_gaussians(
@@ -89,7 +93,7 @@ def make_gaussians(
         progress: called with the number of views that are done, and of all.
 
     Raises:
-        RunError: the views show nothing, or too much.
+        RunError: the views show nothing, or their points do not fit into half of the memory.
     """
     views = render_surfaces(render, cameras, width, progress)
     return fuse(views, choose_points([view.points for view in views]))
@@ -138,51 +142,63 @@ def _of_view(rendering: Rendering, camera: Cameras) -> SurfaceView:
     normal *= np.sign(cosine)[:, None]
     known = rendering.opacity.cpu().numpy().reshape(-1) >= MIN_OPACITY
     shown = known & (np.abs(cosine) > STEEPEST)
-    footprint = depth.reshape(-1) / float(camera.focal_px[0].mean())
-    rgb = rendering.colour.double().cpu().numpy().reshape(-1, 3)
+    rgb = rendering.colour.cpu().numpy().reshape(-1, 3).astype(np.float32)
     points = ViewPoints(camera, xyz, depth.reshape(-1).astype(np.float32), known, shown)
-    return SurfaceView(points, normal, rgb, footprint)
+    return SurfaceView(points, normal, rgb)
 
 
 def fuse(views: Sequence[SurfaceView], chosen: Sequence[Bool[np.ndarray, " P"]]) -> Gaussians:
     """Make Gaussians of the chosen points of views: one for each cell of space that holds any.
 
-    A cell is as large as what half the shown pixels show at most.
+    A cell is as large as what half the shown pixels show at most, or larger where there would be more than `MOST`.
 
     Raises:
-        RunError: the views show nothing, or too much.
+        RunError: the views show nothing.
     """
-    footprint = np.concatenate([view.footprint[view.points.shown] for view in views])
+    points = [view.points for view in views]
+    footprint = np.concatenate([np.float64(of.depth[of.shown]) / float(of.camera.focal_px[0].mean()) for of in points])
     if not len(footprint):
         raise RunError("the views show nothing: expected a scene with a surface; look at it with `tidefield view`")
-    cell = float(np.median(footprint))
-    parts = [
-        (view.points.xyz_world[own], view.normal_world[own], view.rgb[own])
-        for view, own in zip(views, chosen, strict=True)
-    ]
-    mean, normal, rgb = (np.concatenate(part) for part in zip(*parts, strict=True))
-    found = _fused(mean, normal, rgb, cell)
-    if len(found[0]) > MOST:
-        raise RunError(f"{len(found[0]):,} Gaussians: expected at most {MOST:,}; choose a smaller --width")
-    return Gaussians(*found, sigma=WIDTH * cell)
+    cell = finest = float(np.median(footprint))
+
+    def columns(values: Sequence[np.ndarray]) -> Iterable[np.ndarray]:
+        """The coordinates of the chosen points, one after the other: all at once would double what is held."""
+        return (np.concatenate([of[own, k] for of, own in zip(values, chosen, strict=True)]) for k in range(3))
+
+    xyz = [of.xyz_world for of in points]
+    which = _cells(columns(xyz), cell)
+    while which.max() >= MOST:
+        cell *= GROWTH
+        which = _cells(columns(xyz), cell)
+    if cell > finest:
+        log.warning(
+            f"a cell for what each pixel shows would make more than {MOST:,} Gaussians: cells are {cell / finest:.3g} "
+            "times as wide; a smaller --width takes less time for the same"
+        )
+    count = np.bincount(which)[:, None]
+
+    def means(values: Sequence[np.ndarray]) -> Float64[np.ndarray, "G 3"]:
+        sums = np.stack([np.bincount(which, column) for column in columns(values)], axis=1)
+        sums /= count
+        return sums
+
+    mean, rgb, normal = means(xyz), means([view.rgb for view in views]), means([view.normal_world for view in views])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.maximum(length, 1e-6)
+    normal[length[:, 0] <= 1e-6] = (0.0, 0.0, 1.0)
+    return Gaussians(mean, normal, rgb, sigma=WIDTH * cell)
 
 
-def _fused(
-    mean: Float64[np.ndarray, "P 3"], normal: Float64[np.ndarray, "P 3"], rgb: Float64[np.ndarray, "P 3"], cell: float
-) -> tuple[Float64[np.ndarray, "G 3"], Float64[np.ndarray, "G 3"], Float64[np.ndarray, "G 3"]]:
-    """The means of what lies in each cell of space."""
-    index = np.floor((mean - mean.min(0)) / cell).astype(np.int64)
-    _, which, count = np.unique(index, axis=0, return_inverse=True, return_counts=True)
-    which = which.reshape(-1)
-
-    def means(values: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "G 3"]:
-        sums = [np.bincount(which, values[:, k], len(count)) for k in range(3)]
-        return np.stack(sums, axis=1) / count[:, None]
-
-    direction = means(normal)
-    length = np.linalg.norm(direction, axis=1, keepdims=True)
-    up = np.where(length > 1e-6, direction / np.maximum(length, 1e-6), (0.0, 0.0, 1.0))
-    return means(mean), up, means(rgb)
+def _cells(columns: Iterable[Float64[np.ndarray, " P"]], cell: float) -> Int64[np.ndarray, " P"]:
+    """Number the cells of space that points lie in, by their first coordinate, then by the others."""
+    which = np.zeros(1, np.int64)
+    for column in columns:
+        # Ranks, since indices themselves, where one point lies far away, have products beyond 64 bits.
+        column -= column.min()
+        column /= cell
+        rank = np.unique(np.floor(column, out=column), return_inverse=True)[1]
+        which = np.unique(which * (rank.max() + 1) + rank, return_inverse=True)[1]
+    return which
 
 
 def write_gaussians(gaussians: Gaussians, path: Path, origin_world: Sequence[float], overwrite: bool = False) -> None:
@@ -196,23 +212,17 @@ def write_gaussians(gaussians: Gaussians, path: Path, origin_world: Sequence[flo
     """
     from plyfile import PlyData, PlyElement
 
-    count = len(gaussians.mean_world)
-    constant = {
-        "opacity": math.log(OPACITY / (1 - OPACITY)),
-        "scale_0": math.log(gaussians.sigma),
-        "scale_1": math.log(gaussians.sigma),
-        "scale_2": math.log(FLATNESS * gaussians.sigma),
-    }
-    columns: dict[str, np.ndarray | float] = {
-        **dict(zip("xyz", gaussians.mean_world.T, strict=True)),
-        **dict(zip(("nx", "ny", "nz"), gaussians.normal_world.T, strict=True)),
-        **{f"f_dc_{k}": (gaussians.rgb[:, k] - 0.5) / SH_0 for k in range(3)},
-        **constant,
-        **{f"rot_{k}": column for k, column in enumerate(_quaternions(gaussians.normal_world).T)},
-    }
-    vertex = np.empty(count, [(name, "<f4") for name in columns])
-    for name, column in columns.items():
-        vertex[name] = column
+    names = ("x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{k}" for k in range(3)), "opacity")
+    names = (*names, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)))
+    table = np.empty((len(gaussians.mean_world), len(names)), "<f4")
+    table[:, :3], table[:, 3:6] = gaussians.mean_world, gaussians.normal_world
+    table[:, 9], table[:, 10:12] = math.log(OPACITY / (1 - OPACITY)), math.log(gaussians.sigma)
+    table[:, 12] = math.log(FLATNESS * gaussians.sigma)
+    for first in range(0, len(table), WRITTEN_AT_ONCE):
+        part = slice(first, first + WRITTEN_AT_ONCE)
+        table[part, 6:9] = (gaussians.rgb[part] - 0.5) / SH_0
+        table[part, 13:] = _quaternions(gaussians.normal_world[part])
+    vertex = table.view([(name, "<f4") for name in names])[:, 0]
     origin = " ".join(f"{value:.6f}" for value in origin_world)
     comments = [SOFTWARE, f"origin_world {origin}"]
     with completed_file(path, overwrite=overwrite) as partial:

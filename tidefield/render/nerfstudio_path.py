@@ -45,8 +45,24 @@ class NerfstudioPath:
     """None if the file does not state it."""
 
 
+def read_export(file: Path) -> Mapping[str, Any]:
+    """Read the JSON of a camera path, without its poses and numbers, which need a scene.
+
+    Raises:
+        TidefieldError: the file is missing, no JSON, of another camera type, or has no frames.
+    """
+    top = read_json(file)
+    kind = top.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise TidefieldError(f"{file} is for a camera of type {kind!r}: expected perspective; export it as that")
+    frames = top.get("camera_path")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise TidefieldError(f"{file} has no list camera_path of frames: expected nerfstudio's export of a camera path")
+    return top
+
+
 def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
-    """Read a camera path.
+    """Read a camera path into a scene's coordinates.
 
     Args:
         file: the JSON; a `dataparser_transforms.json` next to it is used.
@@ -56,13 +72,8 @@ def read_nerfstudio_path(file: Path, scene_root: Path) -> NerfstudioPath:
     Raises:
         TidefieldError: the file is missing, damaged, of another camera type, or holds invalid poses.
     """
-    top = read_json(file)
-    kind = top.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise TidefieldError(f"{file} is for a camera of type {kind!r}: expected perspective; export it as that")
-    frames = top.get("camera_path")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise TidefieldError(f"{file} has no list camera_path of frames: expected nerfstudio's export of a camera path")
+    top = read_export(file)
+    frames = top["camera_path"]
     width, height = (number(top, key, file, least=1.0, most=LARGEST_SIDE) for key in ("render_width", "render_height"))
     placed = [(frame, f"{file}, frame {i}") for i, frame in enumerate(frames)]
     degrees = [number(frame, "fov", place, least=_NARROWEST, most=_WIDEST) for frame, place in placed]

@@ -11,14 +11,14 @@ import io
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from PIL import Image
 
 from tidefield.change.errors import Z95, Variogram, colour_limit, region_error
@@ -38,6 +38,8 @@ SECTION_POINTS = 600
 MOST_POINTS = 500
 MOST_CELLS = 16_000_000
 """Of the box around a polygon."""
+STRIP_CELLS = 1 << 18
+"""Of a map's box around a polygon that are read at once."""
 CHANGE_FILE, CHANGE_RASTER, MAP_FILE = "change.json", "change.tif", "map.json"
 HILLSHADES = ("odm_dem/dsm_hillshade.tif", "odm_dem/dtm_hillshade.tif")
 
@@ -111,9 +113,7 @@ def open_sheet(folder: Path) -> Sheet:
     """
     name = folder.resolve().name
     if (folder / CHANGE_RASTER).is_file():
-        numbers = read_json(folder / CHANGE_FILE)
-        if not isinstance(numbers, dict) or not {"earlier", "later", "level_of_detection_m"} <= set(numbers):
-            raise RunError(f"{folder} has no {CHANGE_FILE} of a change: expected what `tidefield change` wrote")
+        numbers = _numbers_of_change(folder)
         dz = folder / CHANGE_RASTER
         sizes = np.abs(_overview(dz, 1))
         largest = float(sizes.max(initial=0.0))
@@ -124,8 +124,8 @@ def open_sheet(folder: Path) -> Sheet:
         )
         return Sheet(folder, name, numbers["later"].get("date"), "change", layers, None, None, numbers)
     surface = first_of(folder, SURFACES)
-    heights = surface and open_surface(surface)
-    sigma = open_surface(heights.sigma) if heights is not None and heights.sigma is not None else None
+    heights = surface and _surface(surface)
+    sigma = _surface(heights.sigma) if heights is not None and heights.sigma is not None else None
     found: list[Layer] = []
     for kind, title, path in (
         ("orthophoto", "Orthophoto", first_of(folder, ORTHOPHOTOS)),
@@ -144,7 +144,45 @@ def open_sheet(folder: Path) -> Sheet:
         raise RunError(f"{folder} is no map: expected a folder of `tidefield map`, ODM or `tidefield change`")
     numbers = read_json(folder / MAP_FILE) or {}
     date = date_in(name) or (date_in(str(numbers.get("scene", ""))) if isinstance(numbers, dict) else None)
+    date = date or (heights.date if heights is not None else None)
     return Sheet(folder, name, date, "map", tuple(found), heights, sigma, numbers)
+
+
+def _numbers_of_change(folder: Path) -> dict[str, Any]:
+    """What change.json has; raises a RunError where a part of it is missing."""
+    numbers = read_json(folder / CHANGE_FILE)
+    parts = ("earlier", "later", "level_of_detection_m", "registration", "variogram", "volumes")
+    whole = isinstance(numbers, dict) and all(isinstance(numbers.get(part), dict) for part in parts)
+    sills, ranges = (numbers["variogram"].get(name) if whole else None for name in ("sill_shares", "ranges_m"))
+    if not (isinstance(sills, list) and isinstance(ranges, list) and len(sills) == len(ranges)):
+        raise RunError(f"{folder} has no {CHANGE_FILE} of a change: expected what `tidefield change` wrote")
+    return numbers
+
+
+def _surface(path: Path) -> Surface:
+    """A surface whose cells that are NaN show nothing, also where the file does not declare that."""
+    from rasterio.enums import MaskFlags
+
+    found = open_surface(path)
+    with opened(path) as file:
+        undeclared = file.dtypes[0].startswith("float") and MaskFlags.all_valid in file.mask_flag_enums[0]
+    return replace(found, unknown=(*found.unknown, math.nan)) if undeclared else found
+
+
+def _with_common_ends(sheets: list[Sheet]) -> list[Sheet]:
+    """The sheets, with the same colours for all heights, and for all errors: the page has one legend for two dates."""
+    layers = [layer for sheet in sheets for layer in sheet.layers]
+    ends = {
+        kind: {
+            "low": min(one.low for one in layers if one.kind == kind),
+            "high": max(one.high for one in layers if one.kind == kind),
+        }
+        for kind in {layer.kind for layer in layers} & {"height", "error"}
+    }
+    return [
+        replace(sheet, layers=tuple(replace(layer, **ends.get(layer.kind, {})) for layer in sheet.layers))
+        for sheet in sheets
+    ]
 
 
 def _with_own_titles(sheets: list[Sheet]) -> list[Sheet]:
@@ -172,7 +210,7 @@ class Atlas:
         self.folders = tuple(folders)
         # Those without a date last: the first one's system is everybody's.
         sheets = sorted(map(open_sheet, folders), key=lambda sheet: (sheet.date is None, sheet.date or ""))
-        self.sheets = _with_own_titles(sheets)
+        self.sheets = _with_common_ends(_with_own_titles(sheets))
         self._state = _state(self.sheets)
         self._systems = [_system(sheet) for sheet in self.sheets]
         stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
@@ -288,68 +326,55 @@ class Atlas:
                 continue
             with self._reader(source) as file:
                 box, inside = _cells_in(file, polygon)
-                if not inside.any():
-                    results.append({})
-                    continue
-                values = _band(file, 1, box)
-                transform = _corner_at(file.transform, box)
-                cell = abs(transform.a) * self.metre
-                cell_area = cell * abs(transform.e) * self.metre
+                cell_area = abs(file.transform.a * file.transform.e) * self.metre**2
                 on = polygon.intersection(shapely.box(*file.bounds)).area / polygon.area
-                bands = (2, 4) if sheet.kind == "change" else ()
-                errors = [_band(file, band, box) for band in bands if band <= file.count]
-            cells = np.count_nonzero(inside)
-            inside &= np.isfinite(values)
-            if not inside.any():
-                results.append({})
-                continue
-            share = {"share": on * np.count_nonzero(inside) / cells}
-            if sheet.kind == "change":
-                volumes = _change_volumes(values, errors, inside, cell, cell_area, sheet.numbers, detection_m)
-                results.append(volumes | share)
-                continue
-            sigma = None
-            if sheet.sigma is not None:
-                with self._reader(sheet.sigma) as file:
-                    error = _band(file, 1, box)
-                sigma = error if error.shape == values.shape else None
-            volumes = self._map_volumes(polygon, values, sigma, inside, transform, cell_area, source)
-            results.append(volumes and volumes | share)
+                cells = np.count_nonzero(inside)
+                if sheet.kind == "change":
+                    cell = abs(file.transform.a) * self.metre
+                    volumes = _change_volumes(file, box, inside, cell, cell_area, sheet.numbers, detection_m)
+                else:
+                    volumes = self._map_volumes(sheet.sigma, file, polygon, box, inside, cell_area)
+            results.append(volumes and volumes | {"share": on * volumes["cells_m2"] / (cells * cell_area)})
         return {"area_m2": polygon.area * self.metre**2, "length_m": polygon.length * self.metre, "sheets": results}
 
     def _map_volumes(
         self,
+        sigma: Surface | None,
+        file: Any,
         polygon: Any,
-        heights: Any,
-        sigma: Any,
-        inside: Any,
-        transform: Any,
+        box: Any,
+        inside: Bool[np.ndarray, "h w"],
         cell_area: float,
-        source: Path | Surface,
     ) -> dict[str, Any]:
+        """Volumes above and below the plane through a polygon's rim; none where the rim or the cells are not known."""
         rim = np.array([polygon.exterior.interpolate(s, normalized=True).coords[0] for s in np.linspace(0, 1, 200)])
-        with self._reader(source) as file:
-            z = _sample(file, rim, 1)
+        z = _sample(file, rim, 1)
         known = np.isfinite(z)
-        if known.sum() < 3 or not inside.any():
+        if known.sum() < 3:
             return {}
         centre = rim.mean(0)
         design = np.column_stack([np.ones(known.sum()), rim[known] - centre])
         plane = np.linalg.lstsq(design, z[known], rcond=None)[0]
-        rows, columns = np.nonzero(inside)
-        x = transform.c + (columns + 0.5) * transform.a - centre[0]
-        y = transform.f + (rows + 0.5) * transform.e - centre[1]
-        above = heights[inside] - (plane[0] + plane[1] * x + plane[2] * y)
-        result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
-        for name, chosen in (("above", above > 0), ("below", above < 0)):
-            value = float(np.abs(above[chosen]).sum()) * cell_area
+        cells, sums = 0, {"above": np.zeros(4), "below": np.zeros(4)}
+        with self._reader(sigma) if sigma is not None else nullcontext() as errors:
+            for window, within in _strips(box, inside):
+                heights, corner = _band(file, 1, window), _corner_at(file.transform, window)
+                rows, columns = np.nonzero(within & np.isfinite(heights))
+                cells += len(rows)
+                place = np.stack([corner.c + (columns + 0.5) * corner.a, corner.f + (rows + 0.5) * corner.e], axis=1)
+                above = heights[rows, columns] - plane[0] - (place - centre) @ plane[1:]
+                error = np.full(len(place), np.nan) if errors is None else _sample(errors, place, 1)
+                for name, chosen in (("above", above > 0), ("below", above < 0)):
+                    own = error[chosen & np.isfinite(error)]
+                    sums[name] += np.array([np.abs(above[chosen]).sum(), chosen.sum(), own.sum(), len(own)])
+        result: dict[str, Any] = {"cells_m2": cells * cell_area}
+        for name, (height, count, error, known) in sums.items():
+            value = float(height) * cell_area
             result[name] = {"value_m3": value}
-            if sigma is not None:
-                errors = sigma[inside][chosen]
-                known = np.isfinite(errors)
-                half = Z95 * float(errors[known].mean() if known.any() else 0.0) * len(errors) * cell_area
+            if known or (sigma is not None and not count):
+                half = Z95 * float(error / max(known, 1) * count) * cell_area
                 result[name] |= {"low_m3": value - half, "high_m3": value + half}
-        return result
+        return result if cells else {}
 
     def _along(self, place: Float64[np.ndarray, "N 2"]) -> list[dict[str, Float64[np.ndarray, " N"]]]:
         """The values of every sheet at places."""
@@ -452,7 +477,7 @@ def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     own = CRS.from_wkt(crs.to_wkt())
     if is_local(own) or not (own.is_geographic or (own.is_projected and in_metres(own))):
         return crs
-    with _opened(sheet.layers[0].source) as file:
+    with _opened(_placed(sheet)) as file:
         corner, column, row = file.transform, file.width / 2, file.height / 2
     x = corner.c + corner.a * column + corner.b * row
     y = corner.f + corner.d * column + corner.e * row
@@ -460,8 +485,17 @@ def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     return crs if same_system(metric, own) else type(crs).from_wkt(metric.to_wkt())
 
 
+def _placed(sheet: Sheet) -> Path | Surface:
+    """The first raster of a sheet that states a coordinate system; the first of all where none does."""
+    for layer in sheet.layers:
+        with _opened(layer.source) as file:
+            if file.crs is not None:
+                return layer.source
+    return sheet.layers[0].source
+
+
 def _system(sheet: Sheet) -> Any:
-    with _opened(sheet.layers[0].source) as file:
+    with _opened(_placed(sheet)) as file:
         return file.crs
 
 
@@ -631,8 +665,8 @@ def _corner_at(transform: Any, window: Any) -> Any:
     return type(transform)(a, b, c + a * x + b * y, d, e, f + d * x + e * y)
 
 
-def _band(file: Any, band: int, window: Any) -> Float64[np.ndarray, "h w"]:
-    return file.read(band, window=window, masked=True).astype(np.float64).filled(np.nan)
+def _band(file: Any, band: int, window: Any, kind: type = np.float64) -> Float[np.ndarray, "h w"]:
+    return file.read(band, window=window, masked=True).astype(kind, copy=False).filled(np.nan)
 
 
 def _cells_in(file: Any, polygon: Any) -> tuple[Any, Bool[np.ndarray, "h w"]]:
@@ -654,46 +688,67 @@ def _cells_in(file: Any, polygon: Any) -> tuple[Any, Bool[np.ndarray, "h w"]]:
     return window, geometry_mask([polygon], (height, width), transform, invert=True)
 
 
+def _strips(box: Any, inside: Bool[np.ndarray, "h w"]) -> Iterator[tuple[Any, Bool[np.ndarray, "rows w"]]]:
+    """The rows of a window, a few at a time, and which of their cells are inside."""
+    from rasterio.windows import Window
+
+    step = max(1, STRIP_CELLS // max(1, inside.shape[1]))
+    for first in range(0, len(inside), step):
+        within = inside[first : first + step]
+        yield Window(box.col_off, box.row_off + first, box.width, len(within)), within  # type: ignore[call-arg]
+
+
 def _change_volumes(
-    dz: Any,
-    errors: Sequence[Any],
-    inside: Any,
+    file: Any,
+    box: Any,
+    inside: Bool[np.ndarray, "h w"],
     cell_m: float,
     cell_area: float,
     numbers: dict[str, Any],
     detection_m: float,
 ) -> dict[str, Any]:
-    """Volumes in a polygon, net with its interval.
+    """Volumes in a polygon, net with its interval; none where no cell is known.
 
     The systematic error is taken to have one sign in all cells, so that on a hill, where that of a shift cancels out,
     intervals are wider than those of the report.
 
     Args:
-        errors: one sigma of the cells, and of its systematic part, which files of earlier versions lack.
+        file: change, its sigma, p, and the systematic part of sigma, which files of earlier versions lack.
+        box, inside: the window around the polygon, and which of its cells lie in it.
     """
-    sigma = np.nan_to_num(errors[0])
-    if len(errors) > 1:
-        shared = np.nan_to_num(errors[1])
+    if not inside.any():
+        return {}
+    dz = _band(file, 1, box, np.float32)
+    inside = inside & np.isfinite(dz)
+    cells = np.count_nonzero(inside)
+    if not cells:
+        return {}
+
+    def total(values: Float[np.ndarray, "h w"], region: Bool[np.ndarray, "h w"]) -> float:
+        return float(values.sum(where=region, dtype=np.float64))
+
+    registration, variogram = numbers["registration"], numbers["variogram"]
+    own = float(registration.get("systematic_m", 0.0))
+    sigma = np.nan_to_num(_band(file, 2, box, np.float32), copy=False)
+    if file.count >= 4:
+        shared = np.nan_to_num(_band(file, 4, box, np.float32), copy=False)
         sigma = np.sqrt(np.maximum(sigma**2 - shared**2, 0))
     else:
-        shared = np.full_like(sigma, numbers.get("registration", {}).get("systematic_m", 0.0))
-    measured = numbers.get("variogram", {})
-    variogram = Variogram(tuple(measured.get("sill_shares", ())), tuple(measured.get("ranges_m", ())))
-    registration = numbers.get("registration", {})
-    stated = float(registration.get("datum_error_m", 0.0)) * np.count_nonzero(inside)
+        shared = np.full_like(sigma, own)
+    stated = float(registration.get("datum_error_m", 0.0)) * cells
     # Beyond a tilt, whose error is another in each cell, the part of the shift is not found.
     if registration.get("shift_error_stated") and registration.get("model") != "tilt":
-        own = float(registration.get("systematic_m", 0.0))
-        stated = math.hypot(stated, float(np.sqrt(np.maximum(shared[inside] ** 2 - own**2, 0)).sum()))
-    freedom = float((numbers.get("volumes", {}).get("net") or {}).get("degrees_of_freedom") or math.inf)
-    result: dict[str, Any] = {"cells_m2": float(inside.sum()) * cell_area}
-    error = region_error(sigma.astype(np.float32), inside, variogram, cell_m)
-    area = float(inside.sum()) * cell_area
+        stated = math.hypot(stated, total(np.sqrt(np.maximum(shared**2 - own**2, 0)), inside))
+    freedom = float((numbers["volumes"].get("net") or {}).get("degrees_of_freedom") or math.inf)
+    area = cells * cell_area
+    result: dict[str, Any] = {"cells_m2": area}
+    correlation = Variogram(tuple(variogram["sill_shares"]), tuple(variogram["ranges_m"]))
+    error = region_error(sigma, inside, correlation, cell_m)
     net = Volume(
-        float(dz[inside].sum()) * cell_area,
+        total(dz, inside) * cell_area,
         error.random * cell_area,
         error.correlated * cell_area,
-        float(shared[inside].sum()) * cell_area,
+        total(shared, inside) * cell_area,
         area,
         degrees_of_freedom=freedom,
         datum_m3=stated * cell_area,
@@ -701,7 +756,7 @@ def _change_volumes(
     low, high = net.interval_m3
     result["net"] = {"value_m3": net.value_m3, "low_m3": low, "high_m3": high}
     for name, region in (("cut", inside & (dz < -detection_m)), ("fill", inside & (dz > detection_m))):
-        result[name] = {"value_m3": abs(float(dz[region].sum())) * cell_area}
+        result[name] = {"value_m3": abs(total(dz, region)) * cell_area}
     return result
 
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 
 from tidefield.config import Sampling
 from tidefield.errors import TidefieldError
@@ -79,8 +80,8 @@ class FrameServer:
     Args:
         coarse: a camera and what a sharp picture from nearby has shown, to a picture in a fraction of a second.
         render: the method.
-        prepare: does a small part of the work that makes later coarse pictures faster, while nothing moves; returns
-            whether there was any.
+        prepare: does a small part of the work that makes later coarse pictures faster, while somebody looks and
+            nothing moves; returns whether there was any.
         rest_seconds: see `REST_SECONDS`.
     """
 
@@ -152,36 +153,43 @@ class FrameServer:
     def _run_coarse(self) -> None:
         while True:
             with self._changed:
-                while not (self._closed or self._waiting_for_coarse() or self._may_prepare):
+                work = self._next_work()
+                while work is None and not self._closed:
                     self._changed.wait()
-                if self._closed:
+                    work = self._next_work()
+                if work is None or self._closed:
                     return
-                waiting = self._waiting_for_coarse()
-            if not waiting:
-                try:
-                    self._may_prepare = self._prepare()
-                except Exception:  # pictures are made without
-                    log.exception("coarse pictures could not be prepared")
-                    self._may_prepare, self._prepare = False, lambda: False
-                continue
+            work()
+
+    def _next_work(self) -> Callable[[], None] | None:
+        """What the first thread does next: the coarse picture of who has waited longest, or prepare others."""
+        waiting = self._waiting_for_coarse()
+        if not waiting:
+            return self._prepare_some if self._may_prepare and self._viewers else None
+        who, viewer = min(waiting, key=lambda one: one[1].last_coarse)
+        viewer.wants_coarse, self._making_coarse = False, True
+        return partial(self._make_coarse, who, viewer, viewer.serial, viewer.camera, viewer.since, viewer.seen)
+
+    def _prepare_some(self) -> None:
+        try:
+            self._may_prepare = self._prepare()
+        except Exception:  # pictures are made without
+            log.exception("coarse pictures could not be prepared")
+            self._may_prepare, self._prepare = False, lambda: False
+
+    def _make_coarse(
+        self, who: Hashable, viewer: _Viewer, serial: int, camera: Cameras, since: float, seen: ColouredPoints | None
+    ) -> None:
+        try:
+            height = max(1, round(camera.height * COARSE_PX / camera.width))
+            small = camera.resized(COARSE_PX, height) if camera.width > COARSE_PX else camera
+            frame = self._made(lambda: self._coarse(small, seen), small, False, since)
+            self._show(who, viewer, frame, serial)
+        finally:
             with self._changed:
-                waiting = self._waiting_for_coarse()
-                if not waiting:  # it has left meanwhile
-                    continue
-                who = min(waiting, key=lambda one: self._viewers[one].last_coarse)
-                viewer = self._viewers[who]
-                viewer.wants_coarse, self._making_coarse = False, True
-                serial, camera, since, seen = viewer.serial, viewer.camera, viewer.since, viewer.seen
-            try:
-                height = max(1, round(camera.height * COARSE_PX / camera.width))
-                small = camera.resized(COARSE_PX, height) if camera.width > COARSE_PX else camera
-                frame = self._made(lambda small=small, seen=seen: self._coarse(small, seen), small, False, since)
-                self._show(who, viewer, frame, serial)
-            finally:
-                with self._changed:
-                    self._making_coarse, self._may_prepare = False, True
-                    viewer.last_coarse = time.monotonic()
-                    self._changed.notify_all()
+                self._making_coarse, self._may_prepare = False, True
+                viewer.last_coarse = time.monotonic()
+                self._changed.notify_all()
 
     def _run_sharp(self) -> None:
         while True:
@@ -220,8 +228,8 @@ class FrameServer:
             viewer.last_sharp = time.monotonic()
             self._show(who, viewer, frame, serial)
 
-    def _waiting_for_coarse(self) -> list[Hashable]:
-        return [who for who, viewer in self._viewers.items() if viewer.wants_coarse]
+    def _waiting_for_coarse(self) -> list[tuple[Hashable, _Viewer]]:
+        return [(who, viewer) for who, viewer in self._viewers.items() if viewer.wants_coarse]
 
     def _rested(self) -> tuple[Hashable, _Viewer] | None:
         """The viewer whose camera rests and who has waited longest for a sharp picture."""

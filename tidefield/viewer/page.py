@@ -164,14 +164,12 @@ class _Client:
 
     def camera(self) -> Cameras:
         """The viewer's camera in the scene, of the size of its sharp picture."""
-        own, scale = self.client.camera, self.page.scale
-        shown_width, shown_height = own.image_width, own.image_height
-        width = max(16, min(shown_width, self.page.width))
-        height = max(16, round(width * shown_height / max(shown_width, 1)))
-        rotation = Rotation.from_quat(np.roll(own.wxyz, -1)).as_matrix()
-        focal_px = height / 2 / math.tan(min(own.fov, math.radians(150)) / 2)
-        position = np.asarray(own.position, dtype=np.float64) / scale
-        return path_cameras(self.page.scene, position[None], rotation[None], width, height, np.array([focal_px]))
+        own, place = self.client.camera, self._key_frame()
+        width = max(16, min(own.image_width, self.page.width))
+        height = max(16, round(width * own.image_height / max(own.image_width, 1)))
+        focal_px = np.array([height / 2 / math.tan(min(place.fov, math.radians(150)) / 2)])
+        position, rotation = place.position_world[None], place.rotation[None]
+        return path_cameras(self.page.scene, position, rotation, width, height, focal_px)
 
     def moved(self) -> None:
         """Have the picture of where the camera is now made."""
@@ -227,16 +225,17 @@ class _Client:
         step = -(-len(scene.names) // MOST_FRUSTUMS)
         for i in range(0, len(scene.names), step):
             camera, name = scene.cameras[i], scene.names[i]
+            place = _key_frame_of(camera)
             handle = self.client.scene.add_camera_frustum(
                 f"/photographs/{i}",
-                fov=2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1])),
+                fov=place.fov,
                 aspect=camera.width / camera.height,
                 scale=size,
                 thickness=0.02 * size,
                 color=(30, 110, 200) if i in train else (220, 120, 20),
                 image=self.page.thumbnail(i),
                 jpeg_quality=70,
-                wxyz=_wxyz(camera),
+                wxyz=np.roll(Rotation.from_matrix(place.rotation).as_quat(), 1),
                 position=self.page.positions[i],
                 cast_shadow=False,
                 receive_shadow=False,
@@ -255,15 +254,7 @@ class _Client:
 
     def fly_to_photograph(self, name: str) -> None:
         """Move the camera to a photograph's in a short flight."""
-        camera = self.page.scene.cameras[name]
-        self._place(
-            KeyFrame(
-                camera.position_world[0].double().numpy(),
-                camera.T_world_camera[0, :, :3].double().numpy(),
-                2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1])),
-            ),
-            flight=True,
-        )
+        self._place(_key_frame_of(self.page.scene.cameras[name]), flight=True)
 
     def _key_frame(self) -> KeyFrame:
         """Where the camera is."""
@@ -305,6 +296,10 @@ class _Client:
         self.link.content = f"[This view]({query}): keep or send its address."
 
 
-def _wxyz(camera: Cameras) -> Float64[np.ndarray, "4"]:
-    rotation = camera.T_world_camera[0, :, :3].double().numpy()
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+def _key_frame_of(camera: Cameras) -> KeyFrame:
+    """Where a photograph's camera is."""
+    return KeyFrame(
+        camera.position_world[0].double().numpy(),
+        camera.T_world_camera[0, :, :3].double().numpy(),
+        2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1])),
+    )
