@@ -187,7 +187,8 @@ def _train(options: Train, console: Console, again: str) -> None:
             if used >= 1:
                 console.print(USED_BEFORE, highlight=False)
             stopped, progress = run_training(trainer, folder, budget, console, callback), trainer.progress
-        if budget.minutes is not None and stopped is None and progress.step < run.config.train.warm_up:
+        few = isinstance(run.config, Config) and progress.step < run.config.train.warm_up
+        if few and budget.minutes is not None and stopped is None:
             log.warning(
                 f"{progress.step} steps change little: expected hundreds; give more --minutes, or a smaller --width"
             )
