@@ -199,6 +199,7 @@ def test_users_mistakes_are_one_clear_message(
     assert "--resume continues the run that --overwrite replaces" in said
     assert "no photograph named" in fails(capsys, "render", run, tmp_path / "a.png", "--camera", "nobody")
     assert ".mp4" in fails(capsys, "render", run, tmp_path / "a.gif")
+    assert "with --camera" in fails(capsys, "render", run, tmp_path / "a.png")
     for command in (("render", scene, tmp_path / "a.mp4"), ("evaluate", scene, tmp_path / "out")):
         message = fails(capsys, *command)
         assert "add --zero-shot" in message

@@ -77,7 +77,8 @@ def render(options: Render, console: Console) -> None:
     suffix = ".mp4" if camera is None else ".png"
     if out.suffix.lower() != suffix:
         what = "a video" if camera is None else "one view (--camera)"
-        raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name")
+        instead = ", or name the view of a photograph with --camera" if camera is None else ""
+        raise RunError(f"{out.name} was asked for: {what} is written as {suffix}; change the name{instead}")
     if options.with_itself and camera is None:
         raise RunError("--with-itself belongs to --camera NAME: a path has no photographs of its own; leave it out")
     of_paths = next((name for name in ("path", "frames") if getattr(options, name) is not None), None)
