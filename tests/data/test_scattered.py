@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
+from tidefield.data import surface
 from tidefield.data.surface import interpolate_on_pixels
 from tidefield.geometry.cameras import pixel_grid
 
@@ -41,3 +44,18 @@ def test_points_and_edges_on_the_centres_of_pixels() -> None:
             assert found[int(at[1]), int(at[0])] == pytest.approx(on[at], abs=1e-9)
         low, high = found.min(), found.max()
         assert values.min() - 1e-9 <= low <= high <= values.max() + 1e-9
+
+
+def test_a_tall_grid_takes_little_more_memory_than_its_values(monkeypatch: pytest.MonkeyPatch):
+    random, width, height = np.random.default_rng(0), 60, 2000
+    corners = [[-1, -1], [-1, height + 1], [width + 1, -1], [width + 1, height + 1]]
+    uv = np.concatenate([random.uniform(0, 1, (500, 2)) * [width, height], corners])
+    values, found = random.normal(size=len(uv)), []
+    for at_once in (10**6, 6000):
+        monkeypatch.setattr(surface, "PIXELS_AT_ONCE", at_once)
+        tracemalloc.start()
+        found.append(interpolate_on_pixels(uv, values, width, height))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 20 * width * height
+    np.testing.assert_array_equal(*found)

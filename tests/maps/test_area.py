@@ -11,12 +11,13 @@ from pyproj import Transformer
 
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
-from tidefield.maps.area import read_shapes
-from tidefield.maps.grid import MapFrame
+from tidefield.maps.area import inside, read_shapes, touches
+from tidefield.maps.grid import Grid, MapFrame
 
 EAST, NORTH, SIDE = 400_000.0, 500_000.0, 80.0
 WKT = parse_crs("EPSG:27700").to_wkt()
 FRAME = MapFrame(LocalFrame.at("EPSG:27700", (EAST, NORTH, 10.0)), np.zeros(3), np.eye(3), WKT, WKT, "the sea")
+LOCAL = MapFrame(None, np.zeros(3), np.eye(3), WKT, WKT, "local")
 TO = Transformer.from_crs("EPSG:27700", "EPSG:4326", always_xy=True)
 
 
@@ -59,7 +60,7 @@ def test_all_valid_forms_of_an_area_are_read(tmp_path: Path, geometries: list[An
     assert area(write(tmp_path / "a.geojson", *geometries, **members)) == pytest.approx(SIDE**2, rel=1e-4)
 
 
-@pytest.mark.parametrize("frame", [FRAME, MapFrame(None, np.zeros(3), np.eye(3), WKT, WKT, "local")])
+@pytest.mark.parametrize("frame", [FRAME, LOCAL])
 def test_an_outline_that_crosses_itself_has_the_inside_of_both_its_parts(tmp_path: Path, frame: MapFrame):
     path = write(tmp_path / "a.geojson", polygon(BOW_TIE))
     shapes = [shape for shape, _ in read_shapes(path, frame, ("Polygon",))]
@@ -67,6 +68,17 @@ def test_an_outline_that_crosses_itself_has_the_inside_of_both_its_parts(tmp_pat
     assert all(shape.is_valid for shape in shapes)
     box = shapely.box(*shapely.union_all(shapes).bounds)
     assert sum(shape.area for shape in shapes) == pytest.approx(box.area / 2, rel=0.1)
+
+
+@pytest.mark.parametrize("frame", [FRAME, LOCAL])
+@pytest.mark.parametrize("kind", ["Polygon", "LineString"])
+@pytest.mark.parametrize("number", ["NaN", "1e999", "-Infinity", pytest.param("1" + "0" * 400, id="huge")])
+def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path, frame: MapFrame, kind: str, number: str):
+    geometry = polygon(SQUARE) if kind == "Polygon" else {"type": kind, "coordinates": SQUARE}
+    path = write(tmp_path / "a.geojson", geometry)
+    path.write_text(path.read_text().replace(json.dumps(SQUARE[1][1]), number))
+    with pytest.raises(RunError, match=r"has coordinates outside of|is no GeoJSON"):
+        read_shapes(path, frame, (kind,))
 
 
 def test_lines_keep_their_vertices(tmp_path: Path):
@@ -77,3 +89,19 @@ def test_lines_keep_their_vertices(tmp_path: Path):
     spot = {"type": "LineString", "coordinates": [SQUARE[0], SQUARE[0]]}
     with pytest.raises(RunError, match="has no LineString"):
         read_shapes(write(tmp_path / "a.geojson", spot), FRAME, ("LineString",))
+
+
+def test_an_area_has_the_cells_and_tiles_that_lie_in_it_not_in_its_rectangle():
+    tiles = Grid(LOCAL, 0.0, 64.0, 0.5, 128, 128, 0.0).tiles(32, 16)
+    triangle = shapely.Polygon([(0, 0), (64, 0), (0, 64)])
+    for tile in tiles:
+        east, north = (part + middle for part, middle in zip(tile.offsets(), tile.centre, strict=True))
+        expected = (east > 0) & (north > 0) & (east + north < 64)
+        np.testing.assert_array_equal(inside(triangle, tile), expected)
+        assert inside(None, tile).all()
+        # A tile that meets a side in one corner may be made, for nothing.
+        if expected.any() or sum(tile.centre) > 64 + tile.side * 0.5:
+            assert touches(triangle, tile) == expected.any()
+    made = [touches(triangle, tile) for tile in tiles]
+    assert 0.4 < np.mean(made) < 0.95
+    assert all(touches(None, tile) for tile in tiles)

@@ -232,6 +232,55 @@ def test_each_point_checks_once_and_those_that_were_fitted_to_do_not(
     assert "is not georeferenced" in caplog.text
 
 
+def test_points_without_names_are_not_those_that_a_control_file_counts_alike(
+    scene: Scene, frame: MapFrame, tmp_path: Path
+):
+    names, corners = (
+        tuple(f"point {k + 1}" for k in range(4)),
+        np.array([[x, y, 0.0] for x in (20, -20) for y in (20, -20)]),
+    )
+    itself, none = Similarity(1.0, np.eye(3), np.zeros(3)), Residuals()
+    fitted = Residuals(names, np.zeros((4, 3)))
+    there = Georeference(FRAME, "ground control", itself, none, fitted, none, (), (), corners)
+    lines = [f"{351_200 + k} {512_900 + k} 260 10 20 {photograph}" for k in range(6) for photograph in scene.names[:2]]
+    lines += ["351203 512901 260 point 2", "351220.4 512920.4 260 point 1", "351220.4 512879.6 260 10 20 gone.jpg"]
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", *lines[:12], lines[14]]))
+    found = all_check_points(replace(scene, root=tmp_path), frame, tmp_path / "check.txt", there)
+    assert [point.name for point in found] == [f"point {k + 1}" for k in range(7)]
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", *lines[12:14]]))
+    found = all_check_points(replace(scene, root=tmp_path), frame, tmp_path / "check.txt", there)
+    assert [point.name for point in found] == ["point 2"], "where no control point is; the other is within a metre"
+
+
+@pytest.mark.parametrize("metre", [1.0, 3937 / 1200])
+def test_a_list_that_is_printed_to_the_centimetre_has_the_same_points(
+    scene: Scene, frame: MapFrame, tmp_path: Path, metre: float
+):
+    own = replace(scene, root=tmp_path)
+    places = np.array([351_200, 512_900, 260]) + np.random.default_rng(0).uniform(-30, 30, (20, 3))
+    for name, digits in ((CHECK_FILE, 6), ("rounded.txt", 2)):
+        rows = [f"{x:.{digits}f} {y:.{digits}f} {z:.{digits}f} CHK{k}" for k, (x, y, z) in enumerate(places.tolist())]
+        (tmp_path / name).write_text("\n".join(["EPSG:27700", *rows]))
+    in_feet = replace(frame, metre_up=metre)
+    assert len(all_check_points(own, in_feet, tmp_path / "rounded.txt", None)) == 20
+    near = [f"{x} {y} {z + 0.03 * metre} near {k}" for k, (x, y, z) in enumerate(places[:2].tolist())]
+    (tmp_path / "near.txt").write_text("\n".join(["EPSG:27700", *near]))
+    assert len(all_check_points(own, in_feet, tmp_path / "near.txt", None)) == 22
+
+
+def test_a_mark_that_is_listed_twice_is_one_and_two_in_one_photograph_are_refused(
+    scene: Scene, frame: MapFrame, tmp_path: Path
+):
+    line = f"351200 512900 260 20 20 {scene.names[0]} peg"
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", line, line]))
+    [point] = read_check_points(tmp_path / "check.txt", scene, frame)
+    assert point.marks == ((0, (20.0, 20.0)),)
+    assert np.isnan(_intersected(point, scene, frame)).all()
+    (tmp_path / "check.txt").write_text("\n".join(["EPSG:27700", line, line.replace("20 20", "20.6 20.4")]))
+    with pytest.raises(RunError, match=r"line 3 marks peg in .* a second time, at another pixel: expected one mark"):
+        read_check_points(tmp_path / "check.txt", scene, frame)
+
+
 def test_check_points_over_another_zero_are_refused(
     scene: Scene, frame: MapFrame, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

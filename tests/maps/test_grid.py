@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import textured_wall as wall
 import torch
 from pyproj import CRS
@@ -33,7 +34,7 @@ def test_a_tile_s_affine_function_is_that_of_the_projection():
     for tile in own.tiles(480, 16):
         east, north = (x.astype(np.float64) for x in tile.offsets())
         cells = np.array([(x, y, h) for x in east[0, ::100] for y in north[::100, 0] for h in (-5.0, 5.0)])
-        there = np.column_stack([cells, np.ones(len(cells))]) @ tile.affine().T
+        there = np.column_stack([cells, np.ones(len(cells))]) @ tile.affine.T
         middle = np.array([*tile.centre, own.height])
         np.testing.assert_allclose(there, own.frame.to_scene(middle + cells), atol=5e-5)
 
@@ -52,7 +53,7 @@ def test_the_camera_above_a_tile_sees_its_cells_at_the_centres_of_its_pixels():
     height = np.random.default_rng(0).uniform(-3, 3, (tile.side, tile.side)).astype(np.float32)
     camera, _ = camera_above(tile, height)
     east, north = np.broadcast_arrays(*tile.offsets())
-    cells = np.stack([east, north, height, np.ones(height.shape)], axis=-1).reshape(-1, 4) @ tile.affine().T
+    cells = np.stack([east, north, height, np.ones(height.shape)], axis=-1).reshape(-1, 4) @ tile.affine.T
     uv = camera.project(torch.from_numpy(cells).float())[0][0].numpy().reshape(tile.side, tile.side, 2)
     centres = np.arange(tile.side) + 0.5
     off = uv - np.stack(np.meshgrid(centres, centres), axis=-1)
@@ -158,6 +159,13 @@ def test_a_map_that_was_placed_anew_is_another_map():
         grid = Grid(map_frame(own, placed), 351_200.0, 512_900.0, 0.1, 100, 100, 260.0)
         keys.add(Job(own, grid, None, False, {}).key)
     assert len(keys) == 2
+
+
+def test_a_map_of_another_area_or_with_filled_cells_is_another_map():
+    own = wall.scene(wall.cameras(3))
+    grid = Grid(map_frame(own, None), 0.0, 0.0, 0.1, 100, 100, 0.0)
+    areas = None, shapely.box(0, 0, 1, 1), shapely.box(0, 0, 1, 2)
+    assert len({Job(own, grid, area, fill, {}).key for area in areas for fill in (False, True)}) == 6
 
 
 def test_the_start_of_a_tile_is_read_from_coarse_cells_of_any_number():

@@ -18,7 +18,7 @@ from tidefield.data.georeference import Georeference, Residuals
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
-from tidefield.maps import make
+from tidefield.maps import make, terrain
 from tidefield.maps.make import AGREEMENT, CLASSES, CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
 from tidefield.synthetic import Flight, make_survey, write_survey
 
@@ -53,6 +53,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setattr(make, "LARGEST_TILE", 32)
         patch.setattr(make, "SMALLEST_TILE", 32)
+        patch.setattr(make, "CLOUD_ROWS", 8)
+        patch.setattr(terrain, "ROWS", 20)
         yield
 
 
@@ -318,7 +320,8 @@ def test_photographs_leave_no_steps_on_flat_mud(scene: Path, out: Path):
         assert abs(values.mean()) < 1 + 3 * values.std() / np.sqrt(len(values))
 
 
-def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
+@pytest.mark.parametrize("strip_cells", [1_000_000, 1_000])
+def test_tiles_that_differ_meet_without_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strip_cells: int):
     """Even tiles that are 12 grey values and 10 cm apart fade into each other across their margins."""
     from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame, Tile
 
@@ -350,7 +353,10 @@ def test_tiles_that_differ_meet_without_a_step(tmp_path: Path):
             shown=every,
             colour=np.full((*shape, 3), 0.5 + 12 / 255 * odd, np.float32),
         )
+    monkeypatch.setattr(make, "STRIP_CELLS", strip_cells)
     found = list(make.strips(job, tmp_path))
+    rows = np.cumsum([0, *(len(strip.height) for strip in found)]).tolist()
+    assert [strip.row for strip in found] == rows[:-1]
     colour = np.concatenate([strip.colour for strip in found], axis=1)
     height = np.concatenate([strip.height for strip in found])
     assert colour.shape == (3, 130, 150)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from tidefield.maps import contours, masks
+from tidefield.maps import contours, masks, terrain
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.masks import (
@@ -114,10 +114,13 @@ def test_plants_are_green_and_black_is_not():
     np.testing.assert_allclose(green[:, 15:], 100 / 230, atol=1e-3)
 
 
-@pytest.mark.parametrize("most", [4_000_000, 5_000])
-def test_classes_polygons_and_waterline_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int):
+@pytest.mark.parametrize(("most", "rows"), [(4_000_000, 512), (4_000_000, 50), (5_000, 50)])
+def test_classes_polygons_and_waterline_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, rows: int
+):
     pyogrio = pytest.importorskip("pyogrio")
     monkeypatch.setattr(contours, "MOST_CELLS", most)
+    monkeypatch.setattr(terrain, "ROWS", rows)
     height, agreement, wet = flat()
     height[:20, :30] = np.nan
     height[116:118, 136:138] += 0.5  # a post in the water

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +13,18 @@ from pyproj import CRS
 from shapely.geometry import LineString
 
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.maps import rasters
+from tidefield.maps import terrain as terrain_module
 from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
 from tidefield.maps.sections import cut, write_sections
-from tidefield.maps.terrain import hillshade, write_hillshade, write_terrain
+from tidefield.maps.terrain import coarse_ground, hillshade, write_hillshade, write_terrain
 from tidefield.maps.vectors import lost_in_geojson
 
-pytest.importorskip("rasterio")
+rasterio = pytest.importorskip("rasterio")
+pytest.importorskip("rasterio.fill")
 LOCAL = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
 GRID = Grid(LOCAL, 10.0, 90.0, 0.1, 400, 300, 2.0)
 
@@ -102,6 +106,39 @@ def test_the_terrain_of_a_long_coast_is_that_of_its_plane(tmp_path: Path):
     sigma = written(tmp_path / "sigma.tif", np.full(plane.shape, 0.02), coast)
     write_terrain(dsm, sigma, Raster(tmp_path / "dtm.tif", ("terrain",)), coast)
     np.testing.assert_allclose(read_raster(tmp_path / "dtm.tif")[0], plane, atol=0.01)
+
+
+def test_the_terrain_of_a_strip_needs_no_search_over_all_of_the_empty_map_around_it(monkeypatch: pytest.MonkeyPatch):
+    random = np.random.default_rng(0)
+    y, x = np.mgrid[:150, :150]
+    low = (5 + 0.01 * x + 0.3 * np.sin(x / 40)).astype(np.float32)
+    for _ in range(40):  # plants, some at the strip's edges
+        along, across, radius = random.integers(10, 140), random.integers(-20, 20), random.integers(2, 9)
+        low[np.hypot(x - along, y - along - across) < radius] += 0.1 * radius
+    strip = np.abs(x - y) < 20
+    low[~strip] = np.nan
+    distances, fillnodata = [], rasterio.fill.fillnodata
+
+    def filled(*arguments: Any, max_search_distance: float) -> Any:
+        distances.append(max_search_distance)
+        return fillnodata(*arguments, max_search_distance=max_search_distance)
+
+    monkeypatch.setattr(terrain_module, "WIDEST_M", 3.0)
+    monkeypatch.setattr(rasterio.fill, "fillnodata", filled)
+    found = []
+    for searched in (10_000, 30):
+        monkeypatch.setattr(terrain_module, "SEARCHED", searched)
+        height, ground = coarse_ground(low, 0.25)
+        found.append((height[strip], ground))
+    assert distances == [10_000.0, 10_000.0, 30.0, 30.0]
+    assert 0.3 < found[0][1][strip].mean() < 0.7
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    # What has no ground within that distance looks for it farther away.
+    monkeypatch.setattr(terrain_module, "SEARCHED", 4)
+    plant = np.where(np.hypot(x - 75, y - 75) < 10, 6.0, 5.0).astype(np.float32)
+    np.testing.assert_allclose(coarse_ground(plant, 0.25)[0], 5.0, atol=1e-5)
+    assert distances[4:] == [4.0, 4.0, 8.0, 16.0]
 
 
 @pytest.mark.parametrize(("cell", "scale"), [(0.05, 0.001), (0.0002, 1e-5)])
@@ -219,7 +256,8 @@ def test_contours_are_read_again_by_gdal_and_in_longitude_and_latitude(tmp_path:
     wkt = CRS.from_epsg(27700).to_wkt()
     there = MapFrame(frame, np.zeros(3), np.eye(3), wkt, wkt, "unknown")
     line = LineString([(351_200, 512_900), (351_210, 512_905), (351_220, 512_900)])
-    paths = write_contours([(261.5, line)], there, tmp_path)
+    write_contours([(261.5, line)], there, tmp_path)
+    paths = [tmp_path / f"contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")]
     for path, epsg in zip(paths, (27700, 4326, None), strict=True):
         about = pyogrio.read_info(path)
         if epsg is not None:
@@ -233,10 +271,12 @@ def test_contours_are_read_again_by_gdal_and_in_longitude_and_latitude(tmp_path:
     assert shapely.from_wkb(shapes[0]).coords[1] == pytest.approx((351_210, 512_905, 261.5))
 
 
-def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path):
+@pytest.mark.parametrize("block", [512, 64])
+def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int):
     y, x = np.mgrid[: GRID.rows, : GRID.columns] + 0.5
     plane = (0.1 * (GRID.west + x * GRID.cell) - 0.2 * (GRID.north - y * GRID.cell)).astype(np.float32)
     dsm, sigma = written(tmp_path / "dsm.tif", plane), written(tmp_path / "sigma.tif", np.full(plane.shape, 0.5))
+    monkeypatch.setattr(rasters, "BLOCK", block)
     line = LineString([(20.03, 70.01), (30.0, 80.0), (70.0, 80.0)])
     [section] = cut([(line, {"name": "creek, mouth"})], dsm, sigma, GRID)
     known = np.isfinite(section.height)
@@ -244,13 +284,14 @@ def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path):
     np.testing.assert_allclose(section.height[known], truth[known], atol=1e-4)
     assert known[section.place[:, 0] < 49.9].all()
     assert not known[section.place[:, 0] > 50].any()
-    table, plot = write_sections([section], tmp_path, "US survey foot", "m")
+    write_sections([section], tmp_path, "US survey foot", "m")
+    table, plot = tmp_path / "sections.csv", tmp_path / "sections.svg"
     first = table.read_text().splitlines()[1]
     assert first.startswith('"creek, mouth",0.000,20.030,70.010,')
     low, height, high = (float(first.rsplit(",", 4)[k]) for k in (3, 1, 4))
     assert (height - low, high - height) == (pytest.approx(0.98, abs=1e-3), pytest.approx(0.98, abs=1e-3))
     assert plot.read_text().lstrip().startswith("<?xml")
     # Names are texts: no formulas to spreadsheets, no mathematics to the plot.
-    table, plot = write_sections([replace(section, name='=HYPERLINK("a$^$b")')], tmp_path, "m", "m")
+    write_sections([replace(section, name='=HYPERLINK("a$^$b")')], tmp_path, "m", "m")
     assert table.read_text().splitlines()[1].startswith("\"'=HYPERLINK(")
     assert plot.read_text().lstrip().startswith("<?xml")

@@ -127,7 +127,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
     from tidefield.data.georeference import find_georeference
     from tidefield.data.load import at_width
     from tidefield.device import choose_device
-    from tidefield.maps.area import bounds_of, read_shapes
+    from tidefield.maps.area import read_shapes
     from tidefield.maps.check_points import all_check_points
     from tidefield.maps.grid import make_grid, map_frame
     from tidefield.maps.make import Job
@@ -145,7 +145,7 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
             area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
         widest = max(file.lens.width for file in scene.photographs.files)
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
-        grid = make_grid(frame, full, options.gsd, bounds_of(area))
+        grid = make_grid(frame, full, options.gsd, None if area is None else area.bounds)
         lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
         points = all_check_points(full, frame, options.check, georeference)
         job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)

@@ -26,6 +26,7 @@ NEIGHBOURS = 16  # nearest points in the image that a point is compared with
 OUTLIER_SPREADS = 12.0  # a point farther from its neighbours' median than this many spreads is occluded or mismatched
 WIDEST_ANGLE_DEG = 60.0  # a point observed only from directions farther off may be occluded
 PROJECTED_AT_ONCE = 500_000  # points times cameras
+PIXELS_AT_ONCE = 1_000_000  # interpolating takes 50 bytes of each
 
 _Pixels = Float64[np.ndarray, "P 2"]
 _Values = Float64[np.ndarray, " P"]
@@ -228,10 +229,14 @@ def interpolate_on_pixels(
     from scipy.spatial import Delaunay
 
     corners = Delaunay(uv_px).simplices
-    owner = _owners(uv_px[corners], width, height)
     slope, offset = _planes(uv_px[corners], values[corners])
-    u, v = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    return slope[owner, 0] * u + slope[owner, 1] * v + offset[owner]
+    u, rows = np.arange(width) + 0.5, max(1, PIXELS_AT_ONCE // width)
+    result = np.empty((height, width))
+    for first in range(0, height, rows):
+        v = np.arange(first, min(first + rows, height))[:, None] + 0.5
+        owner = _owners(uv_px[corners] - [0, first], width, len(v))
+        result[first : first + rows] = slope[owner, 0] * u + slope[owner, 1] * v + offset[owner]
+    return result
 
 
 def _owners(triangles: Float64[np.ndarray, "T 3 2"], width: int, height: int) -> Int64[np.ndarray, "H W"]:

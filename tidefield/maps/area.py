@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 from tidefield.errors import RunError
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import WGS84, lost_in_conversion
-from tidefield.maps.grid import Grid, MapFrame, Tile
+from tidefield.maps.grid import MapFrame, Tile
 
 LARGEST = 1 << 25
 _log = logging.getLogger(__name__)
@@ -36,7 +36,8 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         kinds: of geometries that are wanted, such as "Polygon".
 
     Raises:
-        RunError: the file is missing, too large, no GeoJSON, or has none of these geometries.
+        RunError: the file is missing, too large, no GeoJSON, has none of these geometries, or coordinates outside
+            of the map's system.
     """
     wanted = " or ".join(kinds)
     with reading_from(path):
@@ -46,11 +47,12 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
     try:
         data = json.loads(text)
         features = data["features"] if data.get("type") == "FeatureCollection" else [data]
-        shapes = [
-            (shapely.geometry.shape(geometry), dict(feature.get("properties") or {}))
-            for feature in features
-            if (geometry := feature.get("geometry", feature)) is not None  # RFC 7946, 3.2: a feature without a place
-        ]
+        with np.errstate(invalid="ignore"):  # what is not finite is refused below
+            shapes = [
+                (shapely.geometry.shape(geometry), dict(feature.get("properties") or {}))
+                for feature in features
+                if (geometry := feature.get("geometry", feature)) is not None  # RFC 7946, 3.2: it has no place
+            ]
         named = (data.get("crs") or {}).get("properties", {}).get("name")
         crs = CRS.from_user_input(named) if named else CRS.from_user_input(WGS84)
     except (
@@ -59,6 +61,7 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         TypeError,
         AttributeError,
         RecursionError,
+        OverflowError,
         CRSError,
         shapely.errors.ShapelyError,
     ) as error:
@@ -74,10 +77,9 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
             return np.column_stack(to_map.transform(*xy.T))
 
         shapes = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
-        if not all(np.isfinite(shape.bounds).all() for shape, _ in shapes):
-            raise RunError(
-                f"{path} has coordinates outside of {frame.name}: expected longitude and latitude of the survey"
-            )
+    if not all(np.isfinite(shapely.get_coordinates(shape)).all() for shape, _ in shapes):
+        expected = "local coordinates" if frame.frame is None else "longitude and latitude"
+        raise RunError(f"{path} has coordinates outside of {frame.name}: expected {expected} of the survey")
     # An outline that crosses itself, as drawn by hand, has an inside all the same.
     shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
     if not shapes:
@@ -111,12 +113,3 @@ def touches(area: BaseGeometry | None, tile: Tile) -> bool:
     half = tile.side * tile.grid.cell / 2
     east, north = tile.centre
     return bool(area.intersects(shapely.box(east - half, north - half, east + half, north + half)))
-
-
-def bounds_of(area: BaseGeometry | None) -> tuple[float, float, float, float] | None:
-    return None if area is None else tuple(area.bounds)  # type: ignore[return-value]
-
-
-def whole(grid: Grid) -> BaseGeometry:
-    """The rectangle of a grid."""
-    return shapely.box(*grid.bounds)

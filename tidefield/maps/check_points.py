@@ -33,8 +33,8 @@ ENOUGH = 30
 _ELLIPSOID = "ellipsoid"
 _SAME_POINT_M = 0.02
 """Two points are not surveyed nearer to each other, and one that is rounded or converted is not farther off."""
-_SAME = 0.001
-"""Metres between positions of one point in two files, at most."""
+_SAME_NAME_M = 1.0
+"""One that has its name, too, is not farther off: some lists count from 1, whatever they are of."""
 _EXPECTED = "expected `x y z name` or `x y z px py image [name]`"
 
 
@@ -43,14 +43,17 @@ class CheckPoint:
     """A surveyed point.
 
     Attributes:
-        name: of the point.
+        name: of the point; a number where its file has none.
         surveyed: its easting, northing and height in the map's system.
-        marks: where photographs show it: index, and pixel of the scene's photograph, without distortion.
+        marks: where photographs show it: index, and pixel of the scene's photograph, without distortion. One for each
+            of the photographs.
+        named: its file has the name.
     """
 
     name: str
     surveyed: Float64[np.ndarray, "3"]
     marks: tuple[tuple[int, tuple[float, float]], ...]
+    named: bool = True
 
 
 @dataclass(frozen=True)
@@ -98,12 +101,14 @@ def all_check_points(
     fitted, names = [], () if georeference is None else georeference.control.names
     control = np.empty((0, 3)) if georeference is None else georeference.control_world
     on_map = frame.to_map(control - frame.origin_world)[:, :2]
+    limit = _SAME_POINT_M * np.array([frame.metre, frame.metre, frame.metre_up])
     for point in [] if given is None else read_check_points(given, scene, frame):
-        same = (np.abs(point.surveyed - other.surveyed).max() < _SAME * frame.metre for other in found)
-        away = np.linalg.norm(on_map - point.surveyed[:2], axis=1)
-        if point.name in names or (away < _SAME_POINT_M * frame.metre).any():
+        away_m = np.linalg.norm(on_map - point.surveyed[:2], axis=1) / frame.metre
+        # Earlier versions wrote names without places.
+        near = not len(away_m) or (away_m < _SAME_NAME_M).any()
+        if (away_m < _SAME_POINT_M).any() or (point.named and point.name in names and near):
             fitted.append(point.name)
-        elif not any(same):
+        elif not any((np.abs(point.surveyed - other.surveyed) < limit).all() for other in found):
             found.append(point)
     if fitted:
         log.warning(f"the scene was fitted to {list_names(fitted)}, which are left out: they check nothing")
@@ -126,7 +131,7 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
         names = PhotographNames(scene.names)
         surveyed: dict[str, tuple[float, ...]] = {}
         unnamed: dict[tuple[float, ...], str] = {}
-        marks: dict[str, list[tuple[int, tuple[float, float]]]] = {}
+        marks: dict[str, dict[int, tuple[float, float]]] = {}
         for where, line in lines:
             cells = line.split()
             numbers = leading_numbers(cells[:3])
@@ -145,9 +150,14 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
                     f"{where} puts the point {point} at {place}, another line at {surveyed[point]}: expected one "
                     "position per point; correct one, or give them different names"
                 )
-            own = marks.setdefault(point, [])
+            own = marks.setdefault(point, {})
             if photograph is not None:
-                own.append((scene.names.index(photograph), (pixel[0], pixel[1])))
+                mark = pixel[0], pixel[1]
+                if own.setdefault(scene.names.index(photograph), mark) != mark:
+                    raise SurveyError(
+                        f"{where} marks {point} in {photograph} a second time, at another pixel: expected one mark of "
+                        "a point per photograph; remove one"
+                    )
         if not surveyed:
             raise SurveyError(f"{path} has no check points: {_EXPECTED} after its first line; add them")
         _require_one_datum(path, crs, frame)
@@ -156,12 +166,12 @@ def read_check_points(path: Path, scene: Scene, frame: MapFrame) -> list[CheckPo
     except (SurveyError, ValueError) as error:
         raise RunError(f"{path} cannot be read as check points: {error}") from error
     there = frame.to_map(world - frame.origin_world)
-    shown = {name: [_undistorted(scene, index, uv) for index, uv in own] for name, own in marks.items()}
-    # Undistorting crops photographs.
-    return [
-        CheckPoint(name, there[i], tuple(mark for mark in shown[name] if all(map(math.isfinite, mark[1]))))
-        for i, name in enumerate(surveyed)
-    ]
+    nameless, points = set(unnamed.values()), []
+    for name, at in zip(surveyed, there, strict=True):
+        shown = [_undistorted(scene, index, uv) for index, uv in marks[name].items()]
+        shown = tuple(mark for mark in shown if all(map(math.isfinite, mark[1])))  # undistorting crops photographs
+        points.append(CheckPoint(name, at, shown, name not in nameless))
+    return points
 
 
 def _require_one_datum(path: Path, crs: str, frame: MapFrame) -> None:

@@ -14,6 +14,7 @@ from shapely.geometry import LineString
 from tidefield.errors import need
 from tidefield.files import write_text
 from tidefield.maps.grid import Grid, MapFrame
+from tidefield.maps.rasters import read_values
 from tidefield.maps.smoothing import smoothed
 from tidefield.maps.vectors import Layer, write_geojson, write_geopackage
 
@@ -96,20 +97,16 @@ def read_reduced(
     # Overviews would not lie on these cells where the raster's size is odd.
     with need("rasterio").open(path, OVERVIEW_LEVEL="NONE") as dataset:
         shape = (coarse.rows, coarse.columns)
-        values = dataset.read(band, window=window, out_shape=shape, resampling=Resampling[resampling])
-        nodata = dataset.nodata
-    # GDAL's mask of larger cells has some more than those of which it knows a value.
-    return np.where(values == nodata, np.nan, values).astype(np.float32), coarse
+        # GDAL's mask of larger cells has some more than those of which it knows a value.
+        return read_values(dataset, band, window=window, out_shape=shape, resampling=Resampling[resampling]), coarse
 
 
-def write_contours(lines: Sequence[tuple[float, LineString]], frame: MapFrame, folder: Path) -> list[Path]:
+def write_contours(lines: Sequence[tuple[float, LineString]], frame: MapFrame, folder: Path) -> None:
     """Write contours.gpkg, contours.geojson (WGS 84; a local frame as it is) and contours.dxf into a folder."""
-    paths = [folder / f"contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")]
     layer = Layer(LAYER, "LineString", [line for _, line in lines], {"height": [height for height, _ in lines]})
-    write_geopackage(paths[0], [layer], frame.horizontal_wkt)
-    write_geojson(paths[1], layer, frame)
-    write_text(paths[2], dxf(lines))
-    return paths
+    write_geopackage(folder / "contours.gpkg", [layer], frame.horizontal_wkt)
+    write_geojson(folder / "contours.geojson", layer, frame)
+    write_text(folder / "contours.dxf", dxf(lines))
 
 
 def dxf(lines: Sequence[tuple[float, LineString]]) -> str:

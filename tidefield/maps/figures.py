@@ -10,6 +10,7 @@ from markupsafe import Markup
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
 INCHES = 7.6
@@ -54,6 +55,9 @@ def map_of(rows: int, columns: int, width: float = INCHES) -> tuple[Figure, Axes
 def png(figure: Figure, what: str) -> Markup:
     """An image element with the picture in it."""
     buffer = io.BytesIO()
+    # The style holds for texts that are made within it.
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # type: ignore[attr-defined]
     with style.context(_STYLE):
         figure.savefig(buffer, format="png", metadata={"Software": None})
     data = base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -378,7 +378,8 @@ class Tile:
         ) * self.grid.cell
 
     @cached_property
-    def _affine(self) -> Float64[np.ndarray, "3 4"]:
+    def affine(self) -> Float64[np.ndarray, "3 4"]:
+        """Matrix from (east, north, height - `Grid.height`, 1), from the middle of the tile, to scene coordinates."""
         east, north = self.centre
         half = self.side * self.grid.cell / 2
         height = self.grid.height
@@ -386,19 +387,14 @@ class Tile:
         points = self.grid.frame.to_scene(np.array([[east, north, height]]) + offsets)
         return np.column_stack([*((points[1:4] - points[4:]) / (2 * half)), points[0]])
 
-    def affine(self) -> Float64[np.ndarray, "3 4"]:
-        """Matrix from (east, north, height - `Grid.height`, 1), from the middle of the tile, to scene coordinates."""
-        return self._affine
-
-    def offsets(self, pad: int = 0, step: int = 1) -> tuple[Float[np.ndarray, "1 n"], Float[np.ndarray, "n 1"]]:
+    def offsets(self, pad: int = 0) -> tuple[Float[np.ndarray, "1 n"], Float[np.ndarray, "n 1"]]:
         """East and north of cell centres from the middle of the tile.
 
         Args:
             pad: cells added on each side.
-            step: cells of a coarser cell.
         """
-        count = (self.side + 2 * pad) // step
-        along = ((np.arange(count) - (count - 1) / 2) * self.grid.cell * step).astype(np.float32)
+        count = self.side + 2 * pad
+        along = ((np.arange(count) - (count - 1) / 2) * self.grid.cell).astype(np.float32)
         return along[None], -along[:, None]
 
     def window(self) -> tuple[slice, slice, slice, slice]:

@@ -23,7 +23,15 @@ from shapely.geometry.base import BaseGeometry
 
 from tidefield.data.scene import Scene
 from tidefield.errors import RunError, need
-from tidefield.files import completed_file, delete_files, delete_partials, read_json, write_json
+from tidefield.files import (
+    completed_file,
+    delete_files,
+    delete_partials,
+    is_partial,
+    read_json,
+    write_json,
+    writing_to,
+)
 from tidefield.machine import cores, release_memory
 from tidefield.maps.area import inside, touches
 from tidefield.maps.check_points import CheckPoint, check, summary
@@ -154,19 +162,32 @@ MakesTiles = Callable[[list[int]], Iterator[int]]
 
 
 def make_missing(job: Job, out: Path, progress: Callable[[int, int], None], makes: MakesTiles) -> None:
-    """Measure and render all tiles that are not on disk yet."""
-    all_tiles = job.tiles()
-    wanted = [number for number, tile in enumerate(all_tiles) if touches(job.area, tile)]
-    missing = [number for number in wanted if not tile_file(out, all_tiles[number]).exists()]
-    done = len(wanted) - len(missing)
+    """Measure and render all tiles that are not on disk yet.
+
+    Raises:
+        RunError: tiles were made, but are not in the folder.
+    """
+    files = {number: tile_file(out, tile) for number, tile in enumerate(job.tiles()) if touches(job.area, tile)}
+    # A folder is listed once: a large map has tens of thousands of tiles.
+    there = set((out / TILES).glob("*"))
+    missing = [number for number, file in files.items() if file not in there]
+    done = len(files) - len(missing)
     if done:
-        log.info(f"{done} of {len(wanted)} tiles are there already")
+        log.info(f"{done} of {len(files)} tiles are there already")
     if not missing:
         return
-    delete_partials(*(tile_file(out, all_tiles[number]) for number in missing))
+    with writing_to(out / TILES):
+        for file in filter(is_partial, there):
+            file.unlink(missing_ok=True)
     for _ in makes(missing):
         done += 1
-        progress(done, len(wanted))
+        progress(done, len(files))
+    # In the joined map they would be holes, like what lies outside of the area.
+    if lost := len({files[number] for number in missing}.difference((out / TILES).glob("*"))):
+        raise RunError(
+            f"{lost} of the {len(missing)} tiles that were made are not in {out / TILES}: expected a folder that all "
+            "machines share under this name; choose one, or share it, and repeat the command"
+        )
 
 
 class TileMaker:
@@ -464,14 +485,16 @@ def make_tiles(job: Job, out: Path, overwrite: bool, bar: Callable[[str], Any], 
         makes: the tiles.
 
     Raises:
-        RunError: the folder holds something else, or cannot be written to.
+        RunError: the folder holds something else, cannot be written to, or lacks tiles that were made.
     """
     begin(out, job.key, overwrite)
     started, record = time.monotonic(), read_json(out / MAP_FILE) or {}
-    with bar("Mapping") as meter:
-        make_missing(job, out, meter, makes)
-    seconds = record.get("seconds", 0.0) + time.monotonic() - started
-    write_json(out / MAP_FILE, {**record, "seconds": seconds})
+    try:
+        with bar("Mapping") as meter:
+            make_missing(job, out, meter, makes)
+    finally:
+        seconds = record.get("seconds", 0.0) + time.monotonic() - started
+        write_json(out / MAP_FILE, {**record, "seconds": seconds})
 
 
 def finish_map(job: Job, out: Path, record: dict[str, Any], bar: Callable[[str], Any]) -> dict[str, Any]:
@@ -533,17 +556,16 @@ def begin(out: Path, key: str, overwrite: bool) -> None:
     there = read_json(out / MAP_FILE) if out.is_dir() else None
     if there is None and out.is_dir() and any(path.name != ".lock" for path in out.iterdir()):
         raise RunError(f"{out} holds something else: expected a new folder, or one of `tidefield map`; choose another")
-    if there is not None and not overwrite:
+    other = there is None or there.get("key") != key or bool(there.get("complete"))
+    if there is not None and other and not overwrite:
         if there.get("key") != key:
             raise RunError(
                 f"{out} holds a map of another scene or with other options: expected a new folder; choose one, or pass "
                 "--overwrite"
             )
-        if there.get("complete"):
-            raise RunError(f"{out} holds this map already: expected a new folder; choose one, or pass --overwrite")
-    if there is not None and overwrite and (there.get("key") != key or there.get("complete")):
+        raise RunError(f"{out} holds this map already: expected a new folder; choose one, or pass --overwrite")
+    if other:
         delete_tiles(out)
-    if there is None or overwrite:
         write_json(out / MAP_FILE, {"key": key, "complete": False})
     delete_partials(*(out / name for name in (*PRODUCTS, MAP_FILE)))
     # What an earlier map has and this one lacks, such as FILLED, would be taken for this one's.

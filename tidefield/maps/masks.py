@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
@@ -347,8 +348,8 @@ def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
     """
     labels, bodies, coarse = water
     values, reduced = read_reduced(classes, grid, resampling="mode")
-    plants = _outlines(values == VEGETATION, reduced)
-    wet = [(shape, body) for k, body in enumerate(bodies) for shape in _outlines(labels == k + 1, coarse)]
+    plants = [shape for shape, _ in _outlines(values == VEGETATION, reduced)]
+    wet = [(shape, bodies[number - 1]) for shape, number in _outlines(labels, coarse)]
     fields = {
         "height": [body.level for _, body in wet],
         "sigma": [body.sigma for _, body in wet],
@@ -364,14 +365,14 @@ def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
         write_geojson(folder / f"{layer.name}.geojson", layer, grid.frame)
 
 
-def _outlines(mask: Bool[np.ndarray, "h w"], grid: Grid) -> list[BaseGeometry]:
-    """Polygons of a mask, in map coordinates."""
+def _outlines(numbers: Shaped[np.ndarray, "h w"], grid: Grid) -> list[tuple[BaseGeometry, int]]:
+    """Polygons of the cells of each number above 0, or of a mask, in map coordinates, by number."""
     from rasterio.transform import Affine
 
     features = need("rasterio.features")
-    found = features.shapes(mask.astype(np.uint8), mask=mask, transform=Affine(*grid.transform))
-    shapes = [shapely.geometry.shape(shape).simplify(SIMPLIFIED_CELLS * grid.cell) for shape, _ in found]
-    return [shape for shape in shapes if shape.area >= SMALLEST_CELLS * grid.cell**2]
+    found = features.shapes(numbers.astype(np.int32), mask=numbers > 0, transform=Affine(*grid.transform))
+    shapes = [(shapely.geometry.shape(shape).simplify(SIMPLIFIED_CELLS * grid.cell), int(of)) for shape, of in found]
+    return sorted((one for one in shapes if one[0].area >= SMALLEST_CELLS * grid.cell**2), key=itemgetter(1))
 
 
 def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], unknown: Bool[np.ndarray, "h w"], grid: Grid) -> Layer:
@@ -384,7 +385,7 @@ def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], unknown: Bool[np.ndarra
     ends = np.pad(unknown, 1, constant_values=True)
     ends = cv2.dilate(ends.astype(np.uint8), np.ones((2 * END_CELLS + 1, 2 * END_CELLS + 1), np.uint8)) > 0
     around = replace(grid, west=grid.west - grid.cell, north=grid.north + grid.cell)
-    beyond = shapely.union_all(_outlines(ends, around))
+    beyond = shapely.union_all([shape for shape, _ in _outlines(ends, around)])
     lines, bodies = [], []
     for shape, body in wet:
         cut = shape.boundary.difference(beyond)

@@ -37,7 +37,7 @@ def camera_above(tile: Tile, height: Float32[np.ndarray, "H W"]) -> tuple[Camera
     Returns:
         The camera, and its height above `Grid.height` in scene units.
     """
-    affine = tile.affine()
+    affine = tile.affine
     east, north, up = (affine[:, k] / np.linalg.norm(affine[:, k]) for k in range(3))
     units = float(np.linalg.norm(affine[:, :2], axis=0).mean())  # scene units per map unit
     units_up = float(np.linalg.norm(affine[:, 2]))
@@ -71,7 +71,7 @@ def prior_of(
         tile: of the cells.
         above: height of the camera above `Grid.height`, scene units.
     """
-    units_up = float(np.linalg.norm(tile.affine()[:, 2]))
+    units_up = float(np.linalg.norm(tile.affine[:, 2]))
     cell = tile.grid.cell_up
     reach = np.minimum(MARGIN_SIGMAS * sigma, 100 * cell) + MARGIN_CELLS * cell
     around = np.ones((3 * STRIDE, 3 * STRIDE), np.uint8)

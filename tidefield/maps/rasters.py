@@ -132,6 +132,18 @@ def cog_writer(
             rough.unlink(missing_ok=True)
 
 
+def read_values(dataset: Any, band: int | None = None, **how: Any) -> np.ndarray:
+    """Read a band of an open raster, or all of them, as floats, NaN where it has no data.
+
+    Args:
+        how: rasterio's options, such as the window.
+    """
+    values = dataset.read(band, **how).astype(np.float32, copy=False)
+    if dataset.nodata is not None:
+        values[values == np.float32(dataset.nodata)] = np.nan
+    return values
+
+
 def read_raster(path: Path, band: int = 1) -> tuple[np.ndarray, Any]:
     """Read a band of a raster as floats, NaN where it has no data, and its profile.
 
@@ -141,10 +153,7 @@ def read_raster(path: Path, band: int = 1) -> tuple[np.ndarray, Any]:
     rasterio = need("rasterio")
     try:
         with rasterio.open(path) as dataset:
-            values = dataset.read(band).astype(np.float32)
-            if dataset.nodata is not None:
-                values[values == dataset.nodata] = np.nan
-            return values, dict(dataset.profile)
+            return read_values(dataset, band), dict(dataset.profile)
     except rasterio.errors.RasterioError as error:
         raise RunError(f"{path} is no raster ({error}): expected a GeoTIFF") from error
 
@@ -172,9 +181,8 @@ def sample(paths: Sequence[Path], place: Float64[np.ndarray, "N 2"], grid: Grid)
                 if key not in block:  # the block with the next one's first row and column
                     first, west = key[0] * BLOCK, key[1] * BLOCK
                     last, east = min(first + BLOCK + 1, grid.rows), min(west + BLOCK + 1, grid.columns)
-                    values = dataset.read(1, window=((first, last), (west, east))).astype(np.float64)
-                    values[values == dataset.nodata] = np.nan
-                    block = {key: values}
+                    values = read_values(dataset, 1, window=((first, last), (west, east)))
+                    block = {key: values.astype(np.float64)}
                 row, column = row % BLOCK, column % BLOCK
                 four = block[key][row : row + 2, column : column + 2]
                 result[i, k] = np.array([1 - b[i], b[i]]) @ four @ np.array([1 - a[i], a[i]])

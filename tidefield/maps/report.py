@@ -15,6 +15,7 @@ from tidefield.errors import need
 from tidefield.files import write_text
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.figures import INCHES, Extent, map_of, png
+from tidefield.maps.rasters import read_values
 from tidefield.pages import command_line, template_environment
 
 WIDEST = 900
@@ -73,11 +74,8 @@ def _read(path: Path) -> tuple[Float32[np.ndarray, "bands rows columns"], Extent
     with need("rasterio").open(path) as dataset:
         factor = max(1.0, max(dataset.width, dataset.height) / WIDEST)
         shape = (dataset.count, max(1, round(dataset.height / factor)), max(1, round(dataset.width / factor)))
-        values = dataset.read(out_shape=shape).astype(np.float32)
-        if dataset.nodata is not None:
-            values[values == np.float32(dataset.nodata)] = np.nan
         west, south, east, north = dataset.bounds
-        return values, (west, east, south, north)
+        return read_values(dataset, out_shape=shape), (west, east, south, north)
 
 
 def _orthophoto(values: np.ndarray, extent: Extent) -> Markup:

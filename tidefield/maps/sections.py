@@ -59,7 +59,7 @@ def cut(lines: Sequence[tuple[BaseGeometry, dict[str, Any]]], dsm: Path, sigma: 
     return result
 
 
-def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up: str) -> list[Path]:
+def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up: str) -> None:
     """Write sections.csv and sections.svg into a folder, with the units of distances and of heights."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -72,7 +72,6 @@ def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up
     plot = draw(sections, unit, unit_up)
     with completed_file(folder / "sections.svg", overwrite=True) as partial:
         plot.savefig(partial, format="svg", metadata={"Date": None})
-    return [folder / "sections.csv", folder / "sections.svg"]
 
 
 def draw(sections: Sequence[Section], unit: str, unit_up: str) -> Any:

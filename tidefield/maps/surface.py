@@ -158,7 +158,8 @@ def sparse_surface(scene: Scene, grid: Grid) -> Start:
     heights = np.concatenate([xyz[:, 2], np.median(xyz[near, 2], axis=1)])
     # Rounded positions may coincide, which Delaunay's triangles leave out.
     height = interpolate_on_pixels(np.concatenate([uv, frame]), heights - grid.height, grid.columns, grid.rows)
-    return Start(grid, (height + grid.height).astype(np.float32))
+    height += grid.height
+    return Start(grid, height.astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from tidefield.errors import need
-from tidefield.maps.rasters import NODATA, Raster, raster_writer
+from tidefield.maps.rasters import NODATA, Raster, raster_writer, read_values
 
 COARSE_M = 0.25
 """Coarse cells are about as large, or as the map's own, in metres."""
@@ -36,6 +36,9 @@ RIM_M = 0.15
 """So far around what is taken off, or one cell, higher fine cells are no ground either: matching widens rims."""
 MOST_RIM = 100
 """Cells: in a local frame a unit may be a hundred metres."""
+SEARCHED = 400
+"""Coarse cells, in each direction, in which what lies around a gap is looked for; without a limit terrain takes hours
+where most of a map is empty. More than twice the largest radius of an opening: no cell of the map sees beyond."""
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
 ROWS = 512
 """Of a raster that are read at once."""
@@ -54,9 +57,7 @@ def blocks(path: Path, around: int = 0, band: int = 1) -> Iterator[tuple[int, in
         for row in range(0, dataset.height, ROWS):
             count = min(ROWS, dataset.height - row)
             first, last = max(0, row - around), min(dataset.height, row + count + around)
-            values = dataset.read(band, window=((first, last), (0, dataset.width))).astype(np.float32)
-            if dataset.nodata is not None:
-                values[values == np.float32(dataset.nodata)] = np.nan
+            values = read_values(dataset, band, window=((first, last), (0, dataset.width)))
             pad = (around - (row - first), around - (last - row - count))
             yield row, count, np.pad(values, (pad, (0, 0)), mode="edge")
 
@@ -71,13 +72,10 @@ def coarse_ground(
         cell_m: side of a cell, metres.
         scale: vertical units per metre.
     """
-    from rasterio.fill import fillnodata
-
     known = np.isfinite(low)
     if not known.any():
         return low, known
-    far = float(max(low.shape))
-    surface = fillnodata(np.nan_to_num(low), known.astype(np.uint8), max_search_distance=far)
+    surface = _filled(low, known, known)
     last = surface
     other = np.zeros(low.shape, bool)
     for radius in range(1, max(1, round(WIDEST_M / cell_m)) + 1):
@@ -88,9 +86,24 @@ def coarse_ground(
     ground = known & ~other
     if not ground.any():
         return surface, known
-    filled = fillnodata(np.where(ground, surface, 0), ground.astype(np.uint8), max_search_distance=far)
-    smooth = cv2.GaussianBlur(filled, (0, 0), 1.0)
+    # The blur reaches 4 cells beyond the map's, and what is interpolated between cells 1.
+    around = cv2.dilate(known.astype(np.uint8), np.ones((11, 11), np.uint8)) > 0
+    smooth = cv2.GaussianBlur(_filled(surface, ground, around), (0, 0), 1.0)
     return np.where(ground, surface, smooth).astype(np.float32), ground
+
+
+def _filled(
+    values: Float32[np.ndarray, "h w"], given: Bool[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Interpolate between cells whose values are given, at least where they are wanted; 0 far from all elsewhere."""
+    from rasterio.fill import fillnodata
+
+    searched = float(SEARCHED)
+    while True:
+        filled = fillnodata(np.where(given, values, np.nan), given.astype(np.uint8), max_search_distance=searched)
+        if np.isfinite(filled[wanted]).all():
+            return np.nan_to_num(filled)
+        searched *= 2
 
 
 def write_terrain(dsm: Path, sigma: Path, out: Raster, grid: Any) -> None:

@@ -48,7 +48,7 @@ class GreyPhotographs:
 
 def positions_from(tile: Tile, cameras: Cameras) -> Float64[np.ndarray, "V 3"]:
     """East, north (horizontal units) and height above `Grid.height` of cameras, from the middle of a tile."""
-    affine = tile.affine()
+    affine = tile.affine
     away = cameras.T_world_camera[:, :, 3].double().numpy() - affine[:, 3]
     return away @ np.linalg.inv(affine[:, :3]).T
 
@@ -76,7 +76,7 @@ class View:
     """
 
     def __init__(self, camera: Cameras, tile: Tile, used: Bool[np.ndarray, "h w"] | None = None) -> None:
-        affine = tile.affine()
+        affine = tile.affine
         # Exact positions in double precision: single precision would cost a hundredth of a pixel.
         pose = camera.T_world_camera[0].double().numpy()
         rotation = pose[:, :3].T
