@@ -121,6 +121,35 @@ def test_a_gaussian_lands_on_its_pixel_of_a_held_out_photograph_at_its_exposure(
         torch.testing.assert_close(view.colour[0, 0], grey, atol=2e-3, rtol=0)
 
 
+def test_the_principal_point_is_shifted_as_in_training_at_any_size(
+    scene: Scene, program: Path, run: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shown, show = [], opensplat.render_splats
+    monkeypatch.setattr(
+        opensplat, "render_splats", lambda splats, camera, *more: shown.append(camera) or show(splats, camera, *more)
+    )
+    scene.cameras.principal_px[3:] += torch.tensor([3.7, -2.2])  # another lens
+    curve = make_curve(scene)
+    opensplat.train(program, scene, run, Budget(minutes=0.3 / 60), CPU, curve, ignore)
+    shown[2:] = []
+    render = opensplat.renderer(run, CPU)
+    for index in TEST:
+        for width, height in ((48, 36), (12, 9), (96, 72)):
+            render(scene.cameras[index].resized(width, height))
+    middles = [[27.5, 16.0], [31.0, 13.5]]
+    expected = [np.multiply(middle, 1 / 4) for middle in middles]
+    expected += [np.multiply(middle, scale) for middle in middles for scale in (1, 1 / 4, 2)]
+    np.testing.assert_allclose([camera.principal_px[0].tolist() for camera in shown], expected, atol=1e-4)
+    job = json.loads((run / "opensplat" / "job.json").read_text())
+    assert len(job["shifts"]) == 2, "one of each lens"
+    (run / "opensplat" / "job.json").write_text(json.dumps({**job, "shifts": [[0.5, 0.5, 1e99, 0.0]]}))
+    with pytest.raises(RunError, match=r"job\.json: shifts.*expected -1 to 1"):
+        opensplat.renderer(run, CPU)
+    (run / "opensplat" / "job.json").write_text(json.dumps({key: job[key] for key in ("factor", "trained")}))
+    opensplat.renderer(run, CPU)(scene.cameras[0])
+    assert shown[-1].principal_px.tolist() == [middles[0]], "of an older version"
+
+
 def test_steps_are_made_and_nothing_is_saved_on_the_way(scene: Scene, program: Path, run: Path):
     steps = []
     done = opensplat.train(program, scene, run, Budget(steps=12), CPU, None, lambda step, _: steps.append(step))

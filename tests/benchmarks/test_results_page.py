@@ -46,7 +46,7 @@ def keep_result(
     step = {"command": f"tidefield evaluate RUN {method}", "seconds": 1.0, "peak_memory_bytes": peak}
     process = {
         "settings": {"minutes": minutes, "steps": steps, "width": 400, "device": device, "from_scratch": from_scratch},
-        "evaluate": step | this_machine.describe(),
+        "evaluate": step | this_machine.describe() | {"commit": None},
     }
     if method not in (*names("untrained"), *names("zero-shot")):
         evaluation["configuration"] = {"trained": {"steps": 1234, "seconds": 600.0}}
@@ -122,7 +122,7 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
         "| the same view repeatedly, of a survey of 200 photographs | 8.40 |",
         "| swindale ² | **27.00** | 23.00 | 24.00 | 22.00 | 20.00 | 25.00 |",
         "| another | 31.50 | - | - | - | - | - |",
-        "| caliterra, tidefield | 10.0 | 1,234 | 2.00 | 50,000 | 2.00, 2.00 |",
+        "| caliterra, tidefield | 10.0 | 1,234 | 2.00 | 50,000 | 2.00 | 2.00 |",
         "    tidefield evaluate RUN tidefield",
         "No lpips_alex: no weights.",
         "| no-ray-transformer | 1 | -1.00 | -1.00 | -0.0250 | +0.0000 | 1.00 | 1.00 |",
@@ -218,6 +218,21 @@ def test_machines_differ_by_cores_and_gpus_and_changed_sources_keep_their_mark(t
         "P, 16 cores, H200 for training and P, 16 cores, H100 for evaluation (tidefield of lego)",
         "P, 16 cores, H200 for training and P, 2 cores, H200 for evaluation (tidefield of swindale).",
     ]
+
+
+def test_commits_are_those_of_training_and_of_evaluation(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    for scene in ("fern", "lego", "swindale"):
+        keep_result(file, scene, "tidefield", 24.0)
+    record = read_json(file) or {}
+    for result, trained in zip(record["results"], ("1234567890", "abcdefabcd", None), strict=True):
+        result["evaluation"]["commit"], result["process"]["train"]["commit"] = "1234567890", trained
+    write_json(file, record)
+    (commits,) = code_and_machines(read_figures([file], table.SCENES, names()))
+    assert commits == (
+        "Measured at different commits, whose code and settings differ: 1234567 (tidefield of fern, swindale); "
+        "abcdefa for training and 1234567 for evaluation (tidefield of lego)."
+    )
 
 
 def test_a_page_of_a_gpu_says_what_ran_on_the_processor(tmp_path: Path) -> None:

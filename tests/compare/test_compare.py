@@ -24,7 +24,7 @@ from tidefield.commands.ablate import Ablate, ablate
 from tidefield.commands.compare import Compare, _scenes, _with_failures, make_settings
 from tidefield.commands.compare import compare as compare_command
 from tidefield.commands.train import Train, train
-from tidefield.compare.figures import most_different, side_by_side
+from tidefield.compare.figures import most_different, side_by_side, write_curves
 from tidefield.compare.results import Result, Results, figures_of, read_figures, read_results
 from tidefield.compare.run import (
     MIPNERF360,
@@ -282,7 +282,7 @@ def test_tables_figures_and_numbers_are_written(disk: Path, tmp_path: Path):
     assert "LPIPS with alexnet-owt-7be5be79.pth, the published file (SHA-256 7be5be79" in page
     assert "LPIPS with vgg16-397923af.pth, which is another file than the published one (SHA-256 ffff" in page
     assert "LPIPS, AlexNet, all pixels (" not in page, "of what nobody has there is no table"
-    assert "| flats, tidefield | 10.0 | 7 | 0.50 | 1,234 | 3.00, 3.00 |" in page
+    assert "| flats, tidefield | 10.0 | 7 | 0.50 | 1,234 | 3.00 | 3.00 |" in page
     numbers = json.loads((out / "comparison.json").read_text())
     assert numbers["settings"]["minutes"] == 10
     assert numbers["results"][0]["curve"] == [[10.0, 20.5], [600.0, 25.0]]
@@ -553,6 +553,32 @@ def test_a_table_in_every_form():
     assert r"a\_b & \textbf{1\%} \\" in table.latex()
     assert r"\caption{A \& B}" in table.latex()
     assert list(csv.reader(table.csv().splitlines())) == [["scene", "x_1"], ["a_b", "1%"], ["c, d", ""]]
+
+
+def test_figures_of_a_csv_are_numbers():
+    found = evaluation(wall.scene(wall.cameras(3), test=(1,)), 20.0) | {"rays_per_second": 1234567.0}
+    peaks = {"train": {"peak_memory_bytes": 1_200_000_000}, "evaluate": {"peak_memory_bytes": 800_000_000}}
+    table = cost_table(Results(("2,000 m",), ("nerf",), {("2,000 m", "nerf"): Result(found, peaks)}))
+    assert "1,234,567" in table.markdown()
+    head, (name, *cells) = csv.reader(table.csv().splitlines())
+    assert name == "2,000 m, nerf"
+    assert dict(zip(head[-3:], map(float, cells[-3:]), strict=True)) == {
+        "rays/s": 1234567,
+        "memory, GB (train)": 1.2,
+        "memory, GB (evaluate)": 0.8,
+    }
+
+
+def test_the_legend_of_curves_has_the_methods_of_all_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, *_, **__: drawn.append(figure))
+    by = {
+        pair: Result({}, curve=[(10.0, 20.5), (600.0, 25.0)]) for pair in (("a", "nerf"), ("b", "nerf"), ("b", "paper"))
+    }
+    write_curves(Results(("a", "b"), ("paper", "nerfacto", "nerf"), by), tmp_path / "curves.png")
+    (legend,) = drawn[0].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["paper", "nerf"]
+    assert [line.get_color() for line in legend.get_lines()] == ["C0", "C2"]
 
 
 def test_crops_show_where_methods_differ_and_do_not_overlap():

@@ -1,5 +1,6 @@
 """Exposure gains: planted gains are recovered, and held-out pixels have no influence."""
 
+import logging
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -358,6 +359,51 @@ def test_a_factor_that_one_photograph_lacks_is_left_out_for_all(tmp_path: Path):
     assert found.log_exposure == pytest.approx([-math.log(100 * 16), -math.log(400 * 4)])
     assert math.isnan(found.time_s[0])
     assert found.time_s[1] == 1714979289.0
+
+
+def test_photographs_without_exif_take_no_exposure_or_time_from_the_others(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    from PIL import Image
+
+    picture, paths = Image.new("RGB", (8, 8)), [tmp_path / f"{name}.jpg" for name in "abc"]
+    for path, seconds, more in zip(paths[::2], (100, 400), ({"FNumber": 4.0}, {}), strict=True):
+        taken = {"ExposureTime": 1 / seconds, "DateTimeOriginal": f"2024:05:06 07:08:{seconds // 10}"}
+        picture.save(path, exif=exif_of(**taken, **more))
+    picture.save(paths[1])
+    with caplog.at_level(logging.INFO):
+        found = read_exposures(paths[::2])
+        assert not caplog.records
+        found = read_exposures(paths)
+    assert found.log_exposure == pytest.approx([-math.log(100), math.nan, -math.log(400)], nan_ok=True)
+    assert np.diff(found.time_s[::2]) == [30.0]
+    assert math.isnan(found.time_s[1])
+    assert [record.message.partition(":")[0] for record in caplog.records] == [
+        "the EXIF of 1 of 3 photographs has no exposure or no time"
+    ]
+
+
+def test_a_photograph_without_exif_counts_as_those_before_and_after_it():
+    log_exposure, time_s = np.arange(5.0), 1e9 + 2 * np.arange(5.0)
+    whole = exposure.exposure_and_clock(Exposures(log_exposure, time_s), 5)
+    without = Exposures(*(np.where(np.arange(5) == 2, math.nan, values) for values in (log_exposure, time_s)))
+    np.testing.assert_allclose(exposure.exposure_and_clock(without, 5), whole, atol=1e-9)
+    most = Exposures(log_exposure, np.where(np.arange(5) > 1, math.nan, time_s))
+    np.testing.assert_allclose(exposure.exposure_and_clock(most, 5)[1], np.arange(5))
+
+
+@pytest.mark.parametrize("lacking", [3, TEST[1]])
+def test_exif_exposures_are_used_where_one_photograph_has_none(lacking: int):
+    log_exposure = torch.zeros(COUNT, dtype=torch.float64)
+    log_exposure[[*range(5, 10), TEST[-1]]] = 0.6
+    truth = torch.exp(0.5 * log_exposure)[:, None].float().expand(COUNT, 3)
+    photographs, cameras, points = survey(truth)
+    log_exposure[lacking] = math.nan
+    metadata = Exposures(log_exposure.numpy(), np.full(COUNT, math.nan))
+    error = (gains(photographs, cameras, points, TRAIN, metadata) / relative(truth)).log().abs()
+    without = (gains(photographs, cameras, points, TRAIN) / relative(truth)).log().abs()
+    assert error.max() < 0.02
+    assert without[list(TEST)].max() > 0.1
 
 
 def test_exif_of_a_png_is_read_without_decoding_it_and_damaged_exif_counts_as_absent(tmp_path: Path):

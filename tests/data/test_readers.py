@@ -1,5 +1,6 @@
 import json
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,7 @@ def test_a_file_that_states_no_size_counts_as_empty() -> None:
         ("cameras.txt", "OPENCV 64 48 50", "OPENCV 64 48 nan"),
         ("images.txt", "strip_0", ""),
         ("points3D.txt", "\n1 ", "\none "),
+        ("points3D.txt", "\n1 ", f"\n{1 << 63} "),
     ],
 )
 def test_garbled_text_models_are_refused(tmp_path: Path, file: str, old: str, new: str) -> None:
@@ -105,6 +107,18 @@ def test_garbled_text_models_are_refused(tmp_path: Path, file: str, old: str, ne
     (folder / file).write_text(text.replace(old, new))
     with pytest.raises(SceneError):
         read_colmap(tmp_path, folder, False)
+
+
+def test_many_points_take_little_memory(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, survey(BARREL))
+    layout = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+    points = np.zeros(50_000, np.dtype(layout))
+    (folder / "points3D.bin").write_bytes(np.uint64(len(points)).tobytes() + points.tobytes())
+    tracemalloc.start()
+    read_colmap(tmp_path, folder, False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * points.nbytes, "the file, and an array"
 
 
 def test_a_model_without_its_images_file_is_refused(tmp_path: Path) -> None:

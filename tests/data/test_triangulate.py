@@ -95,8 +95,9 @@ def test_points_of_a_cache_that_others_can_write_to_are_not_used(
 
 def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     disk.write_transforms(tmp_path / "scene", disk.survey(disk.PINHOLE))
-    assert load_scene(tmp_path / "scene", cache=tmp_path).points is None
-    assert "views may be blurred or torn" in caplog.text
+    for count in (1, 2):  # the second time from the cache
+        assert load_scene(tmp_path / "scene", cache=tmp_path).points is None
+        assert caplog.text.count("views may be blurred or torn") == count
 
 
 @pytest.mark.parametrize("used", [(), (4,)])

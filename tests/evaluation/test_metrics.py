@@ -1,8 +1,10 @@
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tidefield.evaluation.lpips import BACKBONES
 from tidefield.evaluation.metrics import (
@@ -116,6 +118,45 @@ def test_the_colour_fit_of_one_flat_colour_is_the_mean_of_the_truth():
     flat = torch.full_like(truth, 77)
     expected = truth.double().mean((0, 1)).round().to(torch.uint8).expand_as(truth)
     assert torch.equal(fit_colours(flat, truth, full(truth)), expected)
+
+
+@pytest.mark.parametrize("kind", ["colours", "nearly grey", "grey", "two colours"])
+def test_the_colour_fit_is_the_least_squares_of_least_norm(kind: str):
+    image, truth = noise(150, 90, seed=1), noise(150, 90, seed=2)
+    grey = image[..., :1].expand_as(image).clone()
+    if kind == "nearly grey":
+        grey[40, 50] = grey[40, 50] ^ torch.tensor([0, 1, 0], dtype=torch.uint8)
+    image = {"colours": image, "two colours": image[..., [0, 1, 1]] // 128 * 100 + 20}.get(kind, grey)
+    truth, mask = (image // 3 + truth // 2).to(torch.uint8), truth[..., 0] > 60
+    design = torch.nn.functional.pad(image.double(), (0, 1), value=1.0)
+    fit = np.linalg.lstsq(design[mask].numpy(), truth[mask].double().numpy(), rcond=None)[0]
+    expected = (design.numpy() @ fit).clip(0, 255)
+    found = fit_colours(image, truth, mask).double().numpy()
+    assert np.abs(found - expected).max() < 0.5 + 1e-6
+
+
+class Largest(TorchDispatchMode):
+    """Measures the largest tensor, in bytes."""
+
+    bytes = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        self.bytes = max(self.bytes, out.nbytes if isinstance(out, torch.Tensor) else 0)
+        return out
+
+
+def test_large_photographs_take_little_memory():
+    image, truth = noise(1000, 200, seed=1), noise(1000, 200, seed=2)
+    pixels = 1000 * 200
+    with Largest() as largest:
+        fit_colours(image, truth, left_half(image))
+    assert largest.bytes < 4 * pixels
+    tracemalloc.start()
+    ssim_map(image, truth)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 * pixels
 
 
 def test_a_full_mask_changes_no_metric():

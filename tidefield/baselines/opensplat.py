@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -38,7 +38,7 @@ from PIL import Image
 from tidefield.baselines.export import at_common_exposure, exposure_factor, point_colours
 from tidefield.baselines.job_file import JOB_FILE, failure, read_job
 from tidefield.baselines.splats import Splats, read_splats, render_splats
-from tidefield.config import Budget
+from tidefield.config import Budget, Range, from_json
 from tidefield.data.readers.transforms import write_transforms_file
 from tidefield.data.scene import Scene
 from tidefield.device import environment_of
@@ -65,6 +65,7 @@ VERSION_SECONDS, END_SECONDS = 60, 30
 """Time limits: for printing its version, and for ending after SIGTERM."""
 LEAST_POINTS = 4
 """OpenSplat's first Gaussians are as large as the distances to their three nearest neighbours."""
+_SHIFTS = tuple[tuple[(Annotated[float, Range(-1, 1)],) * 4], ...]
 
 
 def find(given: Path | None) -> Path:
@@ -160,6 +161,7 @@ def train(
     job: dict[str, Any] = {"factor": None}
     write_json(out / JOB_FILE, job)
     factor = export(scene, out / "data")
+    shifts = half_pixel_shifts(scene.cameras[list(scene.train)])
     seconds = None if budget.minutes is None else 60 * budget.minutes
     steps = budget.steps or STEPS
     every = SAVE_EVERY_CPU if device.type == "cpu" else SAVE_EVERY_GPU
@@ -200,13 +202,14 @@ def train(
     if curve is not None and seconds is not None:
         for save in saves:
             splats = read_splats(save.file)
-            curve.add(save.seconds, [_render(splats, camera, factor, device) for camera in curve.cameras])
+            curve.add(save.seconds, [_render(splats, camera, factor, shifts, device) for camera in curve.cameras])
             curve.write(folder)
     else:
         read_splats(last.file)  # damaged ones are reported now
     last.file.replace(out / SPLATS_FILE)
     delete_files(folder, out.glob("splat_*.ply"))
-    write_json(out / JOB_FILE, {"factor": factor.tolist(), "trained": [last.step, last.seconds]})
+    trained = [last.step, last.seconds]
+    write_json(out / JOB_FILE, {"factor": factor.tolist(), "shifts": shifts.tolist(), "trained": trained})
     progress(last.step, last.seconds)
     return progress_of(folder)
 
@@ -282,23 +285,43 @@ def renderer(folder: Path, device: torch.device) -> Render:
         RunError: it has not been trained to its end.
         SceneError: its splats are damaged.
     """
-    factor = torch.tensor(read_job(folder / FOLDER / JOB_FILE, "splats")["factor"])
+    path = folder / FOLDER / JOB_FILE
+    job = read_job(path, "splats")
+    factor, shifts = torch.tensor(job["factor"]), job.get("shifts")
+    shifts = torch.tensor(from_json(_SHIFTS, shifts, f"{path}: shifts")) if shifts else None  # none of version 0.1
     splats = read_splats(folder / FOLDER / SPLATS_FILE)
-    return lambda camera: _render(splats, camera, factor, device)
+    return lambda camera: _render(splats, camera, factor, shifts, device)
 
 
-def _render(splats: Splats, camera: Cameras, factor: Float[torch.Tensor, "3"], device: torch.device) -> Rendering:
-    """Render a view at the camera's own gain."""
-    view = render_splats(splats, with_half_pixels(camera), BACKGROUND_RGB, device)
+def _render(
+    splats: Splats,
+    camera: Cameras,
+    factor: Float[torch.Tensor, "3"],
+    shifts: Float[torch.Tensor, "L 4"] | None,
+    device: torch.device,
+) -> Rendering:
+    """Render a view at the camera's own gain, its principal point shifted as those of the most similar lens were."""
+    if shifts is None:
+        shifted = with_half_pixels(camera)
+    else:
+        lens = (camera.principal_px / camera.size_px - shifts[:, :2]).norm(dim=1).argmin()
+        shifted = replace(camera, principal_px=camera.principal_px + shifts[lens, 2:] * camera.size_px)
+    view = render_splats(splats, shifted, BACKGROUND_RGB, device)
     return replace(view, colour=(view.colour / factor * camera.gain_of_rows()).clamp(0, 1))
 
 
 def with_half_pixels(cameras: Cameras) -> Cameras:
-    """Round principal points to half pixels, so that a crop to whole pixels has each in its middle.
-
-    The error of at most 0.25 px is the same in training and in rendering, where photographs share a camera.
-    """
+    """Round principal points to half pixels, so that a crop to whole pixels has each in its middle."""
     return replace(cameras, principal_px=(2 * cameras.principal_px).round() / 2)
+
+
+def half_pixel_shifts(cameras: Cameras) -> Float[torch.Tensor, "L 4"]:
+    """Principal points of the lenses, and how far `with_half_pixels` shifts them, in shares of width and height.
+
+    Rendering shifts as training did, at any size, so that the error of at most 0.25 px is the same in both.
+    """
+    shift = with_half_pixels(cameras).principal_px - cameras.principal_px
+    return (torch.cat([cameras.principal_px, shift], dim=1) / cameras.size_px.repeat(1, 2)).unique(dim=0)
 
 
 def export(scene: Scene, folder: Path) -> Float[torch.Tensor, "3"]:

@@ -16,16 +16,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tidefield.data.load import load_scene
+from tidefield.data.matching import blend_weights
 from tidefield.data.scene import Scene
 from tidefield.data.surface import in_frame, surface_depth, surface_points
 from tidefield.geometry.cameras import Cameras, angle_between
 from tidefield.model.rendering import Render, Rendering, fill_unseen
 from tidefield.model.views import pixel_means, upsample_twice
 
-VIEWS = 4
-"""Photographs that `sparse_depth` blends."""
-SOFTNESS_RAD = 0.02
-"""Angle at which a photograph's blend weight has halved: differences in angle below it hardly matter."""
 CHUNK = 2**22
 """Photographs x pixels that `sparse_depth` handles at once, which bounds its memory to some 200 MB."""
 CUBIC_REACH_PX = 2
@@ -94,8 +91,7 @@ def nearest(scene: Scene, doubled: Scene | None = None) -> Render:
 def sparse_depth(scene: Scene, doubled: Scene | None = None) -> Render:
     """Blend the four photographs of the most similar directions on the surface through the sparse points.
 
-    The weights are those of unstructured lumigraph rendering (Buehler et al., 2001). On plain ground with dense overlap
-    this scores high for nearly no work.
+    The weights are `blend_weights`. On plain ground with dense overlap this scores high for nearly no work.
     """
 
     def render(camera: Cameras) -> Rendering:
@@ -189,14 +185,10 @@ def _blend(
     angle = _angles(camera, sources, points_world)
     seen = in_frame(sources, uv, z, scene.photographs.masks_of(indices))
     angle = angle.masked_fill(~seen, torch.inf)
-    smallest, which = angle.topk(min(VIEWS + 1, len(sources)), dim=0, largest=False)
-    # The weight falls to 0 at the first photograph left out, so that no seam shows where the choice changes.
-    limit = smallest[VIEWS] if len(sources) > VIEWS else torch.full_like(smallest[0], torch.inf)
-    weight = (1 - smallest[:VIEWS] / limit).clamp(min=1e-3) / (smallest[:VIEWS] + SOFTNESS_RAD)
-    weight = torch.where(smallest[:VIEWS].isfinite(), weight, torch.zeros_like(weight))
+    weight, which = blend_weights(angle)
     total = points_world.new_zeros(len(points_world), 3)
     for source, index in enumerate(indices):
-        rank, point = torch.nonzero((which[:VIEWS] == source) & (weight > 0), as_tuple=True)
+        rank, point = torch.nonzero((which == source) & (weight > 0), as_tuple=True)
         if len(point):
             total[point] += weight[rank, point, None] * read_photograph(scene, index, uv[source, point], doubled)
     weight_sum = weight.sum(0)[:, None]

@@ -24,7 +24,7 @@ def records_of(results: Results) -> list[tuple[str, Record]]:
 
 def code_and_machines(results: Results) -> list[str]:
     """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
-    commits = _groups({k: short(of) for k, one in results.by.items() if (of := one.evaluation.get("commit"))})
+    commits = _groups({k: commit for k, one in results.by.items() if (commit := _commit_of(one))})
     machines = _groups({k: machine for k, one in results.by.items() if (machine := _machine_of(one))})
 
     def each(groups: Mapping[str, str]) -> str:
@@ -45,17 +45,27 @@ def short(commit: object) -> str:
     return str(commit)[:7] + "+" * str(commit).endswith("+")
 
 
+def _commit_of(result: Result) -> str | None:
+    """The code that a result was measured with; None where nothing was recorded."""
+    found = {"train": result.process.get("train", {}).get("commit"), "evaluate": result.evaluation.get("commit")}
+    return _of_steps({step: short(commit) for step, commit in found.items() if commit})
+
+
 def _machine_of(result: Result) -> str | None:
     """Where a result was measured: what its minutes depend on; None where nothing was recorded."""
-    found = {}
-    for step in STEPS:
-        if (machine := result.process.get(step, {}).get("machine")) is not None:
-            count = machine["cores"]
-            parts = [machine["processor"], f"{count} core{'s' * (count > 1)}", *machine.get("gpus", [])]
-            found[step] = ", ".join(parts)
+    found = {step: result.process.get(step, {}).get("machine") for step in STEPS}
+    return _of_steps({step: ", ".join([_cores(of), *of.get("gpus", [])]) for step, of in found.items() if of})
+
+
+def _of_steps(found: Mapping[str, str]) -> str | None:
+    """What was found of a result's steps: once where it is the same; None where there is nothing."""
     if len(set(found.values())) > 1:
         return f"{found['train']} for training and {found['evaluate']} for evaluation"
     return next(iter(found.values()), None)
+
+
+def _cores(machine: Record) -> str:
+    return f"{machine['processor']}, {machine['cores']} core{'s' * (machine['cores'] > 1)}"
 
 
 def _groups(labels: Mapping[tuple[str, str], str]) -> dict[str, str]:
@@ -81,9 +91,9 @@ def machines(records: Sequence[tuple[str, Record]]) -> list[str]:
     for name, record in records:
         machine = record["machine"]
         text = (
-            f"{machine['processor']}, {machine['cores']} core{'s' * (machine['cores'] > 1)}, "
-            f"{machine['memory_bytes'] / 2**30:.0f} GiB; {machine['system']}, Python {machine['python']}, "
-            f"torch {machine['torch']}" + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
+            f"{_cores(machine)}, {machine['memory_bytes'] / 2**30:.0f} GiB; {machine['system']}, "
+            f"Python {machine['python']}, torch {machine['torch']}"
+            + "".join(f", {gpu}" for gpu in machine.get("gpus", []))
         )
         found.setdefault(text, {})[name] = None
     several = len(found) > 1

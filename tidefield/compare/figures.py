@@ -152,6 +152,7 @@ def write_curves(results: Results, path: Path) -> None:
         axis.grid(alpha=0.3)
     for axis in axes[len(scenes) :]:
         axis.set_visible(False)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(labels)))
+    lines = {line.get_label(): line for axis in axes for line in axis.get_lines()}
+    methods = [method for method in results.methods if method in lines]
+    figure.legend([lines[method] for method in methods], methods, loc="outside lower center", ncols=len(methods))
     figure.savefig(path, dpi=150)

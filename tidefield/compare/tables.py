@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -53,6 +54,7 @@ NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
 (`baselines/nerfstudio/worker.py`)."""
 OPENSPLAT_STEPS, OPENSPLAT_SCHEDULE = 30_000, 3_000
 """OpenSplat's default number of steps, and after how many it doubles the photographs' size, from a quarter on."""
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3})")
 _ESCAPES = str.maketrans(
     {c: rf"\{c}" for c in "&%_#${}"}
     | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
@@ -96,8 +98,9 @@ class Table:
         return "\n".join([*begin, r"\toprule", head, r"\midrule", *body, *end])
 
     def csv(self) -> str:
-        """With a header; cells without a value are empty."""
-        return _csv([self.columns, *(["" if cell == NOTHING else cell for cell in row] for row in self.rows)])
+        """With a header; cells without a value are empty, and figures have no commas between thousands."""
+        rows = ([name, *(_THOUSANDS.sub("", cell) for cell in cells)] for name, *cells in self.rows)
+        return _csv([self.columns, *(["" if cell == NOTHING else cell for cell in row] for row in rows)])
 
 
 def _csv(rows: Sequence[Sequence[str]]) -> str:
@@ -201,7 +204,8 @@ def paper_table(
 
 def cost_table(results: Results) -> Table:
     """Time, speed and memory of each method."""
-    columns = ["scene, method", "training, min", "steps", "s per frame", "rays/s", "memory, GB (train, evaluate)"]
+    columns = ["scene, method", "training, min", "steps", "s per frame", "rays/s"]
+    columns += ["memory, GB (train)", "memory, GB (evaluate)"]
     on_gpu = any(result.evaluation.get("peak_cuda_memory_bytes") for result in results.by.values())
     columns += ["GPU memory, GB (evaluate)"] if on_gpu else []
     rows = []
@@ -217,7 +221,7 @@ def cost_table(results: Results) -> Table:
                 shown(result.trained("steps"), "{:,}"),
                 shown(result.evaluation["seconds_per_frame"], "{:.2f}"),
                 shown(result.evaluation["rays_per_second"], "{:,.0f}"),
-                ", ".join(shown(peak and peak / 1e9, "{:.2f}") for peak in peaks),
+                *(shown(peak and peak / 1e9, "{:.2f}") for peak in peaks),
             ]
         )
         if on_gpu:

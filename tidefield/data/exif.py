@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,7 @@ EXIF_DAMAGE = (OSError, SyntaxError, ValueError, LookupError, TypeError, Attribu
 
 _MOST_BYTES = 1_000_000
 """Of EXIF that is parsed: a JPEG's has 64 kB; every tag of a longer one could refer to all of it."""
+_log = logging.getLogger(__name__)
 _TIMES = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized, ExifTags.Base.DateTime)
 
 
@@ -121,8 +123,8 @@ def read_exif(image: Image.Image) -> Exif:
 def read_exposures(paths: Sequence[Path]) -> Exposures:
     """Read exposures and capture times from the EXIF of photographs, without decoding pixels.
 
-    A factor of the exposure that some of the photographs lack is left out for all, because it cannot be compared.
-    Damaged EXIF counts as absent.
+    A factor of the exposure that some of the photographs lack is left out for all, because it cannot be compared; those
+    that have none at all have no exposure. Damaged EXIF counts as absent.
 
     Raises:
         SceneError: a file does not exist or is not an image.
@@ -132,6 +134,15 @@ def read_exposures(paths: Sequence[Path]) -> Exposures:
         with open_picture(path) as image:
             found.append(read_exif(image))
     terms = np.array([exif.log_exposure_terms for exif in found], dtype=np.float64).reshape(-1, len(EXPOSURE_POWERS))
-    known = np.isfinite(terms).all(axis=0)
-    log_exposure = terms[:, known].sum(axis=1) if known.any() else np.full(len(found), math.nan)
-    return Exposures(log_exposure, np.array([exif.time_s for exif in found], dtype=np.float64))
+    there = np.isfinite(terms)
+    shared = there[there.any(axis=1)].all(axis=0)
+    log_exposure = terms[:, shared].sum(axis=1) if shared.any() else np.full(len(found), math.nan)
+    time_s = np.array([exif.time_s for exif in found], dtype=np.float64)
+    lacking = [np.isnan(values) for values in (log_exposure, time_s) if not np.isnan(values).all()]
+    if count := np.any(lacking, axis=0).sum():
+        _log.info(
+            "the EXIF of %d of %d photographs has no exposure or no time: those of photographs before and after count",
+            count,
+            len(found),
+        )
+    return Exposures(log_exposure, time_s)

@@ -394,17 +394,29 @@ def huber_weights(residual: Float64[np.ndarray, "O 3"]) -> tuple[Float64[np.ndar
 def exposure_and_clock(
     metadata: Exposures | None, count: int
 ) -> tuple[Float64[np.ndarray, " V"], Float64[np.ndarray, " V"]]:
-    """Centred log exposures (0 where missing), and times in seconds, or the photographs' order without times."""
-    order = np.arange(count, dtype=np.float64)
+    """Centred log exposures (0 without any), and times in seconds, or the photographs' order without times.
+
+    What some photographs lack is taken from those before and after them.
+    """
+    clock = order = np.arange(count, dtype=np.float64)
     if metadata is None:
-        return np.zeros(count), order
-    exposure = metadata.log_exposure
-    valid = np.isfinite(exposure)
-    centred = np.where(valid, exposure - exposure[valid].mean() if valid.any() else 0.0, 0.0)
+        return np.zeros(count), clock
     time = metadata.time_s
     # EXIF has whole seconds: the order breaks ties. Mostly equal times carry no information.
-    usable = np.isfinite(time).all() and np.unique(time).size > count / 2
-    return centred, time - time.min() + 1e-3 * order if usable else order
+    if np.unique(time[np.isfinite(time)]).size > count / 2:
+        time = _filled(time, order)
+        clock = time - time.min() + 1e-3 * order
+    exposure = _filled(metadata.log_exposure, clock)
+    return exposure - exposure.mean(), clock
+
+
+def _filled(values: Float64[np.ndarray, " V"], clock: Float64[np.ndarray, " V"]) -> Float64[np.ndarray, " V"]:
+    """Values, of which those that are missing are interpolated over the clock; 0 without any."""
+    there = np.argsort(clock)
+    there = there[np.isfinite(values[there])]
+    if not len(there):
+        return np.zeros(len(values))
+    return np.where(np.isfinite(values), values, np.interp(clock, clock[there], values[there]))
 
 
 def in_sequence(clock: Float64[np.ndarray, " V"], which: Int64[np.ndarray, " S"]) -> Pairs:

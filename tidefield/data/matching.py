@@ -45,9 +45,9 @@ first where nothing says where the surface is."""
 DOUBT = 0.05
 """By how much less photographs have to differ where coarse levels came to than around the start."""
 VIEWS = 4
-"""Photographs that are compared at a pixel: those from the most similar directions."""
+"""Photographs that are compared, or blended, at a pixel: those from the most similar directions."""
 SOFTNESS_RAD = 0.02
-"""Angle at which a photograph's weight has halved."""
+"""Angle at which a photograph's weight has halved: differences in angle below it hardly matter."""
 CONTRAST_PX = 9
 """Side of the windows whose mean and contrast are removed from the photographs."""
 NOISE = 2 / 255
@@ -87,6 +87,17 @@ MATCHED_PX = 1024
 most of a few minutes."""
 KEPT_BYTES = 300_000_000
 """Memory for photographs without their means and contrasts; those that were not read for the longest time go first."""
+
+
+def blend_weights(angle: Float[Tensor, "V P"]) -> tuple[Float[Tensor, "K P"], Int[Tensor, "K P"]]:
+    """Weights of unstructured lumigraph rendering (Buehler et al., 2001) for each point's `VIEWS` photographs of the
+    smallest angles, radians; and which these are. Photographs of infinite angle do not count, and have the weight 0."""
+    nearest, which = angle.topk(min(VIEWS + 1, len(angle)), dim=0, largest=False)
+    # The weight falls to 0 at the first photograph left out, so that no seam shows where the choice changes.
+    limit = nearest[VIEWS] if len(angle) > VIEWS else torch.full_like(nearest[0], torch.inf)
+    nearest, which = nearest[:VIEWS], which[:VIEWS]
+    weight = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
+    return torch.where(nearest.isfinite(), weight, 0.0), which
 
 
 class Matcher:
@@ -239,8 +250,7 @@ class Matcher:
     def _views(
         self, camera: Cameras, inverse_depth: Float[Tensor, "H W"]
     ) -> tuple[Float[Tensor, "V H W"], Int[Tensor, " V"]]:
-        """The photographs to compare, and their weights at pixels: of each pixel's `VIEWS` photographs from the most
-        similar directions, as in unstructured lumigraph rendering (Buehler et al., 2001)."""
+        """The photographs to compare, and their weights at pixels (`blend_weights`)."""
         indices = torch.tensor(self.scene.sources(camera.to("cpu")), dtype=torch.long)
         shape = inverse_depth.shape
         rays = camera.directions_world(pixel_grid(camera.width, camera.height, self.device)[None])[0]
@@ -251,13 +261,9 @@ class Matcher:
             return inverse_depth.new_zeros(0, *shape), indices
         parts = [self._seen_from(indices[some], rays, points) for some in groups(len(indices), len(points))]
         angle, border = (torch.cat(part) for part in zip(*parts, strict=True))
-        nearest, which = angle.topk(min(VIEWS + 1, len(angle)), dim=0, largest=False)
-        # The weight falls to 0 at the first photograph left out, so that the cost is continuous.
-        limit = nearest[VIEWS] if len(angle) > VIEWS else torch.full_like(nearest[0], torch.inf)
-        nearest, which = nearest[:VIEWS], which[:VIEWS]
-        share = (1 - nearest / limit).clamp(min=1e-3) / (nearest + SOFTNESS_RAD)
-        share = share * ((nearest - LEAST_ANGLE_RAD) / (WHOLE_ANGLE_RAD - LEAST_ANGLE_RAD)).clamp(max=1)
-        weight = torch.zeros_like(angle).scatter_(0, which, torch.where(nearest.isfinite(), share, 0.0))
+        share, which = blend_weights(angle)
+        share *= ((angle.gather(0, which) - LEAST_ANGLE_RAD) / (WHOLE_ANGLE_RAD - LEAST_ANGLE_RAD)).clamp(max=1)
+        weight = torch.zeros_like(angle).scatter_(0, which, share)
         weight = weight * border
         used = (weight > 0).any(1)
         return weight[used].unflatten(1, shape), indices[used.cpu()]

@@ -227,7 +227,7 @@ def find_points(
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> Observations | None:
-    """Triangulate the points of a scene that has none, and say so; found once, they are kept in the cache.
+    """Triangulate the points of a scene that has none, and say so; what is found, or that nothing is, is kept.
 
     Args:
         posed, used, progress: see `triangulate`.
@@ -236,28 +236,25 @@ def find_points(
     """
 
     def found() -> Arrays:
-        points = _found(posed, used, root, progress)
-        return {} if points is None else {field.name: getattr(points, field.name) for field in fields(points)}
-
-    arrays = kept_arrays(f"{_key(posed, used)}{POINTS_SUFFIX}", cache or cache_folder(), found)
-    return Observations(**arrays) if arrays else None
-
-
-def _found(posed: PosedPhotographs, used: Sequence[int], root: Path, progress: Progress | None) -> Observations | None:
-    _log.info("%s has no sparse points: triangulating them from its photographs and poses", root)
-    points = triangulate(posed, used, progress)
-    if points is None:
-        _log.warning(
-            "%s has no sparse points, and fewer than %d could be triangulated: the surface is searched everywhere "
-            "between near and far, and views may be blurred or torn; check the poses and lenses, or make a scene with "
-            "`tidefield prepare`",
-            root,
-            FEWEST,
-        )
-    else:
+        _log.info("%s has no sparse points: triangulating them from its photographs and poses", root)
+        points = triangulate(posed, used, progress)
+        if points is None:
+            return {}
         count, seen = len(points.xyz_world), len(points.uv_px)
         _log.info("%s: found %s points, each seen by %.1f photographs", root, f"{count:,}", seen / count)
-    return points
+        return {field.name: getattr(points, field.name) for field in fields(points)}
+
+    arrays = kept_arrays(f"{_key(posed, used)}{POINTS_SUFFIX}", cache or cache_folder(), found)
+    if arrays:
+        return Observations(**arrays)
+    _log.warning(
+        "%s has no sparse points, and fewer than %d could be triangulated: the surface is searched everywhere between "
+        "near and far, and views may be blurred or torn; check the poses and lenses, or make a scene with `tidefield "
+        "prepare`",
+        root,
+        FEWEST,
+    )
+    return None
 
 
 def _key(posed: PosedPhotographs, used: Sequence[int]) -> str:

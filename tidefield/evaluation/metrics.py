@@ -24,6 +24,11 @@ SUFFIXES = ("", "_seen", "_cc", "_seen_cc")
 PSNR_LIMIT_DB = 100.0
 """PSNR of identical images, which is infinite and has no place in JSON; 8-bit images that differ stay far below it."""
 
+ROWS_AT_ONCE = 64
+"""Rows of an image whose colours are fitted at once, in double precision: all of a large photograph take gigabytes."""
+UNDETERMINED = 1e-14
+"""Eigenvalues of the fit's normal matrix that count as zero, as a share of the largest: those of rounding are 1e-16."""
+
 Image8 = UInt8[Tensor, "H W 3"]
 
 
@@ -139,17 +144,20 @@ def ssim_map(image: Image8, truth: Image8) -> Float[Tensor, "H W"]:
     SciPy's separable filters take a fiftieth of the time that `similarity` takes in double precision on CPUs; in single
     precision bright, even ground is off by up to 2e-3.
     """
-    first, second = (x.double().numpy() / 255 for x in (image, truth))
+    c1, c2 = 0.01**2, 0.03**2
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return gaussian_filter(values, (1.5, 1.5, 0), radius=(5, 5, 0), mode="mirror")
+        return gaussian_filter(values, 1.5, radius=5, mode="mirror")
 
-    c1, c2 = 0.01**2, 0.03**2
-    means = mean(first), mean(second)
-    variances = mean(first * first) - means[0] ** 2 + mean(second * second) - means[1] ** 2
-    covariance = mean(first * second) - means[0] * means[1]
-    light = (2 * means[0] * means[1] + c1) / (means[0] ** 2 + means[1] ** 2 + c1)
-    return torch.from_numpy((light * (2 * covariance + c2) / (variances + c2)).mean(-1)).float()
+    def of_channel(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        means = mean(first), mean(second)
+        variances = mean(first * first) - means[0] ** 2 + mean(second * second) - means[1] ** 2
+        covariance = mean(first * second) - means[0] * means[1]
+        light = (2 * means[0] * means[1] + c1) / (means[0] ** 2 + means[1] ** 2 + c1)
+        return light * (2 * covariance + c2) / (variances + c2)
+
+    total = sum(of_channel(*(x[..., k].double().numpy() / 255 for x in (image, truth))) for k in range(3))
+    return torch.from_numpy(total / 3).float()
 
 
 def similarity(first: Float[Tensor, "T C H W"], second: Float[Tensor, "T C H W"]) -> Float[Tensor, "T C H W"]:
@@ -187,9 +195,18 @@ def fit_colours(image: Image8, truth: Image8, mask: Bool[Tensor, "H W"]) -> Imag
     """
     if not mask.any():
         return image
-    design = torch.nn.functional.pad(image.double(), (0, 1), value=1.0)
-    fit = np.linalg.lstsq(design[mask].numpy(), truth[mask].double().numpy(), rcond=None)[0]
-    return (design @ torch.from_numpy(fit)).clamp(0, 255).round().to(torch.uint8)
+
+    def design(part: UInt8[Tensor, "*N 3"]) -> Float[Tensor, "*N 4"]:
+        return torch.nn.functional.pad(part.double(), (0, 1), value=1.0)
+
+    normal = torch.zeros(4, 7, dtype=torch.double)  # sums of whole numbers, which are exact
+    for part, wanted, counted in zip(*(x.split(ROWS_AT_ONCE) for x in (image, truth, mask)), strict=True):
+        x = design(part[counted])
+        normal += x.T @ torch.cat([x, wanted[counted].double()], dim=1)
+    left, right = normal.split([4, 3], dim=1)
+    fit = torch.from_numpy(np.linalg.lstsq(left.numpy(), right.numpy(), rcond=UNDETERMINED)[0])
+    parts = ((design(part) @ fit).clamp(0, 255).round().to(torch.uint8) for part in image.split(ROWS_AT_ONCE))
+    return torch.cat(list(parts))
 
 
 METRICS = {

@@ -60,7 +60,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     with opened(images_file, _EXPECTED, _MEGABYTES) as file:
         images = list(_binary_images(file) if is_binary else _text_images(file))
     with opened(points_file, _EXPECTED, _MEGABYTES) as file:
-        points = np.array(list(_binary_points(file) if is_binary else _text_points(file)), dtype=_POINT)
+        points = np.fromiter(_binary_points(file) if is_binary else _text_points(file), dtype=_POINT)
     unknown = next((image for image in images if image.camera not in lenses), None)
     if unknown:
         raise SceneError(
