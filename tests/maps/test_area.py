@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import shapely
 from pyproj import Transformer
+from rich.console import Console
 
+from tidefield.commands.map_ import Map, map_
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.maps.area import inside, read_shapes, touches
@@ -105,3 +107,23 @@ def test_an_area_has_the_cells_and_tiles_that_lie_in_it_not_in_its_rectangle():
     made = [touches(triangle, tile) for tile in tiles]
     assert 0.4 < np.mean(made) < 0.95
     assert all(touches(None, tile) for tile in tiles)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"area": "notes.txt"}, "notes.txt is no GeoJSON"),
+        ({"sections": "notes.txt"}, "notes.txt is no GeoJSON"),
+        ({"sections": "missing.geojson"}, "missing.geojson is no file"),
+        ({"gsd": -0.1}, "--gsd -0.1"),
+    ],
+)
+def test_mistakes_of_maps_are_refused_before_photographs_are_read(
+    options: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("tidefield.commands.map_.open_source", lambda *_, **__: pytest.fail("photographs were read"))
+    (tmp_path / "notes.txt").write_text("none")
+    given = {name: tmp_path / value if isinstance(value, str) else value for name, value in options.items()}
+    with pytest.raises(RunError, match=message):
+        map_(Map(tmp_path / "run", tmp_path / "out", **given), Console(quiet=True))
+    assert not (tmp_path / "out").exists()

@@ -63,6 +63,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
     from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
+    from tidefield.maps.area import parse
     from tidefield.maps.make import TileMaker, delete_tiles, finish_map, make_tiles
     from tidefield.progress import ProgressBar
 
@@ -70,6 +71,12 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         need(library)
     if options.contours is not None and not 0.001 <= options.contours < math.inf:
         raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
+    # Before photographs are read, which may take minutes.
+    if options.gsd is not None and not 0 < options.gsd < math.inf:
+        raise RunError(f"--gsd {options.gsd:g} was asked for: expected a side in metres above 0; choose another")
+    for path, kind in ((options.area, "Polygon"), (options.sections, "LineString")):
+        if path is not None:
+            parse(path, (kind,))
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
         opened = stack.enter_context(ExitStack())

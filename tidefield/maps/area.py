@@ -36,8 +36,40 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         kinds: of geometries that are wanted, such as "Polygon".
 
     Raises:
-        RunError: the file is missing, too large, no GeoJSON, has none of these geometries, or coordinates outside
-            of the map's system.
+        RunError: as `parse`, or it has none of these geometries, or coordinates outside of the map's system.
+    """
+    shapes, crs = parse(path, kinds)
+    shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
+    if frame.frame is not None:
+        target = CRS.from_wkt(frame.horizontal_wkt)
+        to_map = Transformer.from_crs(crs, target, always_xy=True)
+        if lost := lost_in_conversion(crs, target):
+            _log.warning(f"{path.name}: coordinates {lost}")
+
+        def converted(xy: np.ndarray) -> np.ndarray:
+            return np.column_stack(to_map.transform(*xy.T))
+
+        shapes = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
+    if not all(np.isfinite(shapely.get_coordinates(shape)).all() for shape, _ in shapes):
+        expected = "local coordinates" if frame.frame is None else "longitude and latitude"
+        raise RunError(f"{path} has coordinates outside of {frame.name}: expected {expected} of the survey")
+    # An outline that crosses itself, as drawn by hand, has an inside all the same.
+    shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
+    if not shapes:
+        wanted = " or ".join(kinds)
+        raise RunError(f"{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON")
+    return shapes
+
+
+def parse(path: Path, kinds: tuple[str, ...]) -> tuple[list[tuple[BaseGeometry, dict[str, Any]]], CRS]:
+    """The geometries of a GeoJSON file, of any kind, with their properties, and the system of their coordinates.
+
+    Args:
+        path: the file.
+        kinds: of geometries that are wanted, for messages.
+
+    Raises:
+        RunError: the file is missing, too large, or no GeoJSON.
     """
     wanted = " or ".join(kinds)
     with reading_from(path):
@@ -66,25 +98,7 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         shapely.errors.ShapelyError,
     ) as error:
         raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
-    shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
-    if frame.frame is not None:
-        target = CRS.from_wkt(frame.horizontal_wkt)
-        to_map = Transformer.from_crs(crs, target, always_xy=True)
-        if lost := lost_in_conversion(crs, target):
-            _log.warning(f"{path.name}: coordinates {lost}")
-
-        def converted(xy: np.ndarray) -> np.ndarray:
-            return np.column_stack(to_map.transform(*xy.T))
-
-        shapes = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
-    if not all(np.isfinite(shapely.get_coordinates(shape)).all() for shape, _ in shapes):
-        expected = "local coordinates" if frame.frame is None else "longitude and latitude"
-        raise RunError(f"{path} has coordinates outside of {frame.name}: expected {expected} of the survey")
-    # An outline that crosses itself, as drawn by hand, has an inside all the same.
-    shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
-    if not shapes:
-        raise RunError(f"{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON")
-    return shapes
+    return shapes, crs
 
 
 def _parts(shape: BaseGeometry, kinds: tuple[str, ...]) -> Iterator[BaseGeometry]:

@@ -551,8 +551,6 @@ def begin(out: Path, key: str, overwrite: bool) -> None:
     Raises:
         RunError: the folder holds a finished map, another one, or something else, or cannot be written to.
     """
-    if out.exists() and not out.is_dir():
-        raise RunError(f"{out} is a file: expected a folder for the map; choose another name")
     there = read_json(out / MAP_FILE) if out.is_dir() else None
     if there is None and out.is_dir() and any(path.name != ".lock" for path in out.iterdir()):
         raise RunError(f"{out} holds something else: expected a new folder, or one of `tidefield map`; choose another")
