@@ -278,7 +278,7 @@ def test_the_table_says_what_is_missing_and_why(scene, tmp_path):
     text = console.file.getvalue()
     assert re.search(r"PSNR, dB .*\d\d\.\d\d", text)
     assert re.search(r"LPIPS, VGG .*-", text)
-    assert "No lpips_alex, " in text
+    assert "No LPIPS, AlexNet; LPIPS, VGG: " in text
     assert text.count("not here") == 1
     assert str(tmp_path / "pictures") in text
 

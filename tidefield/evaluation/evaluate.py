@@ -227,11 +227,12 @@ def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
 
 def _remarks(report: Mapping[str, Any], out: Path) -> list[str]:
     """Return the lines below the table: why values are missing, speed, and the folder of the pictures."""
-    missing: dict[str, list[str]] = {}
+    missing: dict[str, dict[str, None]] = {}
     for name, reason in report["mean"]["reasons"].items():
-        missing.setdefault(reason, []).append(name)
+        metric = next(metric for prefix, metric in METRICS.items() if name.startswith(prefix))
+        missing.setdefault(reason, {})[metric.title] = None
     return [
-        *(f"No {', '.join(names)}: {reason}" for reason, names in missing.items()),
+        *(f"No {'; '.join(titles)}: {reason}" for reason, titles in missing.items()),
         f"Doubly seen: {report['mean']['seen_share']:.0%} of the pixels.",
         f"Speed: {report['seconds_per_frame']:.2f} s per frame, {report['rays_per_second']:,.0f} rays/s.",
         f"Pictures: {out / 'pictures'}",
