@@ -11,7 +11,7 @@ from pyproj import CRS, Transformer
 from tidefield.change.clouds import Cloud, compare_clouds, in_system, read_cloud, write_distances, write_surface
 from tidefield.change.inputs import open_pair
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, open_surface, other_datums
+from tidefield.change.surfaces import ChangeError, Grid, open_surface, other_datums
 
 US_FOOT = 1200 / 3937
 EAST, NORTH = 1_830_000.0, 646_000.0
@@ -210,6 +210,24 @@ def test_one_cloud_without_a_system_is_refused():
     bare = Cloud(Path("a.laz"), None, np.zeros((3, 3)), None)
     with pytest.raises(ChangeError, match=r"a\.laz has no coordinate system"):
         in_system(bare, CRS("EPSG:25832"))
+
+
+def test_distances_larger_than_ten_cells_are_measured():
+    """The planes are 1.5 m apart, where ten cells and the least reach are 1 m."""
+    rng, grid = np.random.default_rng(0), Grid(None, 0.0, 4.0, 0.1, 40, 40)
+    early, late = (
+        Cloud(Path("a.laz"), None, square(rng, 4.0, 8000) + np.array([0, 0, up]), None) for up in (0.0, -1.5)
+    )
+    early.xyz[:, 2] += rng.normal(0, 0.05, len(early.xyz))
+    dz = np.full(grid.shape, -1.5, np.float32)
+    dz[20:, 20:] = np.nan
+    found = compare_clouds(early, late, 0.1, registration(), difference=(grid, dz))
+    inner = (np.abs(found.cores[:, :2] - 2) < 1.5).all(axis=1)
+    unknown = inner & (found.cores[:, 0] > 2.3) & (found.cores[:, 1] < 1.7)
+    differs = inner & ~((found.cores[:, 0] > 2.1) & (found.cores[:, 1] < 1.9))
+    assert np.isfinite(found.distance_m[differs]).mean() > 0.99
+    assert np.nanmedian(found.distance_m[differs]) == pytest.approx(-1.5, abs=0.02)
+    assert np.isnan(found.distance_m[unknown]).all(), "nothing differs there by the surfaces"
 
 
 def test_the_later_cloud_is_moved_by_the_whole_registration():

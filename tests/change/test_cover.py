@@ -1,5 +1,6 @@
 """Plants gained and lost, on pictures and on a built-in flat whose plants are known."""
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,18 @@ def picture(
 def disc(east: float, north: float, radius: float) -> np.ndarray:
     x, y = (np.arange(400) + 0.5) * 0.1, 30 - (np.arange(300) + 0.5) * 0.1
     return np.hypot(x[None] - east, y[:, None] - north) < radius
+
+
+def test_polygons_do_not_take_memory_all_at_once():
+    rng, small = np.random.default_rng(0), Grid(None, 0.0, 60.0, 0.2, 300, 300)
+    shown, known, peaks = rng.integers(80, 140, (300, 300, 3)).astype(np.uint8), np.ones((300, 300), bool), []
+    for count in (1, 100):
+        regions = [Region(str(k), shapely.box(k % 50, 10, k % 50 + 5, 20)) for k in range(count)]
+        tracemalloc.start()
+        compare_cover(shown, shown, known, small, regions)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0]
 
 
 def test_the_light_of_two_dates_is_evened_by_what_did_not_change():

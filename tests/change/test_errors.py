@@ -134,6 +134,26 @@ def test_the_error_of_a_region_that_is_reduced_to_blocks_is_andersons():
     assert found.correlated * 0.25**2 == pytest.approx(correlated, rel=0.02)
 
 
+@pytest.mark.parametrize("reach", [2.0, 6.0, 20.0])
+def test_roads_and_roofs_of_a_large_survey_are_no_scattered_ground(reach: float):
+    """Two roads one cell wide, and patches of 8 x 8, whose blocks of 8 x 8 are reduced to one number each."""
+    n, variogram = 4096, Variogram((0.9,), (reach,))
+    grid, roads, roofs = Grid(None, 0.0, float(n), 1.0, n, n), np.zeros((n, n), bool), np.zeros((n, n), bool)
+    roads[:, n // 2] = roads[n // 2] = True
+    h = np.arange(1, n)
+    pairs = 2 * (n + 2 * float(((n - h) * variogram.correlation(h.astype(float))).sum()))
+    for row in range(8):
+        for column in range(8):
+            roofs[5 + row :: 256, 5 + column :: 256] = True
+    at = np.indices((8, 8)).reshape(2, -1)
+    distance = np.hypot(*(at[:, :, None] - at[:, None]))
+    of_roof = float((variogram.correlation(distance) + variogram.nugget * (distance == 0)).sum())
+    for stable, whole in ((roads, pairs), (roofs, of_roof * (n // 256) ** 2)):
+        shift = math.sqrt(covariance("vertical", stable, 0.03, variogram, grid, 0.0, None)[0, 0])
+        assert shift * stable.sum() == pytest.approx(0.03 * math.sqrt(whole), rel=0.1)
+        assert region_error(0.03, stable, variogram, 1.0).total == pytest.approx(0.03 * math.sqrt(whole), rel=0.1)
+
+
 def test_nothing_summed_has_no_error():
     assert region_error(1.0, np.zeros((4, 4), bool), UNCORRELATED, 1.0).total == 0
 

@@ -1,17 +1,20 @@
 """Where the maps of a page lie."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from surveys_of_two_dates import NORTH, WEST, pair
+from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change import figures
 from tidefield.change.cover import compare_cover
-from tidefield.change.measure import measure
+from tidefield.change.measure import Options, measure
+from tidefield.change.page import sentences
 from tidefield.change.surfaces import Grid, open_surface
+from tidefield.change.volumes import Volume
 
 
 def middle(grid: Grid, row: int, column: int) -> tuple[float, float]:
@@ -30,6 +33,35 @@ def test_cells_of_a_page_lie_where_those_of_the_survey_do(tmp_path: Path, monkey
         assert middle(small.grid, row, column) == pytest.approx(place, rel=0, abs=1e-6)
         with change.earlier.on_grid(change.grid) as read:
             assert small.heights[row, column] == read(step * row, step * row + 1)[0, step * column]
+
+
+def test_a_narrow_strip_keeps_two_rows_to_be_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(figures, "_SIDE", 40)
+    rng = np.random.default_rng(0)
+    paths = [write_surface(tmp_path / f"{k}.tif", rng.normal(0, 0.02, (8, 400)).astype(np.float32)) for k in (0, 1)]
+    small = figures.thinned(measure(*(open_surface(path) for path in paths)))
+    assert small.grid.shape == (2, 100)
+    assert "<img" in figures.draw_stable(small, "stable ground")
+
+
+@pytest.mark.parametrize(
+    ("value_m3", "sigma_m3", "words"),
+    [
+        (-100.0, 10.0, "the ground lost 100 m³ (95%: 80.4 to 120 m³) in all on 400 m²."),
+        (100.0, 10.0, "the ground gained 100 m³ (95%: 80.4 to 120 m³) in all on 400 m²."),
+        (-100.0, 100.0, "the ground changed by \u2212100 m³ (95%: \u2212296 to 96.0 m³) in all on 400 m², which"),
+    ],
+)
+def test_a_volume_in_words_has_the_sign_of_its_interval(value_m3: float, sigma_m3: float, words: str, tmp_path: Path):
+    change = measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.1)[:2]), Options(windows=(5,)))
+    net = Volume(value_m3, sigma_m3, 0.0, 0.0, 400.0)
+    assert words in sentences(replace(change, net=net))[0]
+
+
+def test_names_of_surveys_are_no_formulas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    paths = pair(tmp_path, 0, 0.1)[:2]
+    change = measure(*(replace(open_surface(path), source="a$\\x$.tif") for path in paths), Options(windows=(5,)))
+    assert "<img" in figures.draw_section(change, 60, "a section")
 
 
 def test_plants_of_a_page_lie_where_they_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -93,6 +93,9 @@ def test_two_folders_of_maps_are_compared(tmp_path: Path):
     assert any("local frame" in remark for remark in numbers["remarks"])
     # Neither what the map left empty nor what it filled in is compared.
     assert numbers["cells"] == truth.size - 400 - 400
+    filled_in = "0.8% of the cells, 100 m², were filled in at one date or both and not measured (filled.tif): left out"
+    assert filled_in in numbers["remarks"]
+    assert not any("no standard error" in remark for remark in numbers["remarks"])
     with rasterio.open(tmp_path / "out" / "change.tif") as file:
         assert np.isnan(file.read(1)[100:120, 100:120]).all()
 

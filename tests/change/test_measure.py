@@ -15,13 +15,13 @@ from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, Options, Register, _slopes, measure
 from tidefield.change.page import limits
-from tidefield.change.regions import Region, read_regions
+from tidefield.change.regions import Region, rasterised, read_regions
 from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
 from tidefield.change.stable import sampled
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
 from tidefield.change.volumes import ErrorModel, Volume
-from tidefield.change.write import volume_rows
+from tidefield.change.write import volume_rows, write_tables
 
 AREA = 0.25
 
@@ -122,6 +122,28 @@ def test_volumes_of_polygons_are_given_one_by_one(tmp_path: Path):
     assert net.value_m3 == pytest.approx(truth[:100, :110].sum() * AREA, rel=0.05)
     assert cut.value_m3 == pytest.approx(-net.value_m3, rel=0.05)
     assert fill.value_m3 == 0
+
+
+def test_a_polygon_is_summed_in_its_own_rows_and_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    earlier, later, _ = pair(tmp_path, 4, 0.2)
+    pit = Region("pit", shapely.Point(WEST + 30, NORTH - 30).buffer(14))
+    edge = Region("edge", shapely.LineString([(WEST + 110.3, NORTH - 90.1), (WEST + 130.2, NORTH - 93.7)]))
+    whole, shapes = [rasterised([region], common_grid([open_surface(earlier)])) for region in (pit, edge)], []
+    monkeypatch.setattr(
+        "tidefield.change.regions.rasterised", lambda of, grid: shapes.append(grid.shape) or rasterised(of, grid)
+    )
+    found = measured(earlier, later, regions=lambda grid: [pit, edge])
+    assert shapes == [(59, 59), (10, 21)]
+    for one, cells in zip(found.per_region, whole, strict=True):
+        expected = found.errors.volume(found.dz, cells)
+        assert asdict(one.net) == pytest.approx(asdict(expected))
+
+
+def test_the_table_of_no_outlines_has_its_header(tmp_path: Path):
+    change = measured(*pair(tmp_path, 2, 0.0)[:2])
+    write_tables(replace(change, each=[]), tmp_path)
+    fields = "id,change,area_m2,volume_m3,low_m3,high_m3,mean_dz_m,largest_dz_m\n"
+    assert (tmp_path / "outlines.csv").read_text() == fields
 
 
 @pytest.mark.thorough
@@ -270,6 +292,20 @@ def test_standard_errors_of_the_cells_are_used_and_calibrated(tmp_path: Path):
     assert isinstance(found.errors.sigma, np.ndarray)
     assert found.errors.sigma[50, 20] == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
     assert found.errors.sigma[50, 180] == pytest.approx(0.04 * np.sqrt(2), rel=0.05)
+
+
+@pytest.mark.parametrize("unknown", [np.nan, 0.0])
+def test_cells_that_are_left_out_for_want_of_a_standard_error_are_remarked(tmp_path: Path, unknown: float):
+    earlier, later, _ = pair(tmp_path, 6, 0.1)
+    sigma = np.full((200, 240), 0.02, np.float32)
+    sigma[:, :120] = unknown
+    for path in (earlier, later):
+        write_surface(path.with_name(f"{path.stem}_sigma.tif"), sigma)
+    found = measured(earlier, later)
+    assert found.net.area_m2 == 200 * 120 * AREA
+    [remark] = [remark for remark in found.remarks if "no standard error" in remark]
+    assert remark.startswith("50.0% of the cells, 6,000 m², have no standard error above 0 in one survey or both (")
+    assert "(early_6_sigma.tif, late_6_sigma.tif)" in remark
 
 
 def test_the_comparison_is_limited_to_polygons(tmp_path: Path):

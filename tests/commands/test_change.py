@@ -2,10 +2,12 @@
 
 import csv
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from scenes_on_disk import PINHOLE, write_colmap
 from scenes_on_disk import survey as posed_photographs
 from surveys_of_two_dates import pair
@@ -122,7 +124,7 @@ def test_the_report_is_one_page_with_the_volumes_and_the_pictures(compared: tupl
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "Between 2023-05-01 and 2024-05-03" in page
     cut = json.loads((out / "change.json").read_text())["volumes"]["cut"]
-    assert f"{cut['value_m3']:.1f} m³ were cut" in page
+    assert f"{cut['value_m3']:.1f} m³ (95%: {cut['low_m3']:.1f} to {cut['high_m3']:.1f} m³) were cut on" in page
     assert "red is lower, blue is higher" in page
     assert str(out.parent) not in page  # of paths only their last names
 
@@ -313,6 +315,77 @@ def test_scenes_of_which_one_has_no_georeference_are_refused_at_once(tmp_path: P
     with pytest.raises(ChangeError, match="one of the scenes is georeferenced"):
         _check_scenes((tmp_path / "local", tmp_path / "placed"), (), "cpu")
     _check_scenes((tmp_path / "placed", tmp_path / "placed"), (), "cpu")
+
+
+def test_mistakes_in_any_survey_of_a_series_are_found_before_the_first_is_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    from surveys_of_two_dates import write_surface
+
+    laspy = pytest.importorskip("laspy")
+    heights = np.random.default_rng(0).normal(0, 0.02, (40, 50)).astype(np.float32)
+    first, second, far, bare, other, geoid = (
+        write_surface(tmp_path / f"{name}_2024-0{k}-01.tif", heights, west=west, crs=crs)
+        for name, k, west, crs in (
+            ("first", 1, 400_000.0, "EPSG:32630"),
+            ("second", 2, 400_000.0, "EPSG:32630+5773"),
+            ("far", 3, 500_000.0, "EPSG:32630"),
+            ("bare", 3, 400_000.0, None),
+            ("other", 3, 400_000.0, "EPSG:32630+3855"),
+            ("geoid", 3, 400_000.0, "EPSG:32630+5773"),
+        )
+    )
+    clouds = []
+    for k, (date, crs) in enumerate((("2024-01-01", 32630), ("2024-02-01", 32630), ("2023-01-01", 32630))):
+        las = laspy.create(point_format=6, file_version="1.4")
+        las.header.add_crs(CRS(crs))
+        las.x, las.y, las.z = np.arange(10.0), np.arange(10.0), np.zeros(10)
+        clouds.append(tmp_path / f"{k}_{date}.laz")
+        las.write(str(clouds[-1]))
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.x, las.y, las.z = np.arange(10.0), np.arange(10.0), np.zeros(10)
+    las.write(str(tmp_path / "bare_2024-03-01.laz"))
+    monkeypatch.setattr("tidefield.change.inputs.open_pair", lambda *_, **__: pytest.fail("surveys were compared"))
+    for surveys, part in (
+        ((first, second, clouds[0]), "two surfaces or two clouds"),
+        ((first, second, far), "do not overlap"),
+        ((first, second, bare), "has a coordinate system"),
+        ((first, second, other), "one vertical datum"),
+        ((*clouds[:2], tmp_path / "bare_2024-03-01.laz"), "has no coordinate system"),
+        (clouds, "expected the order of time"),
+    ):
+        message = fails(capsys, monkeypatch, "change", *surveys[:2], tmp_path / "out", "--series", surveys[2])
+        assert part in message
+    with pytest.raises(pytest.fail.Exception, match="compared"):
+        call("change", first, second, tmp_path / "out", "--series", geoid)
+
+
+def test_surveys_of_a_series_have_one_name_in_all_comparisons_and_each_result_is_given_up_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from surveys_of_two_dates import write_surface
+
+    from tidefield.change import measure
+
+    rng, compare, names, results = np.random.default_rng(0), measure.measure, [], []
+    paths = [
+        write_surface(tmp_path / name / "dem.tif", rng.normal(0, 0.02, (30, 40)).astype(np.float32))
+        for name in ("spring/north", "autumn/north", "autumn/south")
+    ]
+
+    def compared_alone(*surveys: object, **options: object) -> object:
+        assert [result() for result in results] == [None] * len(results)
+        found = compare(*surveys, **options)  # type: ignore[arg-type]
+        names.append((found.earlier.name, found.later.name))
+        results.append(weakref.ref(found))
+        return found
+
+    monkeypatch.setattr("tidefield.change.measure.measure", compared_alone)
+    monkeypatch.setattr("tidefield.commands.change._write", lambda *_: None)
+    call("change", *paths[:2], tmp_path / "out", "-q", "--series", paths[2], "--windows", 5)
+    spring, autumn, south = "spring/north/dem", "autumn/north/dem", "autumn/south/dem"
+    assert names == [(spring, autumn), (spring, south), (autumn, south)]
+    assert json.loads((tmp_path / "out" / "series.json").read_text())["surveys"] == [spring, autumn, south]
 
 
 @pytest.mark.thorough

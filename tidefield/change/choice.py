@@ -73,13 +73,16 @@ def repeat_choice(
 ) -> tuple[Choice, Choice]:
     """Bias and deviation of the sums of dz in the outlines of lower and of higher ground.
 
-    Large surveys are looked at in four tiles of a million cells, those with most outlined ground, and the rest is taken
-    to behave alike.
+    Large surveys are looked at in tiles of a million cells, for each sign in the four with most of its outlined ground,
+    and the rest is taken to behave alike.
     """
-    tiles, share = _tiles(outlines.labels)
+    boxes, signs = _tiles(*dz.shape), np.concatenate([[0], outlines.signs])
+    counts = np.array([[np.count_nonzero(signs[outlines.labels[box]] == sign) for box in boxes] for sign in (-1, 1)])
+    chosen = np.zeros(counts.shape, bool)
+    np.put_along_axis(chosen, np.argsort(-counts, axis=1, kind="stable")[:, :_MOST_TILES], True, axis=1)
     sums = np.zeros((2, _REPEATS))
-    for number, box in enumerate(tiles):
-        random = np.random.default_rng([0, number])
+    for number in np.flatnonzero((chosen & (counts > 0)).any(axis=0)).tolist():
+        box, random = boxes[number], np.random.default_rng([0, number])
         part, labels = dz[box], outlines.labels[box]
         known = np.isfinite(part)
         own, near = (of[box] if isinstance(of, np.ndarray) else of for of in (sigma, systematic_m))
@@ -88,25 +91,25 @@ def repeat_choice(
             noise = simulate_noise(part.shape, variogram, cell_m, random) * np.asarray(own, np.float32)
             again = find_outlines(found + noise, own, near, variogram, cell_m, outlines.windows)
             for side, sign in enumerate((-1, 1)):
-                sums[side, k] += float(noise.sum(where=again.cells(sign), dtype=np.float64))
-    lower, higher = (Choice(float(s.mean()) * share, float(s.std(ddof=1)) * math.sqrt(share)) for s in sums)
+                if chosen[side, number]:
+                    sums[side, k] += float(noise.sum(where=again.cells(sign), dtype=np.float64))
+    shares = counts.sum(axis=1) / np.maximum(1, counts.sum(axis=1, where=chosen))
+    lower, higher = (
+        Choice(float(of.mean() * share), float(of.std(ddof=1) * math.sqrt(share)))
+        for of, share in zip(sums, shares, strict=True)
+    )
     return lower, higher
 
 
-def _tiles(labels: np.ndarray) -> tuple[list[tuple[slice, slice]], float]:
-    """Tiles to look at, and how much more outlined ground there is than in these."""
-    rows, columns = labels.shape
+def _tiles(rows: int, columns: int) -> list[tuple[slice, slice]]:
+    """The tiles of a raster; one for all of a small one."""
     if rows * columns <= 2 * _TILE**2:
-        return [(slice(0, rows), slice(0, columns))], 1.0
-    boxes = [
+        return [(slice(0, rows), slice(0, columns))]
+    return [
         (slice(r, min(r + _TILE, rows)), slice(c, min(c + _TILE, columns)))
         for r in range(0, rows, _TILE)
         for c in range(0, columns, _TILE)
     ]
-    counts = [int(np.count_nonzero(labels[box])) for box in boxes]
-    chosen = np.argsort(counts)[::-1][:_MOST_TILES]
-    inside = sum(counts[k] for k in chosen)
-    return [boxes[k] for k in chosen], sum(counts) / inside if inside else 1.0
 
 
 def _smoothed(dz: np.ndarray, labels: np.ndarray) -> Float32[np.ndarray, "rows columns"]:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError
+from scipy.ndimage import maximum_filter
 
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, Grid, is_local, system_of_ground, unstated_unit
+from tidefield.change.surfaces import ChangeError, Grid, is_local, system_of_ground, unstated_unit, values_at
 from tidefield.errors import need
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
@@ -40,6 +42,7 @@ _USER_DEFINED = 32767
 _UNITS_M = {9001: 1.0, 9002: FOOT_M, 9003: US_SURVEY_FOOT_M}
 """Lengths of EPSG's units of length."""
 _ASSIGN = "pdal translate --writers.las.a_srs"
+_EXPECTED = "expected a LAS or LAZ file with points; name another"
 SIGMAS = ("sigma_z", "sigma")
 """Names of a dimension with the points' standard errors."""
 
@@ -64,6 +67,42 @@ class Cloud:
     remarks: tuple[str, ...] = ()
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, CRS | None, dict[int, int]]]:
+    """The reader of a LAS or LAZ file, its system, and its GeoTIFF keys."""
+    laspy = need("laspy")
+    with reading_from(path):
+        size = path.stat().st_size
+        path.open("rb").close()
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+            if not 0 < header.point_count <= _MOST_POINTS or header.point_count > 100 * size:
+                raise ChangeError(f"{path} has {header.point_count} points: {_EXPECTED}, or a part of it")
+            crs, keys = _system(header)
+            if crs is not None and (crs.is_geographic or crs.is_geocentric):
+                found = "in degrees" if crs.is_geographic else "geocentric, without heights"
+                raise ChangeError(
+                    f"{path} is {found} ({crs.name}): expected a projected system in metres; convert it first"
+                )
+            yield reader, crs, keys
+    except ChangeError:
+        raise
+    except Exception as error:  # laspy and lazrs raise whatever a damaged file makes them
+        raise ChangeError(f"{path} cannot be read as a point cloud ({error}): {_EXPECTED}") from error
+
+
+def look_at_cloud(path: Path) -> Cloud:
+    """Read the header of a LAS or LAZ file alone: a cloud without points, in the file's own system.
+
+    Raises:
+        ChangeError: as `read_cloud`, as far as the header tells.
+    """
+    with _opened(path) as (_, crs, _):
+        own = None if crs is None or is_local(crs) else crs
+        return Cloud(path, own, np.empty((0, 3)), None, None if own is None else vertical_datum_of(own))
+
+
 def read_cloud(path: Path) -> Cloud:
     """Read the points of a LAS or LAZ file without those that are withheld or classified as noise or water.
 
@@ -72,40 +111,24 @@ def read_cloud(path: Path) -> Cloud:
     Raises:
         ChangeError: the file is damaged, empty or too large, in degrees, geocentric, or outside of its system.
     """
-    laspy = need("laspy")
-    expected = "expected a LAS or LAZ file with points; name another"
-    with reading_from(path):
-        size = path.stat().st_size
-        path.open("rb").close()
-    try:
-        with laspy.open(path) as reader:
-            header = reader.header
-            if not 0 < header.point_count <= _MOST_POINTS or header.point_count > 100 * size:
-                raise ChangeError(f"{path} has {header.point_count} points: {expected}, or a part of it")
-            crs, keys = _system(header)
-            extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
-            # As large as all points: parts that are joined would take as much again.
-            xyz, read = np.empty((header.point_count, 3)), 0
-            sigmas = None if extra is None else np.empty(header.point_count)
-            for points in reader.chunk_iterator(_CHUNK):
-                kept = ~np.isin(np.asarray(points.classification), (*NOISE, WATER))
-                kept &= ~np.asarray(points.withheld, bool)
-                part = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
-                kept &= np.isfinite(part).all(axis=1)
-                rows = slice(read, read + int(np.count_nonzero(kept)))
-                xyz[rows], read = part[kept], rows.stop
-                if sigmas is not None:
-                    sigmas[rows] = np.asarray(points[extra], np.float64)[kept]
-    except ChangeError:
-        raise
-    except Exception as error:  # laspy and lazrs raise whatever a damaged file makes them
-        raise ChangeError(f"{path} cannot be read as a point cloud ({error}): {expected}") from error
+    with _opened(path) as (reader, crs, keys):
+        header = reader.header
+        extra = next((name for name in SIGMAS if name in header.point_format.extra_dimension_names), None)
+        # As large as all points: parts that are joined would take as much again.
+        xyz, read = np.empty((header.point_count, 3)), 0
+        sigmas = None if extra is None else np.empty(header.point_count)
+        for points in reader.chunk_iterator(_CHUNK):
+            kept = ~np.isin(np.asarray(points.classification), (*NOISE, WATER))
+            kept &= ~np.asarray(points.withheld, bool)
+            part = np.stack([np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z)], axis=1)
+            kept &= np.isfinite(part).all(axis=1)
+            rows = slice(read, read + int(np.count_nonzero(kept)))
+            xyz[rows], read = part[kept], rows.stop
+            if sigmas is not None:
+                sigmas[rows] = np.asarray(points[extra], np.float64)[kept]
     xyz, sigma = xyz[:read], None if sigmas is None else sigmas[:read]
     if len(xyz) == 0:
-        raise ChangeError(f"{path} has no points but noise, water and withheld ones: {expected}")
-    if crs is not None and (crs.is_geographic or crs.is_geocentric):
-        found = "in degrees" if crs.is_geographic else "geocentric, without heights"
-        raise ChangeError(f"{path} is {found} ({crs.name}): expected a projected system in metres; convert it first")
+        raise ChangeError(f"{path} has no points but noise, water and withheld ones: {_EXPECTED}")
     up = _UNITS_M.get(keys.get(_HEIGHT_UNIT, 0), 1.0 if crs is None else metres_per_height(crs))
     xyz[:, 2] *= up
     sigma = None if sigma is None else sigma * up
@@ -225,12 +248,15 @@ def compare_clouds(
     spacing_m: float,
     registration: Registration,
     tick: Callable[[int, int], Any] | None = None,
+    difference: tuple[Grid, Float32[np.ndarray, "rows columns"]] | None = None,
 ) -> Distances:
     """M3C2 at core points that are one point of the earlier cloud in each cell of a grid.
 
-    Normals are of points within 3 spacings, cylinders have a radius of 2 spacings and reach as far as heights differ.
+    Normals are of points within 3 spacings. Cylinders have a radius of 2 spacings and reach 10 spacings to either side,
+    1 m at least, or half of that further than heights differ there.
 
     Args:
+        difference: of the surfaces, with its grid of this spacing in the system of both clouds, metres.
         registration: moves the later cloud, in the system of both; the level of detection counts its error.
     """
     cells = np.floor(earlier.xyz[:, :2] / spacing_m).astype(np.int64)
@@ -241,7 +267,13 @@ def compare_clouds(
     middle = cores.mean(axis=0).round()
     normals = fit_normals(earlier.xyz - middle, cores - middle, 3 * spacing_m)
     across = np.hypot(normals[:, 0], normals[:, 1])
-    reach = max(10 * spacing_m, 1.0)
+    least = max(10 * spacing_m, 1.0)
+    reach = np.full(len(cores), least)
+    if difference is not None:
+        grid, dz = difference
+        # Of each place, so that a single mismatch on a slope does not make all cylinders long; they are 5 cells wide.
+        sizes = maximum_filter(np.nan_to_num(np.abs(dz)), 5)
+        reach = np.maximum(reach, values_at(sizes, grid, cores[:, :2], 0) + least / 2)
     found = m3c2(
         earlier.xyz - middle,
         moved - middle,

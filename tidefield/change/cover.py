@@ -22,7 +22,7 @@ from scipy.ndimage import label
 
 from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, with_light
-from tidefield.change.regions import Region, rasterised
+from tidefield.change.regions import Region
 from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import STRIP_CELLS, ChangeError, Grid
 from tidefield.maps.smoothing import smoothed
@@ -193,13 +193,13 @@ def compare_cover(
     scatter = nmad(difference[:: 1 + len(difference) // 1_000_000]) if len(difference) else 0.0
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
-    inside = {"all": known} | {region.name: rasterised([region], grid) & known for region in regions or []}
     clearly, classes = np.abs(second - first) > least, {}
     for k in (-1, 0, 1):
         threshold = bare + MARGIN + k * scatter
         before, after = (_plants(green > threshold, own, k) for green, own in zip((first, second), rough, strict=True))
         classes[k] = _classes(before, np.where(clearly, after, before), known, grid)
-    for name, where in inside.items():
+    for region in (None, *(regions or [])):
+        name, where = ("all", known) if region is None else (region.name, region.cells(grid) & known)
         areas[name] = {}
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
             sizes = [float(np.isin(classes[k][where], codes).sum()) * cell for k in (0, -1, 1)]

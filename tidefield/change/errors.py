@@ -50,6 +50,8 @@ _WORTH = 6.0
 """A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
 _CLIP = 4.0
 """Residuals are limited to this many deviations before they are squared: moved objects are no part of the noise."""
+_AT_ONCE = 1 << 20
+"""Cells of a region that are reduced to blocks at once."""
 _NEAR = 4
 """Blocks closer than so many of their longer sides have their correlation summed over pairs of cells."""
 _DISTANCES = 128
@@ -95,13 +97,10 @@ class Variogram:
         """
         if not self.sills:
             return math.inf
-        stable = stable[_extent(stable)]
-        cells, size = int(stable.sum()), _block_size(stable.shape)
-        blocks = _block_sums(stable, size)
+        cells, reduced = int(stable.sum()), _reduced(stable, 1.0)
         parts = []
         for sill, reach in self._structures():
-            # Scattered cells in a coarse block pass for spread ones; each is correlated with itself at least.
-            pairs = max(cells, _pair_sum(blocks, Variogram((1.0,), (reach,)), size, cell_m))
+            pairs = max(cells, float(reduced.pair_sums(Variogram((1.0,), (reach,)), cell_m)[0, 0]))
             parts.append((sill * reach**2, max(1.0, cells**2 / pairs - 1)))
         return sum(c for c, _ in parts) ** 2 / sum(c**2 / n for c, n in parts)
 
@@ -455,22 +454,9 @@ def region_error(
     """
     if not region.any():
         return RegionError(0.0, 0.0)
-    box = _extent(region)
-    region = region[box]
-    size = _block_size(region.shape)
-    if not isinstance(sigma, np.ndarray):
-        blocks = _block_sums(region, size) * sigma
-        squares = float(region.sum()) * sigma**2
-    else:
-        inside, (down, across) = sigma[box], size
-        blocks, squares = np.zeros((-(-region.shape[0] // down), -(-region.shape[1] // across))), 0.0
-        for k in range(blocks.shape[0]):
-            part = np.where(region[k * down : (k + 1) * down], inside[k * down : (k + 1) * down], np.float32(0))
-            blocks[k] = _block_sums(part, size)[0]
-            squares += float(np.square(part, dtype=np.float64).sum())
-    # Scattered cells in a coarse block pass for spread ones; each is correlated with itself at least.
-    correlated = max(sum(variogram.sills) * squares, _pair_sum(blocks, variogram, size, cell_m))
-    return RegionError(math.sqrt(variogram.nugget * squares), math.sqrt(correlated))
+    reduced = _reduced(region, sigma)
+    correlated = max(0.0, float(reduced.pair_sums(variogram, cell_m)[0, 0]))
+    return RegionError(math.sqrt(variogram.nugget * float(reduced.squares[0, 0])), math.sqrt(correlated))
 
 
 def _extent(region: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
@@ -493,14 +479,65 @@ def pair_covariance(
     Args:
         terms: of each column of X, its factor of the rows and of the columns of the raster.
     """
+    reduced = _reduced(region, sigma, terms)
+    return reduced.normal, variogram.nugget * reduced.squares + reduced.pair_sums(variogram, cell_m)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Columns of values over a region, reduced to sums over blocks of cells.
+
+    Attributes:
+        normal: sums of the products of two columns.
+        squares: the same of the columns times sigma, as are blocks and within.
+        blocks: sums over blocks.
+        within: sums of the products of two cells of the same block, by their offset along rows and columns, over the
+            blocks that the region covers in part.
+        size: rows and columns of cells in a block.
+    """
+
+    normal: Float64[np.ndarray, "terms terms"]
+    squares: Float64[np.ndarray, "terms terms"]
+    blocks: Float64[np.ndarray, "terms rows columns"]
+    within: Float64[np.ndarray, "terms terms down across"]
+    size: tuple[int, int]
+
+    def pair_sums(self, variogram: Variogram, cell_m: float) -> Float64[np.ndarray, "terms terms"]:
+        """Sums over all pairs of cells of their product times their correlation, without the nugget."""
+        found = np.array(
+            [[_pair_sum(one, variogram, self.size, cell_m, other) for other in self.blocks] for one in self.blocks]
+        )
+        if self.size == (1, 1):
+            return found
+        # Cells that fill a block in part, as those of a road do, are closer together than those of a whole one.
+        r, c = (cell_m * np.fft.fftfreq(n, 1 / n) for n in self.within.shape[2:])
+        missing = variogram.correlation(np.hypot(r[:, None], c[None]))
+        missing -= _near_correlation(variogram, self.size, cell_m, (1, 1))[0, 0]
+        return found + (self.within * missing).sum(axis=(2, 3))
+
+
+def _reduced(
+    region: Bool[np.ndarray, "rows columns"],
+    sigma: Float32[np.ndarray, "rows columns"] | float,
+    terms: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> _Reduced:
+    """Reduce columns of values times sigma to blocks.
+
+    Args:
+        terms: as in `pair_covariance`; one column of ones if None.
+    """
+    box = _extent(region)
+    if terms is None:
+        terms = [(np.ones(region.shape[0]), np.ones(region.shape[1]))]
+    terms = [(of_rows[box[0]], of_columns[box[1]]) for of_rows, of_columns in terms]
+    region, sigma = region[box], sigma[box] if isinstance(sigma, np.ndarray) else sigma
     down, across = size = _block_size(region.shape)
-    starts = np.arange(0, region.shape[0], down)
-    squares = np.zeros((len(terms), len(terms)))
-    normal = np.zeros_like(squares)
-    wide = -(-region.shape[1] // across)
-    blocks = np.zeros((len(terms), len(starts), wide))
-    for k, first in enumerate(starts):
-        rows = slice(first, first + down)
+    normal, squares = np.zeros((2, len(terms), len(terms)))
+    blocks = np.zeros((len(terms), -(-region.shape[0] // down), -(-region.shape[1] // across)))
+    within = np.zeros((len(terms), len(terms), 2 * down, 2 * across))
+    step = max(1, _AT_ONCE // (down * region.shape[1]))
+    for k in range(0, blocks.shape[1], step):
+        rows = slice(k * down, (k + step) * down)
         inside = region[rows]
         if not inside.any():
             continue
@@ -508,15 +545,28 @@ def pair_covariance(
         columns = [of_rows[rows, None] * of_columns[None] * inside for of_rows, of_columns in terms]
         scaled = [np.where(inside, column * s, 0) for column in columns]
         for i, column in enumerate(columns):
-            blocks[i, k] = _block_sums(scaled[i], size)[0]
+            blocks[i, k : k + step] = _block_sums(scaled[i], size)
             for j, other in enumerate(columns):
                 normal[i, j] += float((column * other).sum())
                 squares[i, j] += float((scaled[i] * scaled[j]).sum())
-    middle = variogram.nugget * squares
-    for i in range(len(terms)):
-        for j in range(len(terms)):
-            middle[i, j] += _pair_sum(blocks[i], variogram, size, cell_m, blocks[j])
-    return normal, middle
+        if size != (1, 1):
+            within += _products_within(inside, scaled, size)
+    return _Reduced(normal, squares, blocks, within, size)
+
+
+def _products_within(
+    inside: Bool[np.ndarray, "rows columns"], columns: list[np.ndarray], size: tuple[int, int]
+) -> Float64[np.ndarray, "terms terms down across"]:
+    """Sums of the products of two cells of the same block, as `_Reduced` has them."""
+    down, across = size
+    counts = _block_sums(inside, size)
+    at = np.nonzero((counts > 0) & (counts < down * across))
+    padding = [(0, n * step - length) for n, step, length in zip(counts.shape, size, inside.shape, strict=True)]
+    cells = np.stack([np.pad(column.astype(np.float32), padding) for column in columns])
+    cells = cells.reshape(len(columns), counts.shape[0], down, counts.shape[1], across)[:, at[0], :, at[1]]
+    spectra = rfft2(cells, (2 * down, 2 * across))  # of blocks and columns
+    products = np.einsum("birc,bjrc->ijrc", spectra.conj(), spectra)
+    return irfft2(products.astype(np.complex128), (2 * down, 2 * across))
 
 
 def _block_size(shape: tuple[int, ...]) -> tuple[int, int]:

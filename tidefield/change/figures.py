@@ -47,7 +47,8 @@ class Thinned:
 def thinned(change: Change) -> Thinned:
     """Take every second, third, ... cell of a large change."""
     grid = change.grid
-    step = -(-max(grid.shape) // _SIDE)
+    # Slopes need two rows and columns.
+    step = min(-(-max(grid.shape) // _SIDE), min(grid.shape) // 2)
     small = grid.thinned(step)
     heights = np.empty(small.shape, np.float32)
     with change.earlier.on_grid(grid) as read:

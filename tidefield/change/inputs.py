@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tidefield.change.clouds import Cloud, default_cell, in_system, read_cloud, require_system, write_surface
+from tidefield.change.clouds import (
+    Cloud,
+    default_cell,
+    in_system,
+    look_at_cloud,
+    read_cloud,
+    require_system,
+    write_surface,
+)
 from tidefield.change.shift import is_picture
-from tidefield.change.surfaces import ChangeError, Surface, date_in, open_surface, opened, require_one_datum
+from tidefield.change.surfaces import (
+    ChangeError,
+    Surface,
+    compared_grid,
+    date_in,
+    open_surface,
+    opened,
+    require_one_datum,
+)
 
 FILLED, CLASSES = "filled.tif", "classes.tif"
 """Of `tidefield map --fill`, and of every map, next to the surface."""
@@ -101,6 +118,7 @@ def open_pair(
     cell_m: float | None = None,
     with_clouds: bool = False,
     registered: bool = True,
+    names: Sequence[str] | None = None,
 ) -> Pair:
     """Open two surveys; of point clouds surfaces are made, the mean height of the points in each cell.
 
@@ -109,13 +127,12 @@ def open_pair(
         cell_m: of these; ten points to a cell if None.
         with_clouds: read the clouds of folders, too.
         registered: whether stable ground takes out what their ellipsoids differ by.
+        names: of the surveys, for those without a date; by their files, and the folders above, if None.
 
     Raises:
         ChangeError: one has no surface, only one is a cloud, folders have no clouds, or vertical datums differ.
     """
-    if is_cloud(earlier) != is_cloud(later):
-        cloud = earlier if is_cloud(earlier) else later
-        raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
+    _require_one_kind(earlier, later)
     if not is_cloud(earlier):
         alike = _alike(earlier, later)
         surveys = [open_survey(path, date, alike) for path, date in zip((earlier, later), dates, strict=True)]
@@ -127,14 +144,13 @@ def open_pair(
             surveys[0] = replace(surveys[0], remarks=[*surveys[0].remarks, remark])
         clouds = None
         if with_clouds:
-            paths = [survey.cloud for survey in surveys]
-            if paths[0] is None or paths[1] is None:
-                raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
-            clouds = _both(paths[0], paths[1], registered)
+            first, second = _clouds_of(surveys)
+            clouds = _both(first, second, registered)
             for k, cloud in enumerate(clouds):
                 require_system(cloud, surveys[0].crs)
                 surveys[k] = replace(surveys[k], remarks=[*surveys[k].remarks, *cloud.remarks])
-        return Pair(*_distinguished(surveys[0], surveys[1], earlier, later), clouds)
+        one, other = _named(surveys, (earlier, later), names)
+        return Pair(one, other, clouds)
     clouds = _both(earlier, later, registered)
     cell = cell_m or max(default_cell(cloud) for cloud in clouds)
     surfaces = []
@@ -145,7 +161,8 @@ def open_pair(
         surfaces.append(
             replace(opened, source=cloud.path.name, datum=cloud.vertical_datum, remarks=list(cloud.remarks))
         )
-    return Pair(*_distinguished(surfaces[0], surfaces[1], earlier, later), clouds)
+    one, other = _named(surfaces, (earlier, later), names)
+    return Pair(one, other, clouds)
 
 
 def _alike(earlier: Path, later: Path) -> tuple[str, ...]:
@@ -158,16 +175,79 @@ def _alike(earlier: Path, later: Path) -> tuple[str, ...]:
     return SURFACES
 
 
-def _distinguished(one: Surface, two: Surface, of_one: Path, of_two: Path) -> tuple[Surface, Surface]:
-    """Two surveys; if their files are called the same, with as many of the folders above in their names as differ."""
-    if one.name != two.name or one.date:
-        return one, two
-    first, second = of_one.resolve().parts, of_two.resolve().parts
-    depth = next((k for k in range(1, 1 + min(len(first), len(second))) if first[-k] != second[-k]), 1)
-    return (
-        replace(one, source="/".join((*first[-depth:-1], one.name))),
-        replace(two, source="/".join((*second[-depth:-1], two.name))),
-    )
+def look_at_series(
+    paths: Sequence[Path],
+    dates: Sequence[str | None],
+    cell_m: float | None = None,
+    with_clouds: bool = False,
+    registered: bool = True,
+) -> tuple[list[str], list[str | None]]:
+    """Find the names and dates of a series of surveys, and what would stop it, before any is compared.
+
+    Args:
+        dates, cell_m, with_clouds, registered: as `open_pair` has them.
+
+    Returns:
+        the names and the dates; surveys without a date have names of their own.
+
+    Raises:
+        ChangeError: a survey cannot be read, or not be compared with the first or the one before.
+    """
+    for path in paths[1:]:
+        _require_one_kind(paths[0], path)
+    surveys, found = [], list(dates)
+    if is_cloud(paths[0]):
+        clouds = [look_at_cloud(path) for path in paths]
+        found = [date or date_in(path.stem) for date, path in zip(dates, paths, strict=True)]
+        names = [date or path.name for date, path in zip(found, paths, strict=True)]
+    else:
+        surveys = [open_survey(path, date) for path, date in zip(paths, dates, strict=True)]
+        clouds = [look_at_cloud(path) for path in _clouds_of(surveys)] if with_clouds else []
+        names, found = [survey.name for survey in surveys], [survey.date for survey in surveys]
+    for end in range(1, len(paths)):
+        for start in {0, end - 1}:
+            if surveys:
+                compared_grid(surveys[start], surveys[end], cell_m, registered)
+            if clouds:
+                require_system(clouds[start], clouds[end].crs)
+                require_one_datum([(clouds[k].path, clouds[k].vertical_datum) for k in (start, end)], registered)
+    return _distinguished(names, found, paths), found
+
+
+def _require_one_kind(one: Path, other: Path) -> None:
+    if is_cloud(one) != is_cloud(other):
+        cloud = one if is_cloud(one) else other
+        raise ChangeError(f"{cloud} is a point cloud, the other survey is none: expected two surfaces or two clouds")
+
+
+def _clouds_of(surveys: Sequence[Surface]) -> list[Path]:
+    clouds = [survey.cloud for survey in surveys if survey.cloud is not None]
+    if len(clouds) < len(surveys):
+        raise ChangeError("--m3c2 was given, but a survey has no point cloud: expected folders with clouds")
+    return clouds
+
+
+def _named(surveys: Sequence[Surface], paths: Sequence[Path], names: Sequence[str] | None) -> list[Surface]:
+    """Surveys that are named so, unless they have dates."""
+    if names is None:
+        names = _distinguished([survey.name for survey in surveys], [survey.date for survey in surveys], paths)
+    return [
+        survey if survey.date or survey.name == name else replace(survey, source=name)
+        for survey, name in zip(surveys, names, strict=True)
+    ]
+
+
+def _distinguished(names: Sequence[str], dates: Sequence[str | None], paths: Sequence[Path]) -> list[str]:
+    """Names; surveys without a date that are called the same have as many of the folders above in theirs as differ."""
+    found, parts = list(names), [path.resolve().parts for path in paths]
+    for name in set(names):
+        same = [k for k in range(len(names)) if names[k] == name and not dates[k]]
+        depth = 1
+        while len({parts[k][-depth:] for k in same}) < len({parts[k] for k in same}):
+            depth += 1
+        for k in same:
+            found[k] = "/".join((*parts[k][-depth:-1], name))
+    return found
 
 
 def _both(earlier: Path, later: Path, registered: bool) -> tuple[Cloud, Cloud]:

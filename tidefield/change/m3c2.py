@@ -60,7 +60,7 @@ def m3c2(
     cores: Points,
     normals: Points,
     radius_m: float,
-    half_length_m: float,
+    half_length_m: float | Float64[np.ndarray, " N"],
     registration_m: float | Float64[np.ndarray, " N"] = 0.0,
     sigmas: tuple[Float64[np.ndarray, " A"] | None, Float64[np.ndarray, " B"] | None] = (None, None),
     tick: Callable[[int, int], Any] | None = None,
@@ -69,11 +69,11 @@ def m3c2(
 
     Args:
         radius_m: of the cylinder (half of CloudCompare's projection diameter).
-        half_length_m: H, how far the cylinder reaches to either side.
+        half_length_m: H, how far the cylinders reach to either side, of all core points or of each.
         registration_m: error of the registration, 1 sigma, of all core points or of each.
         sigmas: standard errors of the points of either cloud, along any direction.
     """
-    if not (radius_m > 0 and half_length_m > 0):
+    if not (radius_m > 0 and np.all(half_length_m > 0)):
         raise ChangeError(
             f"a cylinder of radius {radius_m} and half length {half_length_m} was asked for: expected positive lengths"
         )
@@ -81,6 +81,7 @@ def m3c2(
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     # Seen from above, a cylinder is no larger than this; clouds of surveys have few points above each other.
     reach = radius_m + half_length_m * np.hypot(normals[:, 0], normals[:, 1])
+    half_length_m = np.broadcast_to(half_length_m, len(cores))
     counts = np.zeros((len(cores), 2), np.int64)
     means, variances = np.full((len(cores), 2), np.nan), np.full((len(cores), 2), np.nan)
     of_means = np.full((len(cores), 2), np.nan)
@@ -89,7 +90,7 @@ def m3c2(
             offset = cloud[point] - cores[core]
             along = np.einsum("ij,ij->i", offset, normals[core])
             across = np.einsum("ij,ij->i", offset, offset) - along**2
-            inside = (np.abs(along) <= half_length_m) & (across <= radius_m**2)
+            inside = (np.abs(along) <= half_length_m[core]) & (across <= radius_m**2)
             core, along, point = core[inside] - chunk.start, along[inside], point[inside]
             size = chunk.stop - chunk.start
             n = np.bincount(core, minlength=size)

@@ -25,7 +25,7 @@ from tidefield.change.registration import LEAST_STABLE, Model
 from tidefield.change.repeats import leave_out_repeated, rounding_m
 from tidefield.change.shift import Shift, find_shift
 from tidefield.change.stable import MOST_SAMPLED, false_alarms, sampled, settle
-from tidefield.change.surfaces import ChangeError, Grid, Surface, common_grid, open_surface, other_datums, warped
+from tidefield.change.surfaces import ChangeError, Grid, Surface, compared_grid, open_surface, other_datums, warped
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.errors import list_names
 from tidefield.geometry.geodesy import lost_in_conversion
@@ -147,36 +147,35 @@ def read_difference(
     grid: Grid,
     shift_m: tuple[float, float] = (0.0, 0.0),
     tick: Callable[[int, int], Any] | None = None,
-) -> tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"] | None]:
-    """Later minus earlier heights on a grid, and one sigma of it where both surveys have one of theirs."""
+) -> Float32[np.ndarray, "rows columns"]:
+    """Later minus earlier heights on a grid, metres; NaN where one of them is unknown."""
     dz = np.empty(grid.shape, np.float32)
-    sigma = np.empty(grid.shape, np.float32) if earlier.sigma is not None and later.sigma is not None else None
-    for surface, sign in ((earlier, -1), (later, 1)):
-        moved = shift_m if sign > 0 else (0.0, 0.0)
+    for surface, sign, moved in ((earlier, -1, (0.0, 0.0)), (later, 1, shift_m)):
         with surface.on_grid(grid, moved) as read:
             for rows in grid.strips():
                 heights = read(rows.start, rows.stop)
                 dz[rows] = -heights if sign < 0 else dz[rows] + heights
                 if tick is not None:
                     tick(rows.stop + (grid.rows if sign > 0 else 0), 2 * grid.rows)
-        if sigma is not None:
-            assert surface.sigma is not None
-            # In the unit of the heights, whatever unit of heights the raster of errors states.
-            raster = replace(open_surface(surface.sigma), metres=surface.metres)
-            with raster.on_grid(grid, moved) as read:
-                for rows in grid.strips():
-                    own = read(rows.start, rows.stop)
-                    own[~(own > 0)] = np.nan
-                    sigma[rows] = own if sign < 0 else np.hypot(sigma[rows], own)
-        if surface.filled is not None:
-            with warped(surface.filled, surface.crs, grid, moved) as marks:
-                for rows in grid.strips():
-                    # Between a filled cell and a measured one the value is between 0 and 1.
-                    dz[rows][marks(rows.start, rows.stop)[0] > 0] = np.nan
-    if sigma is not None:
-        dz[~np.isfinite(sigma)] = np.nan
-        sigma[~np.isfinite(dz)] = np.nan
-    return dz, sigma
+    return dz
+
+
+def read_sigma(
+    earlier: Surface, later: Surface, grid: Grid, shift_m: tuple[float, float] = (0.0, 0.0)
+) -> Float32[np.ndarray, "rows columns"] | None:
+    """One sigma of later minus earlier heights, metres, NaN where it is unknown; None unless both surveys have one."""
+    if earlier.sigma is None or later.sigma is None:
+        return None
+    sigma = np.zeros(grid.shape, np.float32)
+    for surface, path, moved in ((earlier, earlier.sigma, (0.0, 0.0)), (later, later.sigma, shift_m)):
+        # In the unit of the heights, whatever unit of heights the raster of errors states.
+        raster = replace(open_surface(path), metres=surface.metres)
+        with raster.on_grid(grid, moved) as read:
+            for rows in grid.strips():
+                own = read(rows.start, rows.stop)
+                own[~(own > 0)] = np.nan
+                sigma[rows] = np.hypot(sigma[rows], own)
+    return sigma
 
 
 def measure(
@@ -201,7 +200,7 @@ def measure(
             and are not registered.
     """
     options = options or Options()
-    grid = common_grid([earlier, later], options.cell_m)
+    grid = compared_grid(earlier, later, options.cell_m, options.register != "none")
     remarks = [*dict.fromkeys([*earlier.remarks, *later.remarks])]
     # What cannot be read is found before all is measured.
     steady, limits, polygons = ([] if read is None else read(grid) for read in (stable, within, regions))
@@ -210,27 +209,27 @@ def measure(
         if surface.crs is not None and target is not None and (lost := lost_in_conversion(surface.crs, target)):
             remarks.append(f"{surface.file}: coordinates {lost}; errors do not include that")
     if datums := other_datums(earlier, later):
-        if options.register == "none":
-            raise ChangeError(
-                f"{earlier.file} and {later.file} cannot be compared without registration: {datums}; expected "
-                "one; convert one of them first (gdalwarp), leave --register none out, or, if they are the same one, "
-                "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
-            )
         remarks.append(f"{datums}; only stable ground takes the difference")
     shift = _shift(earlier, later, grid, options, remarks)
     moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
-    dz, own = read_difference(earlier, later, grid, moved, tick=tick)
-    if (earlier.sigma is None) != (later.sigma is None):
+    dz = read_difference(earlier, later, grid, moved, tick=tick)
+    filled = _marked(earlier, later, grid, moved, "filled")
+    _leave_out(dz, filled, grid, "were filled in at one date or both and not measured (filled.tif): left out", remarks)
+    own = read_sigma(earlier, later, grid, moved)
+    if own is not None:
+        files = list_names([*dict.fromkeys(surface.sigma.name for surface in (earlier, later) if surface.sigma)])
+        unsure = f"have no standard error above 0 in one survey or both ({files}): left out; without these files all of"
+        _leave_out(dz, ~np.isfinite(own), grid, f"{unsure} them are compared", remarks)
+        own[~np.isfinite(dz)] = np.nan
+    elif earlier.sigma is not None or later.sigma is not None:
         remarks.append("only one survey has standard errors of its cells; they are not used")
-    wet = _water(earlier, later, grid, moved) & np.isfinite(dz)
+    wet = _marked(earlier, later, grid, moved, "classes") & np.isfinite(dz)
     on_water = dz[wet]
-    if len(on_water):
-        share = 100 * len(on_water) / np.count_nonzero(np.isfinite(dz))
-        dz[wet] = np.nan
-        remarks.append(
-            f"{share:.1f}% of the cells, {len(on_water) * grid.cell_area_m2:,.0f} m², are water at one date or both "
-            "by the classes of the maps: left out, since their heights are the water's and not the ground's"
-        )
+    tidal = (
+        "are water at one date or both by the classes of the maps: left out, since their heights are the water's and "
+        "not the ground's"
+    )
+    _leave_out(dz, wet, grid, tidal, remarks)
     given = rasterised(steady, grid) if steady else None
     if given is not None:
         given &= np.isfinite(dz)
@@ -247,8 +246,8 @@ def measure(
             f"{earlier.file} and {later.file} both have heights in {known} cells{' of ground' if len(on_water) else ''}"
             f": expected at least {LEAST_STABLE}; check their nodata and their places, or give a smaller --cell"
         )
-    unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)[0]
-    unmoved[wet] = np.nan
+    unmoved = dz if moved == (0, 0) else read_difference(earlier, later, grid)
+    unmoved[~np.isfinite(dz)] = np.nan
     steps = rounding_m(earlier), rounding_m(later)
     leave_out_repeated(dz, unmoved, max(steps), given, area, remarks)
     del unmoved
@@ -306,17 +305,36 @@ def measure(
     return replace(found, water=OnWater(wet, on_water)) if len(on_water) else found
 
 
-def _water(
-    earlier: Surface, later: Surface, grid: Grid, shift_m: tuple[float, float]
+def _marked(
+    earlier: Surface, later: Surface, grid: Grid, shift_m: tuple[float, float], by: Literal["filled", "classes"]
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Cells that are water by the classes of either survey."""
-    wet = np.zeros(grid.shape, bool)
+    """Cells that the rasters of either survey mark as filled in, or as water."""
+    found = np.zeros(grid.shape, bool)
     for surface, moved in ((earlier, (0.0, 0.0)), (later, shift_m)):
-        if surface.classes is not None:
-            with warped(surface.classes, surface.crs, grid, moved, nearest=True) as classes:
+        path = surface.filled if by == "filled" else surface.classes
+        if path is not None:
+            with warped(path, surface.crs, grid, moved, nearest=by == "classes") as read:
                 for rows in grid.strips():
-                    wet[rows] |= classes(rows.start, rows.stop)[0] == WATER
-    return wet
+                    marks = read(rows.start, rows.stop)[0]
+                    # Between a filled cell and a measured one the value is between 0 and 1.
+                    found[rows] |= marks > 0 if by == "filled" else marks == WATER
+    return found
+
+
+def _leave_out(
+    dz: Float32[np.ndarray, "rows columns"],
+    cells: Bool[np.ndarray, "rows columns"],
+    grid: Grid,
+    why: str,
+    remarks: list[str],
+) -> None:
+    """Make dz unknown in some cells, with a remark on how many had heights."""
+    known = np.isfinite(dz)
+    count = np.count_nonzero(known & cells)
+    if count:
+        share = 100 * count / np.count_nonzero(known)
+        remarks.append(f"{share:.1f}% of the cells, {count * grid.cell_area_m2:,.0f} m², {why}")
+        dz[cells] = np.nan
 
 
 def _shift(earlier: Surface, later: Surface, grid: Grid, options: Options, remarks: list[str]) -> Shift | None:
@@ -385,14 +403,16 @@ def _summed(
     if len(outlines.signs):
         choices = repeat_choice(dz, errors.sigma, errors.near_sigma(), errors.variogram, grid.cell_m, outlines)
 
-    def chosen(inside: Bool[np.ndarray, "rows columns"]) -> tuple[Volume, Volume]:
-        """Cut and fill of the outlines' cells in a region, with its share of what their choice adds."""
+    whole, counts = (slice(0, grid.rows), slice(0, grid.columns)), [int(np.count_nonzero(of)) for of in (lower, higher)]
+
+    def chosen(inside: Bool[np.ndarray, "rows columns"], box: tuple[slice, slice] = whole) -> tuple[Volume, Volume]:
+        """Cut and fill of the outlines' cells in a region of a box, with its share of what their choice adds."""
         volumes = []
         for k, (outlined, sign) in enumerate(((lower, -1.0), (higher, 1.0))):
-            cells = inside & outlined
-            volume, count = errors.volume(dz, cells, sign), int(np.count_nonzero(cells))
+            cells = inside & outlined[box]
+            volume, count = errors.volume(dz[box], cells, sign, box), int(np.count_nonzero(cells))
             if choices is not None and count:
-                share = count / int(np.count_nonzero(outlined))
+                share = count / counts[k]
                 bias, deviation = sign * choices[k].bias * share, choices[k].deviation * math.sqrt(share)
                 volume = volume.chosen(bias * grid.cell_area_m2, deviation * grid.cell_area_m2)
             volumes.append(volume)
@@ -405,13 +425,14 @@ def _summed(
         each.append((k, errors.volume(part, inside, float(sign), box), float(np.abs(part[inside]).max())))
     per_region, empty = [], []
     for region in regions:
-        cells = region.cells(grid)
-        inside = cells & known
+        box = grid.box_of(region.geometry.bounds)
+        cells = region.cells(grid.part(box))
+        inside = cells & known[box]
         if not inside.any():
             empty.append(region.name)
             continue
         compared = region.share_on(grid) * np.count_nonzero(inside) / np.count_nonzero(cells)
-        per_region.append(InPolygon(region, errors.volume(dz, inside), *chosen(inside), compared))
+        per_region.append(InPolygon(region, errors.volume(dz[box], inside, 1.0, box), *chosen(inside, box), compared))
     if empty:
         remarks.append(f"polygon{'s'[: len(empty) > 1]} {list_names(empty)}: no cell of both surveys is in it")
     return Change(

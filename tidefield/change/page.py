@@ -25,6 +25,7 @@ from tidefield.change.figures import (
 from tidefield.change.kinds import View
 from tidefield.change.measure import Change
 from tidefield.change.pictures import difference, jpeg, side_by_side
+from tidefield.change.volumes import Volume
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
@@ -94,16 +95,15 @@ def write_page(
 def sentences(change: Change) -> list[str]:
     """What changed, in three sentences."""
     earlier, later = change.earlier.name, change.later.name
-    verb = {True: "gained", False: "lost"}[change.net.value_m3 > 0]
-    low, high = (cubic(v) for v in change.net.interval_m3)
+    net, gained = change.net, change.net.value_m3 > 0
+    verb = ("gained" if gained else "lost") if net.significant else "changed by"
     first = (
-        f"Between {earlier} and {later} the ground {verb} {cubic(abs(change.net.value_m3))} m³ in all (95%: {low} to "
-        f"{high} m³ on {cubic(change.net.area_m2)} m²)"
+        f"Between {earlier} and {later} the ground {verb} {_amount(net, net.significant and not gained)} in all on "
+        f"{cubic(net.area_m2)} m²"
     )
-    first += "." if change.net.significant else ", which is not distinguishable from no change."
+    first += "." if net.significant else ", which is not distinguishable from no change."
     parts = [
-        f"{cubic(volume.value_m3)} m³ {word} (95%: {cubic(volume.interval_m3[0])} to {cubic(volume.interval_m3[1])} m³)"
-        f" on {cubic(volume.area_m2)} m²"
+        f"{_amount(volume)} {word} on {cubic(volume.area_m2)} m²"
         for word, volume in (("were cut", change.cut), ("were filled", change.fill))
         if volume.area_m2 > 0
     ]
@@ -115,6 +115,13 @@ def sentences(change: Change) -> list[str]:
         f"{100 * change.false_alarms:.1f}% does, where 5% are expected."
     )
     return [first, second, third]
+
+
+def _amount(volume: Volume, lost: bool = False) -> str:
+    """A volume with its interval; of what was lost both have the sign of the loss."""
+    sign = -1 if lost else 1
+    low, high = sorted(sign * end for end in volume.interval_m3)
+    return f"{cubic(sign * volume.value_m3)} m³ (95%: {cubic(low)} to {cubic(high)} m³)"
 
 
 def cover_words(cover: Cover | None) -> list[str]:

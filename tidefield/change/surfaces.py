@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
@@ -99,6 +99,25 @@ class Grid:
         offset = (0.5 - 0.5 * step) * self.cell_m
         columns, rows = -(-self.columns // step), -(-self.rows // step)
         return Grid(self.crs, self.west_m + offset, self.north_m - offset, self.cell_m * step, columns, rows)
+
+    def box_of(self, bounds: tuple[float, float, float, float]) -> tuple[slice, slice]:
+        """Rows and columns around bounds (west, south, east, north), as far as they are on the grid; one at least."""
+
+        def cells(low: float, high: float, count: int) -> slice:
+            first = min(max(0, math.floor(low / self.cell_m) - 1), count - 1)
+            return slice(first, max(first + 1, min(count, math.floor(high / self.cell_m) + 2)))
+
+        west, south, east, north = bounds
+        return (
+            cells(self.north_m - north, self.north_m - south, self.rows),
+            cells(west - self.west_m, east - self.west_m, self.columns),
+        )
+
+    def part(self, box: tuple[slice, slice]) -> Grid:
+        """The grid of some rows and columns."""
+        rows, columns = box
+        west, north = self.west_m + columns.start * self.cell_m, self.north_m - rows.start * self.cell_m
+        return Grid(self.crs, west, north, self.cell_m, columns.stop - columns.start, rows.stop - rows.start)
 
     def strips(self) -> Iterator[slice]:
         """The rows, a few megabytes at a time."""
@@ -415,6 +434,38 @@ def other_datums(earlier: Surface, later: Surface) -> str | None:
         return None
     apart = ", up to two metres apart" if one.startswith(_ELLIPSOID) and other.startswith(_ELLIPSOID) else ""
     return f"heights are over different vertical datums{apart}: {one} and {other}"
+
+
+def values_at(values: np.ndarray, grid: Grid, place: Float64[np.ndarray, "P 2"], outside: int) -> np.ndarray:
+    """Values of the cells that points (easting and northing) are in; outside of the grid, and at NaN, another one."""
+    known = np.isfinite(place).all(axis=1)
+    column, row = np.full(len(place), -1), np.full(len(place), -1)
+    column[known] = np.floor((place[known, 0] - grid.west_m) / grid.cell_m).astype(int)
+    row[known] = np.floor((grid.north_m - place[known, 1]) / grid.cell_m).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < grid.columns) & (row < grid.rows)
+    found = np.full(len(place), outside, values.dtype)
+    found[inside] = values[row[inside], column[inside]]
+    return found
+
+
+def compared_grid(earlier: Surface, later: Surface, cell_m: float | None, registered: bool) -> Grid:
+    """The grid that two surveys are compared on.
+
+    Args:
+        cell_m: as `common_grid` has it.
+        registered: whether stable ground takes out what heights over other datums differ by.
+
+    Raises:
+        ChangeError: they have none in common, or state different vertical datums and are not registered.
+    """
+    grid = common_grid([earlier, later], cell_m)
+    if not registered and (datums := other_datums(earlier, later)):
+        raise ChangeError(
+            f"{earlier.file} and {later.file} cannot be compared without registration: {datums}; expected "
+            "one; convert one of them first (gdalwarp), leave --register none out, or, if they are the same one, "
+            "state it in the same words (gdal_edit.py -mo VERTICAL_DATUM=...)"
+        )
+    return grid
 
 
 def common_grid(surfaces: list[Surface], cell_m: float | None = None) -> Grid:

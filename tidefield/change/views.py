@@ -18,7 +18,7 @@ from tidefield.change.cover import Cover
 from tidefield.change.kinds import GAINED, HIGHER, LOST, LOWER, UNKNOWN, View, colour_kinds
 from tidefield.change.light import light_gains, with_light
 from tidefield.change.measure import Change
-from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.change.surfaces import ChangeError, Grid, values_at
 from tidefield.data.georeference import find_georeference
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
@@ -191,10 +191,10 @@ def _compared(
     seen = np.logical_and.reduce([(v.opacity >= MIN_OPACITY).cpu().numpy() for v in (first, second)])
     with np.errstate(invalid="ignore"):
         seen &= np.abs(depths[1] - depths[0]) < _HIDDEN * depths[0]
-    outlined = np.concatenate([[0], change.outlines.signs])[change.outlines.labels]
-    known = _sampled(np.isfinite(change.dz), change.grid, place, 0).reshape(shape) > 0
-    sign = _sampled(outlined, change.grid, place, 0).reshape(shape)
-    planted = np.zeros(shape, int) if cover is None else _sampled(cover.classes, cover.grid, place, 0).reshape(shape)
+    known = values_at(np.isfinite(change.dz), change.grid, place, 0).reshape(shape) > 0
+    number = values_at(change.outlines.labels, change.grid, place, 0).reshape(shape)
+    sign = np.concatenate([[0], change.outlines.signs])[number]
+    planted = np.zeros(shape, int) if cover is None else values_at(cover.classes, cover.grid, place, 0).reshape(shape)
     steady = seen & known & (sign == 0) & (planted != 1) & (planted != -1)
     gains = light_gains(one, other, steady if steady.any() else seen)
     relit = with_light(other, gains)
@@ -208,15 +208,3 @@ def _compared(
     ):
         kinds[where] = kind
     return View(name, one, relit, kinds)
-
-
-def _sampled(values: np.ndarray, grid: Grid, place: Float64[np.ndarray, "P 2"], outside: int) -> np.ndarray:
-    """Values of the cells that points are in."""
-    known = np.isfinite(place).all(axis=1)
-    column, row = np.full(len(place), -1), np.full(len(place), -1)
-    column[known] = np.floor((place[known, 0] - grid.west_m) / grid.cell_m).astype(int)
-    row[known] = np.floor((grid.north_m - place[known, 1]) / grid.cell_m).astype(int)
-    inside = (column >= 0) & (row >= 0) & (column < grid.columns) & (row < grid.rows)
-    found = np.full(len(place), outside, int)
-    found[inside] = values[row[inside], column[inside]]
-    return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,18 @@ COVER_BANDS = ("plants: 1 gained, -1 lost, 2 at both dates, 0 at none",)
 SIGNIFICANT_BANDS = (
     "cell by cell: -1 lower, 1 higher, 0 neither, at 95%",
     "outlined: -1 lower, 1 higher, 0 neither; by windows of cells",
+)
+
+
+OUTLINE_FIELDS: tuple[str, ...] = (
+    "id",
+    "change",
+    "area_m2",
+    "volume_m3",
+    "low_m3",
+    "high_m3",
+    "mean_dz_m",
+    "largest_dz_m",
 )
 
 
@@ -92,19 +104,19 @@ def polygons_of(
 def outline_rows(change: Change) -> list[dict[str, Any]]:
     """One row for each outline, the largest volume first."""
     signs = change.outlines.signs
-    rows = [
-        {
-            "id": number,
-            "change": "lower" if signs[number - 1] < 0 else "higher",
-            "area_m2": volume.area_m2,
-            "volume_m3": volume.value_m3,
-            "low_m3": volume.interval_m3[0],
-            "high_m3": volume.interval_m3[1],
-            "mean_dz_m": float(signs[number - 1]) * volume.value_m3 / volume.area_m2,
-            "largest_dz_m": float(signs[number - 1]) * largest,
-        }
+    values = [
+        (
+            number,
+            "lower" if signs[number - 1] < 0 else "higher",
+            volume.area_m2,
+            volume.value_m3,
+            *volume.interval_m3,
+            float(signs[number - 1]) * volume.value_m3 / volume.area_m2,
+            float(signs[number - 1]) * largest,
+        )
         for number, volume, largest in change.each
     ]
+    rows: list[dict[str, Any]] = [dict(zip(OUTLINE_FIELDS, of, strict=True)) for of in values]
     return sorted(rows, key=lambda row: -row["volume_m3"])
 
 
@@ -127,17 +139,16 @@ def volume_rows(change: Change) -> list[dict[str, Any]]:
 def write_tables(change: Change, folder: Path) -> None:
     """Write volumes.csv and outlines.csv."""
     write_csv(folder / "volumes.csv", volume_rows(change))
-    write_csv(folder / "outlines.csv", outline_rows(change))
+    write_csv(folder / "outlines.csv", outline_rows(change), OUTLINE_FIELDS)
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write rows with one set of keys; numbers are rounded to four decimals."""
+def write_csv(path: Path, rows: list[dict[str, Any]], fields: Sequence[str] = ()) -> None:
+    """Write rows with one set of keys, or these fields; numbers are rounded to four decimals."""
     text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: round(v, 4) if isinstance(v, float) else plain_cell(v) for k, v in row.items()})
+    writer = csv.DictWriter(text, fields or list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: round(v, 4) if isinstance(v, float) else plain_cell(v) for k, v in row.items()})
     write_text(path, text.getvalue())
 
 

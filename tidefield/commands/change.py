@@ -106,8 +106,7 @@ def change(options: Change, console: Console) -> None:
     _check(options)
     if options.scenes is not None:
         _check_scenes(options.scenes, options.cameras, options.device)
-    with TemporaryDirectory() as work:
-        (_series if options.series else _compare)(options, console, Path(work))
+    (_series if options.series else _compare)(options, console)
 
 
 @dataclass(frozen=True)
@@ -120,49 +119,44 @@ class Found:
     water: Water | None
 
 
-def _compare(options: Change, console: Console, work: Path) -> None:
-    found = _measured(options, options.earlier, options.later, _dates(options, 2), work, console)
-    with completed_folder(options.out) as folder:
-        _write(found, options, folder, console)
+def _compare(options: Change, console: Console) -> None:
+    with TemporaryDirectory() as work:
+        found = _measured(options, options.earlier, options.later, _dates(options, 2), Path(work), console)
+        with completed_folder(options.out) as folder:
+            _write(found, options, folder, console)
     _say(found, console)
     console.print(str(options.out), soft_wrap=True)
 
 
-def _series(options: Change, console: Console, work: Path) -> None:
+def _series(options: Change, console: Console) -> None:
     """Compare surveys step by step and each with the first."""
-    from tidefield.change.inputs import is_cloud, open_survey
+    from tidefield.change.inputs import look_at_series
     from tidefield.change.series import entries_of, write_series
     from tidefield.pages import command_line
 
     paths = (options.earlier, options.later, *options.series)
     dates = _dates(options, len(paths))
-    names: list[str] = [""] * len(paths)
-    entries, remarks, stated = [], {}, list(dates)
-    # What is missing or out of order is found before the first survey is compared.
-    for k, path in enumerate(paths):
-        if not is_cloud(path):
-            stated[k] = open_survey(path, dates[k]).date
-        elif not path.is_file():
-            raise RunError(f"{path} is not there: expected a point cloud; check its name")
+    registered = options.register != "none"
+    names, stated = look_at_series(paths, dates, options.cell, options.m3c2, registered)
     _require_order(paths, stated)
+    entries, remarks = [], {}
     with completed_folder(options.out) as folder:
         for end in range(1, len(paths)):
             for start in sorted({0, end - 1}):
-                own = work / f"{start}_{end}"
-                own.mkdir()
-                found = _measured(options, paths[start], paths[end], (dates[start], dates[end]), own, console)
-                for k, surface in ((start, found.change.earlier), (end, found.change.later)):
-                    names[k], stated[k] = surface.name, surface.date
-                _require_order(paths[: end + 1], stated[: end + 1])
-                remarks[start, end] = found.change.remarks
-                if start == 0:
-                    entries += entries_of(found.change, "first", start, end)
-                if start == end - 1:
-                    entries += entries_of(found.change, "step", start, end)
-                    (folder / f"step_{end}").mkdir()
-                    _write(found, options, folder / f"step_{end}", console)
-                    console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
-                    _say(found, console)
+                with TemporaryDirectory() as work:
+                    ends = paths[start], paths[end], (dates[start], dates[end])
+                    found = _measured(options, *ends, Path(work), console, (names[start], names[end]))
+                    remarks[start, end] = found.change.remarks
+                    if start == 0:
+                        entries += entries_of(found.change, "first", start, end)
+                    if start == end - 1:
+                        entries += entries_of(found.change, "step", start, end)
+                        (folder / f"step_{end}").mkdir()
+                        _write(found, options, folder / f"step_{end}", console)
+                        console.print(f"{names[start]} to {names[end]}", soft_wrap=True)
+                        _say(found, console)
+                    # Two comparisons of large surveys are more than fits into the memory.
+                    del found
         numbers = write_series(entries, remarks, _distinct(names), folder, command_line())
         if uneven := numbers["different_ground_m2"]:
             log.warning(
@@ -205,7 +199,13 @@ def _dates(options: Change, count: int) -> tuple[str | None, ...]:
 
 
 def _measured(
-    options: Change, one: Path, other: Path, dates: tuple[str | None, ...], work: Path, console: Console
+    options: Change,
+    one: Path,
+    other: Path,
+    dates: tuple[str | None, ...],
+    work: Path,
+    console: Console,
+    names: tuple[str, str] | None = None,
 ) -> Found:
     """Compare two surveys."""
     import numpy as np
@@ -219,7 +219,7 @@ def _measured(
     from tidefield.progress import ProgressBar
 
     registered = options.register != "none"
-    pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2, registered)
+    pair = open_pair(one, other, work, (dates[0], dates[1]), options.cell, options.m3c2, registered, names)
     earlier, later = pair.earlier, pair.later
     for level in (*(options.water or ()), *options.levels):
         if not -12_000 < level * earlier.metres < 9_000:
@@ -279,7 +279,10 @@ def _write(found: Found, options: Change, folder: Path, console: Console) -> Non
         system = None if change.grid.crs is None else CRS.from_wkt(change.grid.crs)
         first, second = (in_system(cloud, system) for cloud in clouds)
         with ProgressBar(console, "Measuring M3C2 distances") as bar:
-            distances = compare_clouds(first, second, change.grid.cell_m, change.errors.registration, bar)
+            difference = change.grid, change.with_water
+            distances = compare_clouds(
+                first, second, change.grid.cell_m, change.errors.registration, bar, difference=difference
+            )
         write_distances(distances, first.crs, folder / "m3c2.laz")
 
 
