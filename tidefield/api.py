@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from tidefield import methods
-from tidefield.addresses import pull
 from tidefield.config import PRESETS
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
@@ -15,7 +14,7 @@ from tidefield.device import choose_device
 from tidefield.errors import RunError
 from tidefield.geometry.cameras import Cameras
 from tidefield.model.rendering import Render, Rendering
-from tidefield.train.checkpoint import given_or_shipped, read_run, require_scene
+from tidefield.train.checkpoint import given_or_shipped, read_run, scene_of
 
 
 def zero_shot(scene: Scene, preset: str = "swift", weights: str | Path | None = None, device: str = "auto") -> Render:
@@ -53,9 +52,7 @@ class OpenRun:
     def __init__(self, folder: Path, device: str) -> None:
         run = read_run(folder)
         self.folder, self.config = folder, run.config
-        pull(run.scene)
-        require_scene(folder, run)
-        self.scene: Scene = load_scene(run.scene, width=run.width)
+        self.scene: Scene = load_scene(scene_of(folder, run), width=run.width)
         self._stack = ExitStack()
         trained = methods.trained(folder, run, self.scene, choose_device(device))
         self._render, progress = self._stack.enter_context(trained)

@@ -382,7 +382,20 @@ def test_a_run_whose_scene_was_moved_goes_on_there(scene: Path, tmp_path: Path) 
     assert evaluate(Evaluate(run, device="cpu"), QUIET).path.exists()
 
 
+@pytest.mark.parametrize("unknown", ["poses", "held_out"])
+def test_a_run_that_cannot_recognise_its_scene_is_not_moved(scene: Path, tmp_path: Path, unknown: str) -> None:
+    run = tmp_path / "run"
+    train(Train(scene, run, budget=Budget(steps=1), device="cpu"), QUIET)
+    write_run(run, replace(read_run(run), scene=tmp_path / "gone", **{unknown: None}))
+    with pytest.raises(RunError, match=r"which is missing: .*; put it back$"):
+        evaluate(Evaluate(run, device="cpu"), QUIET)
+    with pytest.raises(RunError, match="expected the same scene"):
+        train(Train(scene, run, resume=True, device="cpu"), QUIET)
+
+
 def test_few_steps_in_minutes_are_remarked(scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    train(Train(scene, tmp_path / "one", budget=Budget(steps=1), device="cpu"), QUIET)
+    assert "steps change little" not in caplog.text
     train(Train(scene, tmp_path / "run", budget=Budget(minutes=0.001), device="cpu"), QUIET)
     assert "steps change little" in caplog.text
 

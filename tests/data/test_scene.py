@@ -49,6 +49,9 @@ def test_a_name_in_another_case_is_found_and_one_that_is_misspelt_is_answered_by
         scene.index("Dji_0001")
     with pytest.raises(SceneError, match=r"names look like DJI_0025\.jpg"):
         scene.index("DJI_025.jpg")
+    scene = replace(named(), names=tuple(f"100MEDIA/DJI_{k:04}.JPG" for k in (1, 2, 3, 25)))
+    with pytest.raises(SceneError, match=r"names look like 100MEDIA/DJI_0025\.JPG"):
+        scene.index("dji_025")
 
 
 def test_a_name_of_several_photographs_is_an_error_unless_it_is_the_whole_name_of_one():

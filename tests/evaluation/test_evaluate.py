@@ -283,6 +283,15 @@ def test_the_table_says_what_is_missing_and_why(scene, tmp_path):
     assert str(tmp_path / "pictures") in text
 
 
+def test_what_is_missing_of_some_pixels_only_is_named_with_them(tmp_path):
+    reasons = {f"{metric}{suffix}": "nobody sees them" for metric in module.METRICS for suffix in ("_seen", "_seen_cc")}
+    reasons |= {f"lpips_vgg{suffix}": "not installed" for suffix in module.SUFFIXES}
+    report = {"mean": {"reasons": reasons, "seen_share": 0.0}, "seconds_per_frame": 1.0, "rays_per_second": 1.0}
+    first, second, *_ = module._remarks(report, tmp_path)
+    assert first.startswith("No PSNR, dB (doubly seen; doubly seen, colour fit); SSIM (doubly seen;")
+    assert second == "No LPIPS, VGG: not installed"
+
+
 def test_pictures_of_photographs_that_differ_in_their_suffix_only_do_not_collide():
     names = [str(path) for path in module.picture_names(["a.JPG", "a.png", "strip/b.jpg"])]
     assert names == ["a.JPG.png", "a.png.png", "strip/b.png"]

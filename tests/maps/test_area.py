@@ -115,6 +115,7 @@ def test_an_area_has_the_cells_and_tiles_that_lie_in_it_not_in_its_rectangle():
         ({"area": "notes.txt"}, "notes.txt is no GeoJSON"),
         ({"sections": "notes.txt"}, "notes.txt is no GeoJSON"),
         ({"sections": "missing.geojson"}, "missing.geojson is no file"),
+        ({"area": "line.geojson"}, "line.geojson has no Polygon"),
         ({"gsd": -0.1}, "--gsd -0.1"),
     ],
 )
@@ -123,6 +124,7 @@ def test_mistakes_of_maps_are_refused_before_photographs_are_read(
 ):
     monkeypatch.setattr("tidefield.commands.map_.open_source", lambda *_, **__: pytest.fail("photographs were read"))
     (tmp_path / "notes.txt").write_text("none")
+    write(tmp_path / "line.geojson", {"type": "LineString", "coordinates": SQUARE})
     given = {name: tmp_path / value if isinstance(value, str) else value for name, value in options.items()}
     with pytest.raises(RunError, match=message):
         map_(Map(tmp_path / "run", tmp_path / "out", **given), Console(quiet=True))

@@ -127,6 +127,30 @@ def test_a_stage_with_the_same_inputs_continues_unless_it_is_repeated_on_request
     assert run(8, inputs=2) == [False, False, False]
 
 
+def test_a_repetition_on_request_that_was_interrupted_keeps_nothing(tmp_path: Path):
+    def run(redo: str | None = None, breaks: bool = False) -> bool:
+        def first(_: bool) -> Facts:
+            if breaks:
+                raise KeyboardInterrupt
+            return {}
+
+        stages = Stages(tmp_path, 0, redo)
+        stages.run("pairs", 0, [], first)
+        return stages.run("matches", 0, [], lambda resume: {"resumed": resume}, inputs=1)["resumed"]
+
+    assert not run()
+    with pytest.raises(KeyboardInterrupt):
+        run("pairs", breaks=True)
+    assert not run("pairs")
+
+
+def test_inputs_of_stages_of_earlier_versions_are_added(tmp_path: Path):
+    Stages(tmp_path, 0).run("features", 0, [], lambda _: {})
+    Stages(tmp_path, 0).run("features", 0, [], lambda _: {}, inputs=1)
+    facts = Stages(tmp_path, 7).run("features", 0, [], lambda resume: {"resumed": resume}, inputs=1)
+    assert facts == {"resumed": True}
+
+
 def test_a_stage_does_not_continue_from_what_is_damaged(tmp_path: Path):
     def damaged(_: Facts) -> Facts:
         raise ValueError("no database")

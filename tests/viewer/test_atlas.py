@@ -185,6 +185,7 @@ def test_two_dates_have_one_scale_of_colours(tmp_path: Path):
     heights = 5 + 0.01 * columns + 0.02 * rows
     maps = [write_map(tmp_path / f"map 202{k}-01-01", (1, 2, 3), heights - k) for k in range(2)]
     write_surface(maps[1] / "odm_dem" / "dsm_sigma.tif", np.full(SHAPE, 0.05, np.float32), CELL, nodata=-9999.0)
+    maps.append(write_map(tmp_path / "map of nothing", (1, 2, 3), np.full(SHAPE, -9999.0)))
     sheets = Atlas([*maps, write_change(tmp_path / "change", np.full(SHAPE, -1, np.float32))]).describe()["sheets"]
     for kind, low, high in (("height", 4.3, 7.3), ("error", 0.02, 0.051)):
         layers = [layer for sheet in sheets for layer in sheet["layers"] if layer["kind"] == kind]
@@ -273,7 +274,7 @@ def test_a_large_polygon_takes_little_memory(tmp_path: Path, kind: str, monkeypa
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found["cells_m2"] == side**2 * CELL**2
-    assert peak < 30 * side**2
+    assert peak < 36 * side**2
     monkeypatch.setattr(atlas_module, "MOST_CELLS", side**2 - 1)
     with pytest.raises(RunError, match=r"covers 1600 x 1600 cells: expected 2,559,999 or fewer; draw a smaller"):
         atlas.area(corners)

@@ -186,10 +186,9 @@ def open_trained(
 
     Without `hold_out` all photographs are sources, as for products.
     """
-    from tidefield.addresses import pull
     from tidefield.data.load import is_scene
     from tidefield.methods import trained
-    from tidefield.train.checkpoint import RUN_FILE, read_run, require_scene
+    from tidefield.train.checkpoint import RUN_FILE, read_run, scene_of
 
     if not (folder / RUN_FILE).exists() and is_scene(folder):
         raise RunError(
@@ -197,9 +196,7 @@ def open_trained(
             f"the scene without training, or train first: `tidefield train {folder} RUN`"
         )
     run = read_run(folder)
-    pull(run.scene)
-    require_scene(folder, run)
-    scene = load(run.scene, run.width, allow_missing, console, hold_out)
+    scene = load(scene_of(folder, run), run.width, allow_missing, console, hold_out)
     with trained(folder, run, scene, device, sampling) as (render, progress):
         record = {"seed": run.seed, "weights": run.weights, "run": run.id, "trained_width": scene.cameras.width}
         record["trained"] = {"steps": progress.step, "seconds": progress.seconds}

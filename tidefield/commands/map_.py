@@ -73,7 +73,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
     # Before photographs are read, which may take minutes.
     if options.gsd is not None and not 0 < options.gsd < math.inf:
-        raise RunError(f"--gsd {options.gsd:g} was asked for: expected a side in metres above 0; choose another")
+        raise RunError(f"--gsd {options.gsd:g} was asked for: expected the side of a cell, above 0; choose another")
     for path, kind in ((options.area, "Polygon"), (options.sections, "LineString")):
         if path is not None:
             parse(path, (kind,))

@@ -105,7 +105,7 @@ def _train(options: Train, console: Console, again: str) -> None:
     from tidefield.device import choose_device
     from tidefield.evaluation.curves import make_curve
     from tidefield.progress import ProgressBar
-    from tidefield.train.checkpoint import is_of, read_run, write_run
+    from tidefield.train.checkpoint import is_of, may_move, read_run, write_run
     from tidefield.train.loop import train as run_training
 
     budget, folder, weights = options.budget.checked(), options.run, None
@@ -119,7 +119,7 @@ def _train(options: Train, console: Console, again: str) -> None:
         run = read_run(folder)  # its other options were settled when it was started
         scene_folder = Path(os.path.realpath(options.scene))
         if run.scene != scene_folder:
-            if run.poses is None or run.scene.exists():
+            if not may_move(run) or run.scene.exists():
                 raise RunError(
                     f"{folder} was trained on {run.scene}, not on {options.scene}: expected the same scene; name it"
                 )

@@ -362,8 +362,8 @@ def _numbers(
 ) -> Int64[np.ndarray, " V"]:
     """Number the lenses of all photographs; those of few photographs with observations are one for each frame size.
 
-    COLMAP gives each photograph a lens of its own unless it is asked for one; nothing would be known of a held-out
-    photograph's.
+    COLMAP gives each photograph a lens of its own unless it is asked for one; a held-out photograph's would stay
+    undetermined.
     """
     shared, sizes = Counter(lenses[i] for i in supported), cameras.size_px.tolist()
     names = [

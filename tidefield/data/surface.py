@@ -229,12 +229,13 @@ def interpolate_on_pixels(
     from scipy.spatial import Delaunay
 
     corners = Delaunay(uv_px).simplices
-    slope, offset = _planes(uv_px[corners], values[corners])
+    triangles = uv_px[corners]
+    slope, offset = _planes(triangles, values[corners])
     u, rows = np.arange(width) + 0.5, max(1, PIXELS_AT_ONCE // width)
     result = np.empty((height, width))
     for first in range(0, height, rows):
         v = np.arange(first, min(first + rows, height))[:, None] + 0.5
-        owner = _owners(uv_px[corners] - [0, first], width, len(v))
+        owner = _owners(triangles - [0, first], width, len(v))
         result[first : first + rows] = slope[owner, 0] * u + slope[owner, 1] * v + offset[owner]
     return result
 

@@ -227,10 +227,16 @@ def _table(scene: Scene, report: Mapping[str, Any]) -> Table:
 
 def _remarks(report: Mapping[str, Any], out: Path) -> list[str]:
     """Return the lines below the table: why values are missing, speed, and the folder of the pictures."""
-    missing: dict[str, dict[str, None]] = {}
-    for name, reason in report["mean"]["reasons"].items():
-        metric = next(metric for prefix, metric in METRICS.items() if name.startswith(prefix))
-        missing.setdefault(reason, {})[metric.title] = None
+    reasons = report["mean"]["reasons"]
+    missing: dict[str, list[str]] = {}
+    for name, metric in METRICS.items():
+        lacking: dict[str, list[str]] = {}
+        for suffix, column in _COLUMNS.items():
+            if name + suffix in reasons:
+                lacking.setdefault(reasons[name + suffix], []).append(column)
+        for reason, columns in lacking.items():
+            of_some = "" if len(columns) == len(_COLUMNS) else f" ({'; '.join(columns)})"
+            missing.setdefault(reason, []).append(metric.title + of_some)
     return [
         *(f"No {'; '.join(titles)}: {reason}" for reason, titles in missing.items()),
         f"Doubly seen: {report['mean']['seen_share']:.0%} of the pixels.",

@@ -270,6 +270,8 @@ def project_with_slopes(
 
 
 _OF_SOME = ("residual", "shading")
+_COMPARED = 2000
+"""Names of photographs with which a misspelt one is compared."""
 _TENSORS = tuple(f.name for f in fields(Cameras) if f.name not in ("names", *_OF_SOME))
 
 
@@ -297,7 +299,8 @@ def find_name(name: str, names: Sequence[str], where: str) -> int:
         )
     if found:
         return found[0]
-    near = get_close_matches(name, names, n=3) or names[:3]
+    of_stem = {stem.casefold(): whole for whole, _, stem, _ in paths[:_COMPARED]}
+    near = [of_stem[stem] for stem in get_close_matches(PurePath(name).stem.casefold(), of_stem)] or names[:3]
     looks = (
         f"names look like {', '.join(near)}; choose one that is there" if names else "they have no names; use indices"
     )

@@ -21,6 +21,7 @@ from tidefield.geometry.geodesy import WGS84, lost_in_conversion
 from tidefield.maps.grid import MapFrame, Tile
 
 LARGEST = 1 << 25
+_NONE = "{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON"
 _log = logging.getLogger(__name__)
 
 
@@ -36,7 +37,7 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
         kinds: of geometries that are wanted, such as "Polygon".
 
     Raises:
-        RunError: as `parse`, or it has none of these geometries, or coordinates outside of the map's system.
+        RunError: as `parse`, or coordinates outside of the map's system.
     """
     shapes, crs = parse(path, kinds)
     shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
@@ -56,8 +57,7 @@ def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tup
     # An outline that crosses itself, as drawn by hand, has an inside all the same.
     shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
     if not shapes:
-        wanted = " or ".join(kinds)
-        raise RunError(f"{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON")
+        raise RunError(_NONE.format(path=path, wanted=" or ".join(kinds)))
     return shapes
 
 
@@ -66,10 +66,10 @@ def parse(path: Path, kinds: tuple[str, ...]) -> tuple[list[tuple[BaseGeometry, 
 
     Args:
         path: the file.
-        kinds: of geometries that are wanted, for messages.
+        kinds: of geometries that are wanted.
 
     Raises:
-        RunError: the file is missing, too large, or no GeoJSON.
+        RunError: the file is missing, too large, no GeoJSON, or has none of these geometries.
     """
     wanted = " or ".join(kinds)
     with reading_from(path):
@@ -79,7 +79,7 @@ def parse(path: Path, kinds: tuple[str, ...]) -> tuple[list[tuple[BaseGeometry, 
     try:
         data = json.loads(text)
         features = data["features"] if data.get("type") == "FeatureCollection" else [data]
-        with np.errstate(invalid="ignore"):  # what is not finite is refused below
+        with np.errstate(invalid="ignore"):  # `read_shapes` refuses what is not finite
             shapes = [
                 (shapely.geometry.shape(geometry), dict(feature.get("properties") or {}))
                 for feature in features
@@ -98,6 +98,8 @@ def parse(path: Path, kinds: tuple[str, ...]) -> tuple[list[tuple[BaseGeometry, 
         shapely.errors.ShapelyError,
     ) as error:
         raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
+    if not any(True for shape, _ in shapes for _ in _parts(shape, kinds)):
+        raise RunError(_NONE.format(path=path, wanted=wanted))
     return shapes, crs
 
 

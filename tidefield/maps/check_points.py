@@ -104,9 +104,10 @@ def all_check_points(
     limit = _SAME_POINT_M * np.array([frame.metre, frame.metre, frame.metre_up])
     for point in [] if given is None else read_check_points(given, scene, frame):
         away_m = np.linalg.norm(on_map - point.surveyed[:2], axis=1) / frame.metre
+        own = [k for k, name in enumerate(names) if point.named and name == point.name]
         # Earlier versions wrote names without places.
-        near = not len(away_m) or (away_m < _SAME_NAME_M).any()
-        if (away_m < _SAME_POINT_M).any() or (point.named and point.name in names and near):
+        is_own = bool(own) and (len(away_m) != len(names) or (away_m[own] < _SAME_NAME_M).any())
+        if (away_m < _SAME_POINT_M).any() or is_own:
             fitted.append(point.name)
         elif not any((np.abs(point.surveyed - other.surveyed) < limit).all() for other in found):
             found.append(point)

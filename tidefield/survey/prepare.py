@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -399,19 +398,21 @@ def write_scene(
     correction = None
     if colour != "off":
         # A cache of its own: photographs that are to be corrected would only fill the user's.
-        with TemporaryDirectory(dir=scene / "prepare", ignore_cleanup_errors=True) as cache:
-            with ProgressBar(console, "Measuring exposures") as bar:
-                loaded = load_scene(
-                    scene,
-                    width=COLOUR_WIDTH,
-                    hold_out=bool(held_out),
-                    calibrate=False,
-                    progress=bar,
-                    cache=Path(cache),
-                    unfinished=True,
-                )
-            correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
-            del loaded
+        cache = scene / "prepare" / "exposures"
+        shutil.rmtree(cache, ignore_errors=True)  # of a run that was killed
+        with ProgressBar(console, "Measuring exposures") as bar:
+            loaded = load_scene(
+                scene,
+                width=COLOUR_WIDTH,
+                hold_out=bool(held_out),
+                calibrate=False,
+                progress=bar,
+                cache=cache,
+                unfinished=True,
+            )
+        correction = estimate_correction(loaded, [camera.camera_id for camera in cameras], always=colour == "on")
+        del loaded
+        shutil.rmtree(cache, ignore_errors=True)
         if correction.helps:
             with ProgressBar(console, "Correcting exposures") as bar:
                 write_images(photographs, images, correction, cameras, bar)
@@ -450,7 +451,7 @@ def _fingerprint(survey: Survey) -> list:
 
 def _pixels_fingerprint(survey: Survey) -> list:
     """Identify what features and matches are made of: files and lenses, without positions and angles."""
-    return [entry[:3] + entry[4:5] for entry in _fingerprint(survey)]
+    return [[name, size, time, lens] for name, size, time, _, lens, *_ in _fingerprint(survey)]
 
 
 def _have_masks(photographs: Sequence[Photograph]) -> bool:

@@ -113,6 +113,9 @@ class Stages:
                 is_same = continues = False
             else:
                 self.seconds[name] = record["seconds"]
+                if of is not None and "inputs" not in record:  # of an earlier version
+                    record["inputs"] = of
+                    write_json(self._file, self._records)
                 log.info(f"{name}: complete already")
                 return result
         self._is_redoing = True
@@ -127,7 +130,7 @@ class Stages:
         self._records[name] = record
         # Their files may be changed from now on, even if this run ends before they are repeated.
         for later in self._records.keys() - {name, *self.seconds}:
-            self._records[later] |= {"key": None, "done": False}
+            self._records[later] |= {"key": None, "done": False} | ({"inputs": None} if self._is_forced else {})
         write_json(self._file, self._records)
         log.info(f"{name}: started")
         start = time.monotonic()

@@ -25,8 +25,18 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tidefield import __version__
-from tidefield.addresses import address_of, path_of
-from tidefield.config import AnyConfig, Budget, Config, Range, Seed, config_from_json, config_to_json, from_json
+from tidefield.addresses import address_of, path_of, pull
+from tidefield.config import (
+    AnyConfig,
+    Budget,
+    Config,
+    ExternalConfig,
+    Range,
+    Seed,
+    config_from_json,
+    config_to_json,
+    from_json,
+)
 from tidefield.data.scene import Scene, poses_key
 from tidefield.errors import RunError
 from tidefield.files import completed_file, file_sha256, read_json, reading_from, write_json
@@ -124,13 +134,25 @@ def read_run(folder: Path) -> Run:
     return Run(**{**values, "scene": path_of(values["scene"])}, config=config)
 
 
-def require_scene(folder: Path, run: Run) -> None:
-    """Raises: RunError when the scene of the run in a folder is not where it was."""
+def may_move(run: Run) -> bool:
+    """Whether a run can go on with a scene in another place: it must know by which poses to recognise it."""
+    return run.poses is not None and run.held_out is not None and not isinstance(run.config, ExternalConfig)
+
+
+def scene_of(folder: Path, run: Run) -> Path:
+    """The scene of the run in a folder, fetched if it is in an object store.
+
+    Raises:
+        RunError: it is not where it was.
+    """
+    pull(run.scene)
     if not run.scene.exists():
+        instead = f", or name its new place with `tidefield train SCENE {folder} --resume`" if may_move(run) else ""
         raise RunError(
             f"{folder} was trained on {run.scene}, which is missing: expected its scene, from whose photographs it "
-            f"renders; put it back, or name its new place with `tidefield train SCENE {folder} --resume`"
+            f"renders; put it back{instead}"
         )
+    return run.scene
 
 
 def is_of(run: Run, scene: Scene) -> bool:

@@ -172,13 +172,10 @@ def _surface(path: Path) -> Surface:
 def _with_common_ends(sheets: list[Sheet]) -> list[Sheet]:
     """The sheets, with the same colours for all heights, and for all errors: the page has one legend for two dates."""
     layers = [layer for sheet in sheets for layer in sheet.layers]
-    ends = {
-        kind: {
-            "low": min(one.low for one in layers if one.kind == kind),
-            "high": max(one.high for one in layers if one.kind == kind),
-        }
-        for kind in {layer.kind for layer in layers} & {"height", "error"}
-    }
+    ends: dict[str, dict[str, float]] = {}
+    for kind in {layer.kind for layer in layers} & {"height", "error"}:
+        low, high = _common([(layer.low, layer.high) for layer in layers if layer.kind == kind])
+        ends[kind] = {"low": low, "high": high}
     return [
         replace(sheet, layers=tuple(replace(layer, **ends.get(layer.kind, {})) for layer in sheet.layers))
         for sheet in sheets
@@ -346,7 +343,7 @@ class Atlas:
         inside: Bool[np.ndarray, "h w"],
         cell_area: float,
     ) -> dict[str, Any]:
-        """Volumes above and below the plane through a polygon's rim; none where the rim or the cells are not known."""
+        """Volumes above and below the plane through a polygon's rim; none where the rim or the cells have no values."""
         rim = np.array([polygon.exterior.interpolate(s, normalized=True).coords[0] for s in np.linspace(0, 1, 200)])
         z = _sample(file, rim, 1)
         known = np.isfinite(z)
@@ -558,10 +555,10 @@ def _overview(source: Path | Surface, band: int) -> Float64[np.ndarray, " N"]:
 
 
 def _usual(source: Path | Surface, band: int) -> tuple[float, float]:
-    """The 2nd and 98th percentile of a raster's values, from a small picture of it."""
+    """The 2nd and 98th percentile of a raster's values, from a small picture of it; NaN where it has none."""
     known = _overview(source, band)
     if not len(known):
-        return 0.0, 1.0
+        return math.nan, math.nan
     low, high = np.percentile(known, [2, 98]).tolist()
     return low, max(high, low + 1e-3)
 
@@ -580,7 +577,12 @@ def _black_white(path: Path) -> tuple[float, float]:
         bands = _picture_bands(file)
         if file.dtypes[0] == "uint8":
             return 0.0, 255.0
-    low, high = zip(*(_usual(path, band) for band in bands), strict=True)
+    return _common([_usual(path, band) for band in bands])
+
+
+def _common(ends: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The lowest and the highest of the ends of several rasters, of which some may have no values."""
+    low, high = zip(*([own for own in ends if math.isfinite(own[0])] or [(0.0, 1.0)]), strict=True)
     return min(low), max(high)
 
 
@@ -707,7 +709,7 @@ def _change_volumes(
     numbers: dict[str, Any],
     detection_m: float,
 ) -> dict[str, Any]:
-    """Volumes in a polygon, net with its interval; none where no cell is known.
+    """Volumes in a polygon, net with its interval; none where no cell has a value.
 
     The systematic error is taken to have one sign in all cells, so that on a hill, where that of a shift cancels out,
     intervals are wider than those of the report.
