@@ -35,6 +35,13 @@ def test_cells_of_a_page_lie_where_those_of_the_survey_do(tmp_path: Path, monkey
             assert small.heights[row, column] == read(step * row, step * row + 1)[0, step * column]
 
 
+def test_what_takes_long_is_named_before_it_is_done(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level("INFO", "tidefield"):
+        measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]))
+    for step in ("comparing 200 x 240 cells of 0.5 m", "finding stable ground", "outlining change"):
+        assert step in caplog.text
+
+
 def test_a_narrow_strip_keeps_two_rows_to_be_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(figures, "_SIDE", 40)
     rng = np.random.default_rng(0)

@@ -142,7 +142,7 @@ def test_a_polygon_is_summed_in_its_own_rows_and_columns(tmp_path: Path, monkeyp
 def test_the_table_of_no_outlines_has_its_header(tmp_path: Path):
     change = measured(*pair(tmp_path, 2, 0.0)[:2])
     write_tables(replace(change, each=[]), tmp_path)
-    fields = "id,change,area_m2,volume_m3,low_m3,high_m3,mean_dz_m,largest_dz_m\n"
+    fields = "id,change,area_m2,volume_m3,low_m3,high_m3,mean_dz_m,largest_dz_m,east,north\n"
     assert (tmp_path / "outlines.csv").read_text() == fields
 
 

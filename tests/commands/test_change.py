@@ -97,6 +97,9 @@ def test_tables_and_the_geopackage_have_the_same_outlines(compared: tuple[Path, 
     table = dict(zip(meta["fields"], columns, strict=True))
     areas = [shape.area for shape in shapely.from_wkb(shapes)]
     assert areas == pytest.approx(table["area_m2"])
+    middles = [shape.centroid for shape in shapely.from_wkb(shapes)]
+    assert [middle.x for middle in middles] == pytest.approx(table["east"], abs=1e-3)
+    assert [middle.y for middle in middles] == pytest.approx(table["north"], abs=1e-3)
     assert [float(row["volume_m3"]) for row in rows] == pytest.approx(table["volume_m3"], abs=1e-3)
     ground = raw.read(out / "change.gpkg", layer="stable_ground")[2]
     assert sum(shape.area for shape in shapely.from_wkb(ground)) < truth.size * 0.25

@@ -210,6 +210,7 @@ def measure(
             remarks.append(f"{surface.file}: coordinates {lost}; errors do not include that")
     if datums := other_datums(earlier, later):
         remarks.append(f"{datums}; only stable ground takes the difference")
+    log.info(f"comparing {grid.shape[0]:,} x {grid.shape[1]:,} cells of {grid.cell_m:g} m")
     shift = _shift(earlier, later, grid, options, remarks)
     moved = (shift.east_m or 0.0, shift.north_m or 0.0) if shift is not None else (0.0, 0.0)
     dz = read_difference(earlier, later, grid, moved, tick=tick)
@@ -253,6 +254,7 @@ def measure(
     del unmoved
     rounding = math.hypot(*steps) / math.sqrt(12)  # each error is uniform within a step
     model: Model = "vertical" if options.register == "auto" else options.register
+    log.info("measuring errors" if given is not None else "finding stable ground, and measuring errors on it")
     registration, variogram, sigma, ground = settle(
         dz, own, grid, given, model, options.windows, options.datum_error_m, rounding, remarks
     )
@@ -293,6 +295,7 @@ def measure(
             f"stable ground was found, not given: {100 * ground.sum() / max(known, 1):.0f}% of the cells, where no "
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
+    log.info("outlining change, and what chance would have outlined")
     outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, options.windows)
     found = _summed(earlier, later, dz, errors, ground, shown, given is not None, outlines, alarms, polygons, remarks)
     partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in found.per_region if one.compared < _WHOLE]

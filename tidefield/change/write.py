@@ -55,6 +55,8 @@ OUTLINE_FIELDS: tuple[str, ...] = (
     "high_m3",
     "mean_dz_m",
     "largest_dz_m",
+    "east",
+    "north",
 )
 
 
@@ -103,7 +105,7 @@ def polygons_of(
 
 def outline_rows(change: Change) -> list[dict[str, Any]]:
     """One row for each outline, the largest volume first."""
-    signs = change.outlines.signs
+    signs, (east, north) = change.outlines.signs, _middles(change)
     values = [
         (
             number,
@@ -113,11 +115,27 @@ def outline_rows(change: Change) -> list[dict[str, Any]]:
             *volume.interval_m3,
             float(signs[number - 1]) * volume.value_m3 / volume.area_m2,
             float(signs[number - 1]) * largest,
+            float(east[number - 1]),
+            float(north[number - 1]),
         )
         for number, volume, largest in change.each
     ]
     rows: list[dict[str, Any]] = [dict(zip(OUTLINE_FIELDS, of, strict=True)) for of in values]
     return sorted(rows, key=lambda row: -row["volume_m3"])
+
+
+def _middles(change: Change) -> tuple[np.ndarray, np.ndarray]:
+    """East and north of the mean of each outline's cells, in the comparison's coordinates."""
+    labels, count = change.outlines.labels, len(change.outlines.signs)
+    sums = np.zeros((3, count + 1))
+    for rows in change.grid.strips():
+        row, column = np.nonzero(labels[rows])
+        number = labels[rows][row, column]
+        for own, weight in zip(sums, (None, column + 0.5, row + rows.start + 0.5), strict=True):
+            own += np.bincount(number, weight, count + 1)
+    cells, columns, downwards = sums[:, 1:]
+    grid = change.grid
+    return grid.west_m + grid.cell_m * columns / cells, grid.north_m - grid.cell_m * downwards / cells
 
 
 def volume_rows(change: Change) -> list[dict[str, Any]]:
