@@ -72,7 +72,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     if options.contours is not None and not 0.001 <= options.contours < math.inf:
         raise RunError(f"--contours {options.contours:g} was asked for: expected 0.001 or more metres; choose another")
     # Before photographs are read, which may take minutes.
-    if options.gsd is not None and not 0 < options.gsd < math.inf:
+    if options.gsd is not None and options.gsd <= 0:
         raise RunError(f"--gsd {options.gsd:g} was asked for: expected the side of a cell, above 0; choose another")
     for path, kind in ((options.area, "Polygon"), (options.sections, "LineString")):
         if path is not None:
