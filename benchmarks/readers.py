@@ -122,11 +122,20 @@ def _prepared(folder: Path) -> None:
     from tidefield.survey.stages import Stages
 
     class Reading(Stages):
-        def run(self, name: str, options: Any, outputs: Any, job: Any, read: Any = lambda facts: facts) -> Any:
+        def run(
+            self,
+            name: str,
+            options: Any,
+            outputs: Any,
+            job: Any,
+            read: Any = lambda facts: facts,
+            *,
+            inputs: Any = None,
+        ) -> Any:
             def refuse(_: bool) -> Any:
                 raise RunError(f"{name} would be done again")
 
-            return super().run(name, options, outputs, refuse, read)
+            return super().run(name, options, outputs, refuse, read, inputs=inputs)
 
     with patch("tidefield.survey.prepare.Stages", Reading):
         prepare(_prepare_options(folder), Console(file=StringIO()))
