@@ -513,6 +513,7 @@ def _make_comparison(folder: Path, scene: Path) -> None:
     evaluation = {
         "per_photograph": {name: mean},
         "mean": mean,
+        "width": 64,
         "rays_per_second": 1000.5,
         "seconds_per_frame": 1.5,
         "lpips_weights": {},

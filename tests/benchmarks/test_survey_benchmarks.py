@@ -65,7 +65,7 @@ def test_the_page_shows_model_training_and_time(tmp_path: Path) -> None:
         mean = {"psnr_seen": psnr - 1, "psnr_seen_cc": psnr, "ssim_seen_cc": 0.7}
         trained = {"trained": {"steps": 1500, "seconds": 600.0}}
         evaluation = tmp_path / folder / "runs" / scene / "tidefield" / "evaluation.json"
-        speed = {"rays_per_second": 1.0, "seconds_per_frame": 1.0}
+        speed = {"width": 400, "rays_per_second": 1.0, "seconds_per_frame": 1.0}
         write_json(
             evaluation, {"mean": mean, "configuration": trained, "per_photograph": {"a.jpg": {"psnr": psnr}}, **speed}
         )

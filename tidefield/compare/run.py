@@ -439,7 +439,12 @@ def _is_evaluation(data: Any) -> bool:
     mean, trained = dict(data["mean"]), data["configuration"].get("trained") or {}
     reasons, weights = mean.pop("reasons", {}), data.get("lpips_weights", {})
     optional = [*mean.values(), *(trained.get(name) for name in ("steps", "seconds"))]
-    numbers = [data["rays_per_second"], data["seconds_per_frame"], *(x for x in optional if x is not None)]
+    numbers = [
+        data["width"],
+        data["rays_per_second"],
+        data["seconds_per_frame"],
+        *(x for x in optional if x is not None),
+    ]
     numbers += [one["psnr"] for one in data["per_photograph"].values() if one["psnr"] is not None]
     texts = [*reasons.values(), *weights.values()]
     are_whole = bool(data["per_photograph"]) and set(weights) <= set(mean)
